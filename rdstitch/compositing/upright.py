@@ -168,7 +168,7 @@ def of_rectangle(corners: FloatArray, focal: Focal, pixel: float) -> tuple[Uprig
     -------
     Upright, float, float
         With the focal length by which the sides are also orthogonal; the aspect ratio, width by height, and its
-        relative standard deviation by that of the focal length.
+        relative standard deviation, where corners are a pixel off.
 
     Raises
     ------
@@ -178,17 +178,18 @@ def of_rectangle(corners: FloatArray, focal: Focal, pixel: float) -> tuple[Uprig
     sides = _sides(corners)
     if sides is None or np.cross(sides[0], sides[1])[2] <= 0.0:
         raise ArgumentError("rectangle: give the corners of a convex quadrilateral, clockwise from the top left one")
+    # What changes with each coordinate, one pixel off.
+    moved = [_sides(corners + pixel * step.reshape(4, 2)) or sides for step in np.eye(8)]
     if (value := _log_focal(sides)) is not None:
-        # By its change with each coordinate, one pixel off.
-        moved = [_sides(corners + pixel * step.reshape(4, 2)) for step in np.eye(8)]
-        others = [_log_focal(other) if other is not None else None for other in moved]
+        others = [_log_focal(other) for other in moved]
         std = math.sqrt(sum(math.inf if other is None else (other - value) ** 2 for other in others))
         if 0.0 < std < math.inf:
             focal = focal.combined(value, std)
-    ratios = [_aspect(sides, focal.value * math.exp(k * focal.log_std)) for k in (-1.0, 0.0, 1.0)]
+    low, aspect, high = (_aspect(sides, focal.value * math.exp(k * focal.log_std)) for k in (-1.0, 0.0, 1.0))
+    error = math.hypot((high - low) / 2.0, *(_aspect(other, focal.value) - aspect for other in moved)) / aspect
     axes = np.array(sides) * (1.0, 1.0, focal.value)
     upright = Upright(axes / np.linalg.norm(axes, axis=1, keepdims=True), focal)
-    return upright, ratios[1], abs(ratios[2] - ratios[0]) / (2.0 * ratios[1])
+    return upright, aspect, error
 
 
 def _sides(corners: FloatArray) -> tuple[FloatArray, FloatArray] | None:
@@ -306,7 +307,7 @@ def nearest_axis(edges: Edges, axes: FloatArray, focal: float) -> IntArray:
     return np.asarray(np.argmin(edges.angles(axes, focal), axis=0), dtype=np.intp)
 
 
-def of_scene(edges: Edges, start: FloatArray, focal: Focal, *, depth: bool) -> Upright | None:
+def of_scene(edges: Edges, start: FloatArray, focal: Focal, *, depth: bool) -> tuple[Upright, int, int] | None:
     """The directions that most edges are parallel to: a vanishing point near the vertical, and one at right angles.
 
     Random pairs of edges give a direction, a third one the other (RANSAC). A direction counts if so many edges would
@@ -322,8 +323,8 @@ def of_scene(edges: Edges, start: FloatArray, focal: Focal, *, depth: bool) -> U
 
     Returns
     -------
-    Upright or None
-        None where no direction counts.
+    Upright, int, int, or None
+        With the numbers of edges that are horizontal and vertical by it; None where no direction counts.
     """
     edges = edges.chosen(np.argsort(edges.error, kind="stable")[:_MAX_EDGES])
     tried = []
@@ -338,7 +339,8 @@ def of_scene(edges: Edges, start: FloatArray, focal: Focal, *, depth: bool) -> U
     if not {0, 1} & set(meaningful):
         return None
     kept = fitting & np.isin(own, meaningful)
-    return of_edges(edges.chosen(kept), own[kept], axes if len(meaningful) > 1 else start, focal, value)
+    upright = of_edges(edges.chosen(kept), own[kept], axes if len(meaningful) > 1 else start, focal, value)
+    return upright, int((own[kept] == 0).sum()), int((own[kept] == 1).sum())
 
 
 def _false_alarms(own: BoolArray, fitting: BoolArray) -> float:

@@ -80,7 +80,6 @@ def _upright(placed: PlacedImages, options: UprightOptions) -> tuple[FloatArray 
     camera = placed.cameras[placed.reference]
     pixel = 1.0 / camera.half_diagonal
     said: list[Message] = []
-    upright: Upright | None
     if options.rectangle is not None:
         corners = _in_reference(placed, np.reshape(options.rectangle, (4, 2)))
         upright, aspect, error = of_rectangle(corners, focal, pixel)
@@ -88,17 +87,24 @@ def _upright(placed: PlacedImages, options: UprightOptions) -> tuple[FloatArray 
         text += f", with a focal length of {upright.focal.value / pixel:.0f} pixels ({camera.focal_source or 'guess'})"
         said = [Message(text, severity="warning" if error > _SURE else "note")]
     elif options.straighten == "auto":
-        upright = of_scene(_edges(placed), start, focal, depth=placed.turned)
-        if upright is None:
-            said = [Message("no straight edges were found: the output is not turned", code="not-straightened")]
+        found = of_scene(_edges(placed), start, focal, depth=placed.turned)
+        if found is None:
+            text = "no straight edges were found: the output is not turned"
+            return None, [Message(text, code="not-straightened")]
+        upright, across, down = found
+        said = [Message(f"straightened by {across} horizontal and {down} vertical edges", severity="note")]
     elif not isinstance(options.straighten, str):
         ends = _in_reference(placed, np.reshape(options.straighten, (-1, 2))).reshape(-1, 2, 2)
         edges = _between(placed, np.concatenate([ends, np.ones((len(ends), 2, 1))], axis=2), _POINTING * pixel)
         axis = nearest_axis(edges, start[:2], focal.value)
         upright = of_edges(edges, axis, start, focal, focal.value)
+    elif placed.turned:
+        return None, [Message("the horizon of a panorama is level already", severity="note")]
+    elif (level := _level(placed, start, focal)) is None:
+        return None, [Message("the camera looks straight down: there is nothing to level")]
     else:
-        upright, said = _level(placed, start, focal)
-    return (None if upright is None else upright.matrix(frame, turned=placed.turned)), said
+        upright = level
+    return upright.matrix(frame, turned=placed.turned), said
 
 
 def _focal(placed: PlacedImages) -> Focal:
@@ -149,10 +155,8 @@ def _between(placed: PlacedImages, ends: FloatArray, error: float) -> Edges:
     return Edges.between(ends * (1.0, 1.0, focal), error / focal, on_sphere=True)
 
 
-def _level(placed: PlacedImages, start: FloatArray, focal: Focal) -> tuple[Upright | None, list[Message]]:
-    """With what is down in the scene, or else in most images, down in the output."""
-    if placed.turned:
-        return None, [Message("the horizon of a panorama is level already", severity="note")]
+def _level(placed: PlacedImages, start: FloatArray, focal: Focal) -> Upright | None:
+    """With what is down in the scene, or else in most images, down in the output; None where that is ahead."""
     assert placed.reference is not None
     to_reference = np.linalg.inv(placed.homographies[placed.reference]) @ placed.homographies
     calibration = np.diag([1.0, 1.0, focal.value])
@@ -167,9 +171,9 @@ def _level(placed: PlacedImages, start: FloatArray, focal: Focal) -> tuple[Uprig
     down /= np.linalg.norm(down)
     ahead = start[2]
     if abs(down @ ahead) > _STEEP:
-        return None, [Message("the camera looks straight down: there is nothing to level")]
+        return None
     if not known:
         down -= (down @ ahead) * ahead
         down /= np.linalg.norm(down)
     right = np.cross(down, ahead)
-    return Upright(np.stack([right / np.linalg.norm(right), down]), focal), []
+    return Upright(np.stack([right / np.linalg.norm(right), down]), focal)

@@ -161,6 +161,20 @@ def test_gravity_makes_a_wall_level(facade: tuple[Sequence, list[Path]], rdstitc
     assert np.degrees(np.arctan2(down[:, 0], down[:, 1])) == pytest.approx(0.0, abs=0.2)
 
 
+def test_without_gravity_what_is_vertical_in_most_images_is_level(
+    facade: tuple[Sequence, list[Path]], registered: Path, rdstitch: Run, tmp_path: Path
+) -> None:
+    """The output is turned about its axis alone, until the images stand as upright as they can."""
+    output = tmp_path / "up.png"
+    assert rdstitch("apply", registered, "--images", facade[1][0].parent, "-o", output, "--level").status == 0
+    record = json.loads(Path(f"{output}.json").read_text("utf-8"))
+    turn = np.array(record["output"]["orientation"])
+    np.testing.assert_allclose(turn[2] / turn[2, 2], (0.0, 0.0, 1.0), atol=1e-9)
+    matrices = [np.array(image["to_plane"]) for image in record["images"]]
+    down = np.sum([m[:2, 1] - m[:2, 2] * m[2, 1] / m[2, 2] for m in matrices], axis=0)
+    assert np.degrees(np.arctan2(*down)) == pytest.approx(0.0, abs=1.5)
+
+
 def test_places_need_an_image_that_they_are_in() -> None:
     with pytest.raises(ArgumentError, match="reference"):
         StitchOptions(composite=CompositeOptions(rectangle=(0, 0, 9, 0, 9, 9, 0, 9)))
