@@ -320,16 +320,17 @@ compositing = together(
     click.option(
         "--rectangle",
         type=CORNERS,
-        help="Four corners, pixels of the image of --reference as it is read, clockwise: they become an upright "
+        help="Four corners, pixels of the reference image as it is read, clockwise: they become an upright "
         "rectangle of its true aspect ratio, the first one its top left corner.",
     ),
     click.option(
         "--straighten",
         type=LINES,
+        metavar="off|auto|LINES",
         default="off",
         show_default=True,
         help="Make horizontal and vertical what is so in the scene. auto: edges found in the images; LINES: "
-        "'x1,y1,x2,y2;…', ends in pixels of the image of --reference as it is read.",
+        "'x1,y1,x2,y2;…', ends in pixels of the reference image as it is read.",
     ),
     click.option(
         "--level",
