@@ -7,13 +7,12 @@ and once poses are known, with those that the poses put beside it and that close
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations, islice
-from typing import Protocol, TypeVar
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.matching.feature_store import FeatureStore
+from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.retrieval import Similarity, similarity
 from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.scipy_parts import sparse, spatial
@@ -34,22 +33,6 @@ _PARTNERS = 6  # pairs of an image that its place is found by; those that others
 _CELLS_PER_SIDE = 4  # cells of an image, a side, that its partners are to cover
 
 Pairs = list[tuple[int, int]]
-
-Shared = TypeVar("Shared", bound="PointsOfTwo")
-
-
-class PointsOfTwo(Protocol):
-    """Places of matches in the two images of a pair, pixels (M, 2)."""
-
-    @property
-    def points1(self) -> FloatArray:
-        """In the first."""
-        ...
-
-    @property
-    def points2(self) -> FloatArray:
-        """In the second."""
-        ...
 
 
 def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None = None) -> Pairs:
@@ -102,8 +85,8 @@ def _nearest_positions(positions: FloatArray) -> set[tuple[int, int]]:
 
 
 def pairs_that_matter(
-    shared: Mapping[tuple[int, int], Shared], cameras: Sequence[Camera]
-) -> dict[tuple[int, int], Shared]:
+    shared: Mapping[tuple[int, int], StoredMatches], cameras: Sequence[Camera]
+) -> dict[tuple[int, int], StoredMatches]:
     """Of pairs that share something those that one of their images needs for its place.
 
     An image takes one partner after the other: the one whose matches add most to the sum of the square roots of the
@@ -112,14 +95,15 @@ def pairs_that_matter(
 
     Parameters
     ----------
-    shared : mapping of (int, int) to Shared
+    shared : mapping of (int, int) to StoredMatches
         Some matches of each pair (i, j).
     cameras : sequence of Camera
         One an image; only their sizes are used.
     """
     partners: dict[int, list[tuple[tuple[int, int], FloatArray]]] = {}
     for pair, found in shared.items():
-        for image, points in zip(pair, (found.points1, found.points2), strict=True):
+        matched = found.load()
+        for image, points in zip(pair, (matched.points1, matched.points2), strict=True):
             cell = np.clip(points / cameras[image].image_size * _CELLS_PER_SIDE, 0, _CELLS_PER_SIDE - 1).astype(np.intp)
             counts = np.bincount(cell @ [1, _CELLS_PER_SIDE], minlength=_CELLS_PER_SIDE**2)
             partners.setdefault(image, []).append((pair, counts.astype(np.float64)))

@@ -146,16 +146,6 @@ class StoredMatches:
         """Number of matches."""
         return self.count
 
-    @property
-    def points1(self) -> FloatArray:
-        """Places of the matches in the first image, pixels, (M, 2); read every time."""
-        return self.load().points1
-
-    @property
-    def points2(self) -> FloatArray:
-        """In the second."""
-        return self.load().points2
-
     def load(self) -> Correspondences:
         """Read the matches; InputError when they have vanished."""
         found = self.stored.load()

@@ -91,15 +91,11 @@ def _is_overlaid(pair: PairRegistration, threshold: float) -> bool:
     )
 
 
-def moving_images(pairs: Sequence[PairRegistration], count: int, threshold: float) -> int:
-    """How many of the ``count`` images pairs that move connect, at the most."""
-    linked = [pair for pair in pairs if pair.relation and not is_static_pair(pair, threshold)]
-    return len(connected_components(count, [pair.image1 for pair in linked], [pair.image2 for pair in linked])[0])
-
-
 def show_motion(pairs: Sequence[PairRegistration], count: int, threshold: float) -> bool:
     """Whether pairs that do move connect a good part of the ``count`` images, so that this is no chance."""
-    return moving_images(pairs, count, threshold) >= max(_MIN_IMAGES, _MIN_SHARE * count)
+    linked = [pair for pair in pairs if pair.relation and not is_static_pair(pair, threshold)]
+    connected = connected_components(count, [pair.image1 for pair in linked], [pair.image2 for pair in linked])[0]
+    return len(connected) >= max(_MIN_IMAGES, _MIN_SHARE * count)
 
 
 def _moved(pair: PairRegistration) -> FloatArray:

@@ -114,24 +114,24 @@ class Pairing:
         pairs = self.estimate(prescreened, shared=prescreened)
         return pairs if any(pair.relation for pair in pairs) else self.estimate(candidates)
 
-    def remove_static_background(self, pairs: list[PairRegistration], candidates: Sequence[Pair] = ()) -> "MovingPairs":
-        """Where a part of the images is static, the pairing and pairs of what moves; the same again where none is.
+    def without_static_background(
+        self, pairs: list[PairRegistration], candidates: Sequence[Pair] = ()
+    ) -> "tuple[Pairing, list[PairRegistration]] | None":
+        """Where a part of the images is static, the pairing and pairs of what moves; None where none is.
 
         What the images have in common was static then, so that it says nothing of which of the candidate pairs
         matter: all of them are compared.
         """
         threshold = self.options.pair.threshold
         if not has_static_background(pairs, threshold):
-            return MovingPairs(self, pairs, found=False)
+            return None
         compared = [(pair.image1, pair.image2) for pair in pairs]
         others = sorted(set(candidates).difference(compared))
         everything = [*pairs, *self.estimate(others)]
         chosen = sorted([*compared, *others])
         moving = replace(self, features=moving_features(self.features, everything, threshold))
         again = moving.estimate(chosen)
-        if not show_motion(again, len(self.features), threshold):
-            return MovingPairs(self, pairs, found=False)
-        return MovingPairs(moving, again, found=True)
+        return (moving, again) if show_motion(again, len(self.features), threshold) else None
 
     def match_repeated_patterns(self, pairs: list[PairRegistration]) -> list[PairRegistration]:
         """Where the images show a repeated pattern, match again the pairs that failed or hold by little.
@@ -239,24 +239,6 @@ class Pairing:
     def _pair_options(self, distortion: float | None) -> PairOptions:
         pair = self.options.pair
         return replace(pair, solver=pair.solver if distortion is None else "auto", distortion=distortion)
-
-
-@dataclass(frozen=True)
-class MovingPairs:
-    """Pairs of what moves in the images.
-
-    Attributes
-    ----------
-    pairing : Pairing
-        With the features that do not rest in the images.
-    pairs : list of PairRegistration
-    found : bool
-        Whether there was a static background, and it was removed.
-    """
-
-    pairing: Pairing
-    pairs: list[PairRegistration]
-    found: bool
 
 
 def _without_vote(pair: PairRegistration) -> PairRegistration:

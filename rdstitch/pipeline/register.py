@@ -96,15 +96,17 @@ def register(
         store,
         aligner.exact_tilts,
     )
-    moving = pairing.remove_static_background(pairing.estimate_candidates(candidates), candidates)
-    found = moving.pairing.match_repeated_patterns(moving.pairs) if lens_only else moving.pairs
+    found = pairing.estimate_candidates(candidates)
+    moving = pairing.without_static_background(found, candidates)
+    pairing, found = moving or (pairing, found)
+    found = pairing.match_repeated_patterns(found) if lens_only else found
     mixed, other_lens = separate_lenses(aligner.cameras, found, options.threshold, options.known_distortion)
     aligned = aligner.align([pair for pair in found if not {*pair.images} & other_lens.keys()])
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
-    aligned = close_loops(aligner, moving.pairing, aligned, candidates)
+    aligned = close_loops(aligner, pairing, aligned, candidates)
     aligned = select_by_whole_lens(aligner, aligned)
     settle = match_crossings if lens_only else settle_repeated_pattern
-    aligned, undecided = settle(aligner, moving.pairing, aligned, sources, rendered.stretch, options.threads)
+    aligned, undecided = settle(aligner, pairing, aligned, sources, rendered.stretch, options.threads)
     if metric:
         aligned = aligner.metric(aligned)
     return Registration(
@@ -114,11 +116,11 @@ def register(
         aligned.alignment,
         (
             *aligned.alignment.messages,
-            *([_STATIC_BACKGROUND] if moving.found else []),
+            *([_STATIC_BACKGROUND] if moving else []),
             *_low_contrast(rendered.equalized, aligned.alignment, aligner.paths),
             *_left_out(aligned.alignment, aligner.paths, counts, {**other_lens, **detected.damaged, **undecided}),
         ),
-        static_background=moving.found,
+        static_background=moving is not None,
         stretch=rendered.stretch,
         mixed=mixed,
     )

@@ -218,8 +218,8 @@ class _Inspected:
 def _inspected(model: PairModel, fits: Fits, pairs: PairSelection, data: Measurements) -> _Inspected:
     """The fits as they stand, on all matches."""
     width = loss_width(pairs.noise, pairs.threshold)
-    found = PairProblems(model, data, width, pairs.noise, pairs.fixed_distortion).inspect(fits)
-    covariance = covariances(found.information, found.influence, pairs.noise, data)
+    found, shares = PairProblems(model, data, width, pairs.noise, pairs.fixed_distortion).inspect(fits)
+    covariance = covariances(found.information, shares, pairs.noise, data)
     return _Inspected(fits, found.errors, covariance)
 
 

@@ -36,28 +36,6 @@ class Fits:
 
 
 @dataclass(frozen=True)
-class Inspection:
-    """The loss at fits, with what their covariance is made of.
-
-    Attributes
-    ----------
-    errors : ndarray of shape (B, N)
-        Whitened transfer errors, pixels; inf where there is no transfer, or no match.
-    cost : ndarray of shape (B,)
-        Value of the loss, px².
-    information : ndarray of shape (B, P, P)
-        Weighted ``J'J``: by λ first (only where it is free), then by the model's parameters.
-    influence : ndarray of shape (B, N, P)
-        Each match's share of the gradient, in the same order.
-    """
-
-    errors: FloatArray
-    cost: FloatArray
-    information: FloatArray
-    influence: FloatArray
-
-
-@dataclass(frozen=True)
 class PairProblems:
     """Refinement of B pairs as problems of least squares; parameters are ``(λ, state)``.
 
@@ -122,13 +100,12 @@ class PairProblems:
         possible = within & np.isfinite(moved).all(axis=1)
         return np.where(possible[:, None], moved, parameters), possible
 
-    def inspect(self, fits: Fits) -> Inspection:
-        """Errors, loss and influence of the matches at fits."""
+    def inspect(self, fits: Fits) -> tuple[BatchedNormalEquations, FloatArray]:
+        """The equations at fits, and each match's share of the gradient there, (B, N, P)."""
         found = differentiate(fits.homography, PairLenses(fits.distortion), self.data)
         chain = self.chain(fits.state)
-        equations = self._equations(found, fits.state, chain)
         shares = influence(found, self.data.present, self.scale, not self.fixed_distortion) @ chain
-        return Inspection(equations.errors, equations.cost, equations.information, shares)
+        return self._equations(found, fits.state, chain), shares
 
 
 @np.errstate(all="ignore")  # a step may leave the domain of the lens model

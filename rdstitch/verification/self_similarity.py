@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
@@ -99,38 +98,25 @@ def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
     overlaps = Overlaps.of(first.pixels, second.pixels)
     # Position of the first image within the second: rows and columns count from -(size - 1) of the first.
     rows, columns = (np.arange(n) - (m - 1) for n, m in zip(overlaps.area.shape, first.pixels.shape, strict=True))
-    offset = np.rint(first.origin - second.origin).astype(int)
-    down, right = (rows - offset[1]).astype(np.float32), (columns - offset[0]).astype(np.float32)
-    close = np.ix_(np.abs(down) <= SLACK, np.abs(right) <= SLACK)
-    within = np.hypot(down[close[0]], right[close[1][0]]) <= SLACK
-    most = float(overlaps.area[close][within].max(initial=0.0))
+    right, down = np.rint(first.origin - second.origin)
+    distance = np.hypot((rows - down).astype(np.float32)[:, None], (columns - right).astype(np.float32))
+    near = distance <= SLACK
+    most = float(overlaps.area[near].max(initial=0.0))
     if not most > 0:
         return Ambiguity(0.0, 0.0, 0.0)
-    enough = overlaps.area >= limit("kept overlap") * most
-    box = _box_around(enough, SLACK)
-    score, distance = overlaps.correlation(box), np.hypot(down[box[0], None], right[None, box[1]])
-    near = distance <= SLACK
+    score = overlaps.correlation()
     # A peak of its own, not the flank of the one here.
     peak = score >= cv2.dilate(score, np.ones((2 * SLACK + 1, 2 * SLACK + 1), dtype=np.uint8))
-    other = np.where(peak & (distance > _MIN_SHIFT) & enough[box], score, np.float32(0.0))
+    enough = overlaps.area >= limit("kept overlap") * most
+    other = np.where(peak & (distance > _MIN_SHIFT) & enough, score, np.float32(0.0))
     best = int(other.argmax())
-    here = float(score[near].max(initial=0.0))
-    return Ambiguity(here, float(other.flat[best]), float(distance.flat[best]) / MAX_SIDE)
+    return Ambiguity(float(score[near].max()), float(other.flat[best]), float(distance.flat[best]) / MAX_SIDE)
 
 
 def find_ambiguity(first: ComparedImage, second: ComparedImage) -> Ambiguity:
     """Draw two images on the plane at the scale of the second one, and compare them at all shifts."""
     scale = drawing_scale(second.camera, second.homography)
     return placement_ambiguity(draw(first, scale), draw(second, scale))
-
-
-def _box_around(chosen: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
-    """Rows and columns in which something is chosen, and a margin."""
-    ranges = []
-    for axis in (1, 0):
-        places = np.flatnonzero(chosen.any(axis=axis))
-        ranges.append(slice(max(0, int(places[0]) - margin), int(places[-1]) + 1 + margin))
-    return ranges[0], ranges[1]
 
 
 def _without_brightness(image: Grey) -> Grey:

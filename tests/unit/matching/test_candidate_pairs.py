@@ -1,6 +1,5 @@
 """Which pairs are looked at: all of a few images; of many, those that follow one another or look alike."""
 
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.features import Features
+from rdstitch.features import Correspondences, Features
 from rdstitch.features.keypoints import Descriptors
 from rdstitch.matching.candidate_pairs import (
     CANDIDATES,
@@ -22,7 +21,7 @@ from rdstitch.matching.candidate_pairs import (
     pairs_that_matter,
 )
 from rdstitch.matching.candidate_pairs import first_pairs as _first_pairs
-from rdstitch.matching.feature_store import FeatureStore
+from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.retrieval import similarity
 
 
@@ -143,15 +142,12 @@ def test_images_that_overlap_by_a_fifth_are_neighbours(overlap: float, found: li
     assert neighbours([lens, lens], np.stack([np.eye(3), shifted]), {(0, 1)}) == []
 
 
-@dataclass(frozen=True)
-class _Shared:
-    """Places of matches."""
-
-    points1: FloatArray
-    points2: FloatArray
+def _shared(points1: FloatArray, points2: FloatArray) -> StoredMatches:
+    count = len(points1)
+    return StoredMatches.of(Correspondences(np.zeros((count, 2), np.intp), points1, points2, np.zeros(count)))
 
 
-def _shared_by_squares(side: int) -> dict[tuple[int, int], _Shared]:
+def _shared_by_squares(side: int) -> dict[tuple[int, int], StoredMatches]:
     """A survey of side x side images of 400 pixels, each 100 pixels from the next: one match every 20 pixels."""
     rng = np.random.default_rng(0)
     places = rng.uniform(0.0, 100.0 * side + 300.0, ((5 * side + 15) ** 2, 2))
@@ -162,7 +158,7 @@ def _shared_by_squares(side: int) -> dict[tuple[int, int], _Shared]:
         for i, corner1 in enumerate(corners[:j]):
             both = places[seen[i] & seen[j]]
             if len(both) > 8:
-                shared[i, j] = _Shared(both - corner1, both - corner2)
+                shared[i, j] = _shared(both - corner1, both - corner2)
     return shared
 
 
@@ -188,12 +184,12 @@ def test_of_many_overlapping_pairs_each_image_keeps_a_few_all_around_it() -> Non
 def test_a_weak_partner_on_the_other_side_is_kept_before_a_strong_one_on_the_same() -> None:
     rng = np.random.default_rng(1)
     right, left = rng.uniform((200, 0), (400, 400), (60, 2)), rng.uniform((0, 0), (100, 400), (25, 2))
-    shared = {(0, other): _Shared(right, right) for other in range(1, 12)}
+    shared = {(0, other): _shared(right, right) for other in range(1, 12)}
     # The others have partners enough among themselves.
     shared |= {
-        (i, j): _Shared(np.tile(right, (4, 1)), np.tile(right, (4, 1))) for i in range(1, 12) for j in range(i + 1, 12)
+        (i, j): _shared(np.tile(right, (4, 1)), np.tile(right, (4, 1))) for i in range(1, 12) for j in range(i + 1, 12)
     }
-    shared[0, 12] = _Shared(left, left)
+    shared[0, 12] = _shared(left, left)
     chosen = pairs_that_matter(shared, [Camera((400, 400))] * 13)
     assert (0, 12) in chosen
     assert sum(0 in pair for pair in chosen) == 6

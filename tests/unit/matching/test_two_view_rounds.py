@@ -13,7 +13,7 @@ from rdstitch.matching.candidate_pairs import neighbours
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.options import MatchingOptions
 from rdstitch.matching.static_background import is_static_pair, moving_features
-from rdstitch.matching.two_view_rounds import MovingPairs, Pairing
+from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.progress import silent
 
 LENS = Camera((640, 480), distortion=-0.2, focal=520.0)
@@ -65,17 +65,17 @@ def test_a_moving_board_is_found_before_a_static_background() -> None:
     pairing = _pairing(400, 150)
     alone = pairing.estimate(ALL)
     assert all(is_static_pair(pair, 3.0) for pair in alone)
-    moving = pairing.remove_static_background(alone)
-    assert moving.found
-    assert all(pair.relation and not is_static_pair(pair, 3.0) for pair in moving.pairs)
-    distortion = np.median([pair.relation.distortion for pair in moving.pairs])
+    moving = pairing.without_static_background(alone)
+    assert moving is not None
+    assert all(pair.relation and not is_static_pair(pair, 3.0) for pair in moving[1])
+    distortion = np.median([pair.relation.distortion for pair in moving[1]])
     assert abs(distortion - LENS.distortion) < 0.02
 
 
 def test_images_that_are_really_static_stay_together() -> None:
     pairing = _pairing(400, 0)
     alone = pairing.estimate(ALL)
-    assert pairing.remove_static_background(alone) == MovingPairs(pairing, alone, found=False)
+    assert pairing.without_static_background(alone) is None
     assert all(is_static_pair(pair, 3.0) for pair in alone)
 
 
@@ -83,9 +83,9 @@ def test_an_overlay_is_removed_though_every_pair_moves() -> None:
     pairing = _pairing(40, 300)
     alone = pairing.estimate(ALL)
     assert not any(is_static_pair(pair, 3.0) for pair in alone)
-    moving = pairing.remove_static_background(alone)
-    assert moving.found
-    for before, after in zip(alone, moving.pairs, strict=True):
+    moving = pairing.without_static_background(alone)
+    assert moving is not None
+    for before, after in zip(alone, moving[1], strict=True):
         assert len(after.correspondences) <= len(before.correspondences) - 35
         assert after.relation.inliers.sum() >= 0.95 * before.relation.inliers.sum()
 
@@ -93,7 +93,7 @@ def test_an_overlay_is_removed_though_every_pair_moves() -> None:
 def test_a_few_static_matches_change_nothing() -> None:
     pairing = _pairing(4, 300)
     alone = pairing.estimate(ALL)
-    assert pairing.remove_static_background(alone) == MovingPairs(pairing, alone, found=False)
+    assert pairing.without_static_background(alone) is None
 
 
 def test_static_features_that_were_matched_otherwise_are_dropped_too() -> None:
@@ -140,6 +140,6 @@ def test_with_a_static_background_every_candidate_pair_is_compared() -> None:
     pairing = _pairing(400, 150)
     # What is static has chosen these.
     few = [pair for pair in ALL if 0 in pair]
-    moving = pairing.remove_static_background(pairing.estimate(few), ALL)
-    assert moving.found
-    assert [(pair.image1, pair.image2) for pair in moving.pairs] == ALL
+    moving = pairing.without_static_background(pairing.estimate(few), ALL)
+    assert moving is not None
+    assert [(pair.image1, pair.image2) for pair in moving[1]] == ALL
