@@ -16,7 +16,7 @@ _GROUPS = {
     ),
     "Stage": "grid overlap positions positions_only pixel_size search channel flat_field save_flat_field",
     "Input": "following idle refresh every exclude include_only match topic timestamps",
-    "Camera": "distortion lens tilt attitude attitude_std save_camera",
+    "Camera": "distortion lens tilt attitude attitude_std positions_offset gcp save_camera",
     "Features and registration": (
         "features aliked_model lightglue_model max_features work_megapixels solver model threshold"
     ),

@@ -169,6 +169,19 @@ known = together(
         show_default=True,
         help="Standard deviation of the attitudes, degrees; 0 for exact ones.",
     ),
+    _file(
+        "--positions",
+        "FILE",
+        "Where images were taken, instead of EXIF: CSV name,lat,lon or name,x,y (see --crs), exiftool's -csv or -json, "
+        "OpenDroneMap's geo.txt, or a GPX track.",
+    ),
+    _number(
+        "--positions-offset",
+        RealNumber(),
+        0.0,
+        "Seconds to add to the images' times to have those of the GPX track, which are in UTC.",
+        "S",
+    ),
 )
 
 mask = _file(
@@ -337,7 +350,8 @@ compositing = together(
         "--crs",
         "epsg",
         type=EPSG,
-        help="Coordinate system of the map; otherwise UTM on WGS 84. Others than UTM need rasterio.",
+        help="Coordinate system of the map, and of x and y in --positions; otherwise UTM on WGS 84. Others than UTM "
+        "need rasterio.",
     ),
 )
 
@@ -374,6 +388,11 @@ stitching = together(
         "where matches that took no part in it come nearer; a number of cells along an image's longer side: always.",
     ),
     compositing,
+    _file(
+        "--gcp",
+        "FILE",
+        "Ground control points, as OpenDroneMap's gcp_list.txt; they place the output on the Earth.",
+    ),
     layers,
     _file(
         "--save-camera",
