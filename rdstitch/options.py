@@ -80,6 +80,8 @@ class StitchOptions:
         Topic of the images in ROS bags; None: the only one.
     reference : str, optional
         Name of the image whose frame is kept; None: the best connected.
+    pose_covariance : bool
+        Compute covariances of the poses, for the sidecar and tables of poses.
     local_alignment : "auto", "off" or int
         Smooth displacements of the images where the ground is rough: where held-out matches come nearer by them,
         never, or always, with so many cells along the longer side of an image.
@@ -136,6 +138,7 @@ class StitchOptions:
     include_only: tuple[str, ...] = ()
     topic: str | None = None
     reference: str | None = None
+    pose_covariance: bool = False
     local_alignment: LocalAlignmentMode = "auto"
     composite: CompositeOptions = field(default_factory=CompositeOptions)
     cache: Path | None = None

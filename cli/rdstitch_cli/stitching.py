@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rdstitch.camera import Camera
     from rdstitch.compositing import CompositePlan
     from rdstitch.outputs import Outputs
-    from rdstitch.pipeline import Registration, StitchOptions, StitchResult
+    from rdstitch.pipeline import PosesFrame, Registration, StitchOptions, StitchResult
     from rdstitch.robust import SolverName
 
 
@@ -102,7 +102,7 @@ def _check_written(read: Iterable[Path | None]) -> None:
 
     context = click.get_current_context()
     files = [file for file in (*read, context.meta.get(CONFIG_FILE)) if file is not None]
-    for name in ("output", "save_camera", "plot", "report"):
+    for name in ("output", "save_camera", "plot", "report", "poses"):
         if context.params.get(name) is not None:
             check_not_read([context.params[name]], files)
 
@@ -163,9 +163,15 @@ class Report:
 
 
 def staged_beside(
-    report: Report, reporter: Reporter, layers: Path | None, *, whole_layers: bool
+    report: Report,
+    reporter: Reporter,
+    layers: Path | None,
+    *,
+    whole_layers: bool,
+    poses: Path | None = None,
+    frame: "PosesFrame" = "enu",
 ) -> Callable[["Outputs", "StitchResult"], None]:
-    """What stages the report, and the layers where they are wanted, together with the image."""
+    """What stages the report, and layers and poses where they are wanted, together with the image."""
     if whole_layers and layers is None:
         raise click.UsageError("--whole-layers goes with --layers DIR")
     if layers is not None:
@@ -175,6 +181,13 @@ def staged_beside(
 
     def stage(outputs: "Outputs", result: "StitchResult") -> None:
         report.stage(outputs, result)
+        if poses is not None and result.plan is None:
+            from rdstitch.io.atomic import text_bytes
+            from rdstitch.pipeline import poses_table
+
+            file = poses
+            for message in outputs.attempt(file, lambda: outputs.write(file, text_bytes(poses_table(result, frame)))):
+                reporter.warn(str(message))
         if (folder := layers) is None:
             return
         from rdstitch.pipeline import write_layers

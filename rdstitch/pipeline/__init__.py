@@ -4,6 +4,7 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.composer import Composer
 from rdstitch.pipeline.layers import write_layers
+from rdstitch.pipeline.poses import PosesFrame, poses_table
 from rdstitch.pipeline.recipes import calibrate, mosaic, mosaic_blocks, pano, trajectory
 from rdstitch.pipeline.recomposition import Recomposition
 from rdstitch.pipeline.stage_tiles import place_tiles, tiles
@@ -13,6 +14,7 @@ from rdstitch.stitch_result import StitchResult
 
 __all__ = [
     "Composer",
+    "PosesFrame",
     "Recomposition",
     "Registration",
     "StitchOptions",
@@ -23,6 +25,7 @@ __all__ = [
     "mosaic_blocks",
     "pano",
     "place_tiles",
+    "poses_table",
     "tiles",
     "trajectory",
     "undistort",

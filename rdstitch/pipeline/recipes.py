@@ -300,7 +300,7 @@ def trajectory(
     Trajectory, Registration
         The path, and the registration that it comes from.
     """
-    options = options or StitchOptions()
+    options = replace(options or StitchOptions(), pose_covariance=True)
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         files = [file for file in (output, plot) if file is not None]
         for file in files:

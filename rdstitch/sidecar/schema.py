@@ -16,6 +16,7 @@ from rdstitch.sidecar.write import VERSION
 
 Lens = Literal["division", "division-center", "division2", "division3"]
 Model = Literal["rigid", "similarity", "tilting", "pose", "homography", "rotation"]
+_Row = tuple[float, float, float, float]
 _Positive = Annotated[float, Meta(gt=0.0)]
 _FileName = Annotated[str, Meta(pattern=r"^[^/\\]+$", description="in the folder of the sidecar")]
 _Digest = Annotated[
@@ -113,6 +114,9 @@ class PoseRecord(Struct):
     height: _Positive
     yaw_deg: float
     tilt_deg: Pair
+    covariance: Annotated[
+        tuple[_Row, _Row, _Row, _Row] | None, Meta(description="of x, y, height and yaw, heights and radians")
+    ] = None
 
 
 class ImageRecord(LensRecord, kw_only=True):

@@ -98,6 +98,7 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
                 "height": poses.height[index],
                 "yaw_deg": np.degrees(poses.yaw[index]),
                 "tilt_deg": np.degrees(poses.tilt[index]),
+                "covariance": None if poses.covariance is None else poses.covariance[index],
             }
         entries.append(entry)
     unread = [

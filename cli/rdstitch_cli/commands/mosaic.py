@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -40,6 +40,20 @@ Examples:
     help="Stitch what is left out again while it overlaps: the largest block of images becomes OUTPUT, the others "
     "OUTPUT with -2, -3, … before its suffix.",
 )
+@click.option(
+    "--poses",
+    type=options.IMAGE,
+    metavar="FILE",
+    help="Write the pose of the camera for each image, with covariances: CSV, as 'rdstitch trajectory' does.",
+)
+@click.option(
+    "--frame",
+    type=click.Choice(["enu", "camera", "map"]),
+    default="enu",
+    show_default=True,
+    help="Axes of --poses. enu, camera: of the first image, in heights of it, as for 'rdstitch trajectory'. map: "
+    "easting, northing and height in metres, where the output is georeferenced.",
+)
 @live.follow
 @live.refresh
 def mosaic(
@@ -53,6 +67,8 @@ def mosaic(
     report: Path | None,
     layers: Path | None,
     whole_layers: bool,
+    poses: Path | None,
+    frame: Literal["enu", "camera", "map"],
     as_json: bool,
     reporter: Reporter,
     **given: Any,
@@ -63,20 +79,24 @@ def mosaic(
     list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
+    from rdstitch.io.atomic import check_distinct, check_output
     from rdstitch.pipeline import mosaic as recipe
     from rdstitch.pipeline import mosaic_blocks
 
     if all_blocks and (following or given["strict"]):
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
     with ExitStack() as stack:
-        stitch = stitch_options(reporter, **given)
+        stitch = stitch_options(reporter, pose_covariance=poses is not None, **given)
         named: list[Path] = [] if following else options.resolve(inputs)
         paths: Sequence[Named] = named
+        if poses is not None:
+            check_output(poses, given["overwrite"], named, suffixes=())
+            check_distinct([poses, output, f"{output}.json"])
         report_page = Report(report, reporter, named, given["overwrite"], output)
         if following:
             arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle, refresh=refresh)
             paths = stack.enter_context(arrived)
-        beside = staged_beside(report_page, reporter, layers, whole_layers=whole_layers)
+        beside = staged_beside(report_page, reporter, layers, whole_layers=whole_layers, poses=poses, frame=frame)
         how: dict[str, Any] = {"every": every, "progress": report_page.progress, "beside": beside}
         with report_page.explaining():
             if all_blocks:

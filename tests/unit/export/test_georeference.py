@@ -19,7 +19,7 @@ from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.georeference import Georeference, georeference
 from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition, GroundControl
-from rdstitch.pipeline import StitchOptions, apply, mosaic
+from rdstitch.pipeline import StitchOptions, apply, mosaic, poses_table
 from rdstitch.radial_homography import from_plane
 from rdstitch.report import report_page
 from tests.cli.running import flight, transfers
@@ -309,12 +309,21 @@ def test_positions_and_control_points_from_files(
     np.testing.assert_allclose(result.georeference.pixel_to_map, by_positions.pixel_to_map, atol=0.1)
     record = json.loads((tmp_path / "a.tif.json").read_text(encoding="utf-8"))["output"]["georeference"]
     assert record["source"] == "ground control points"
-    off = {r["name"]: np.hypot(r["east_m"], r["north_m"]) for r in record["residuals"]}
-    assert off.keys() == {path.stem for path in plain}
-    assert max(off.values()) < 4 * METRES_PER_TEXEL
+    away = {r["name"]: np.hypot(r["east_m"], r["north_m"]) for r in record["residuals"]}
+    assert away.keys() == {path.stem for path in plain}
+    assert max(away.values()) < 4 * METRES_PER_TEXEL
     assert "f0" in report_page(result).partition("Place on the Earth")[2][:3000]
     again = apply(tmp_path / "a.tif.json", plain, workers=1)
     assert again.georeference == result.georeference
+    table = np.genfromtxt(poses_table(result, "map").splitlines(), delimiter=",", names=True)
+    # The camera is above the middle of its image but for the tilt, which is the same in all.
+    off = np.stack([table["x"], table["y"]], axis=1) - truth
+    assert np.abs(off).max() < 0.1 * table["height"].mean()
+    assert np.ptp(off, axis=0).max() < 8 * METRES_PER_TEXEL
+    assert np.ptp(table["yaw_deg"]) < 30.0
+    blind = mosaic(plain, options=replace(options, gcp=None))
+    with pytest.raises(ArgumentError, match="there is no map for the poses: 0 of 6 images have a GPS position"):
+        poses_table(blind, "map")
 
 
 def test_images_without_positions_leave_no_world_file(cached: StitchOptions, tmp_path: Path) -> None:
