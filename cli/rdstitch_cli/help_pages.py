@@ -22,7 +22,7 @@ _GROUPS = {
     ),
     "Output": (
         "gsd epsg north_up rotate crop projection max_stretch max_size local_alignment exposure seam blend "
-        "interpolation background quality layers whole_layers all_blocks poses plot as_json"
+        "interpolation background quality layers whole_layers all_blocks poses hugin_project plot as_json"
     ),
     "Control": "strict force dry_run cache max_memory workers scheduler seed verbose config help help_all",
 }

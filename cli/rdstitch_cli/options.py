@@ -395,6 +395,11 @@ stitching = together(
     ),
     layers,
     _file(
+        "--hugin-project",
+        "FILE",
+        "Write a project for Hugin (.pto): all images with lens and pose, and control points.",
+    ),
+    _file(
         "--save-camera",
         "FILE",
         "Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), camera_info.yaml (ROS) and others.",

@@ -23,7 +23,7 @@ from rdstitch.records import Side, convert
 _POWERS = (4, 3, 2)
 _RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE = 0, 2, 3
 _PARAMETER = re.compile(r"([A-Za-z]+)(\"[^\"]*\"|\S*)")
-_HEAD = """# hugin project file
+HEAD = """# hugin project file
 #hugin_ptoversion 2
 """
 
@@ -85,8 +85,8 @@ def read_hugin(text: str, file: str) -> CameraFile:
     return fitted_camera(forward, "Hugin", size, center, focal)
 
 
-def hugin_project(camera: Camera) -> str:
-    """A project with one image of this lens, for "load lens" or as a template."""
+def hugin_lens(camera: Camera) -> tuple[str, LensFit]:
+    """The parameters f, v, a, b, c, d and e of an image line, and how far they are from the lens."""
     # Imported late: no other command should wait for SciPy's optimizers.
     from scipy.optimize import brentq
 
@@ -104,10 +104,16 @@ def hugin_project(camera: Camera) -> str:
     half_width = width / 2 / (samples.focal * scale)
     view = 2.0 * math.degrees(math.atan(half_width) if projection == _RECTILINEAR else half_width)
     d, e = camera.center[0] - (width - 1) / 2, camera.center[1] - (height - 1) / 2
-    lens = f"v{view!r} a{a!r} b{b!r} c{c!r} d{d!r} e{e!r} g0 t0"
+    return f"w{width} h{height} f{projection} v{view!r} a{a!r} b{b!r} c{c!r} d{d!r} e{e!r} g0 t0", fit
+
+
+def hugin_project(camera: Camera) -> str:
+    """A project with one image of this lens, for "load lens" or as a template."""
+    (width, height), (lens, fit) = camera.image_size, hugin_lens(camera)
+    view = next(part[1:] for part in lens.split() if part.startswith("v"))
     return (
-        f'{_HEAD}{comments(camera, fit, "a, b, c")}p f0 w{width} h{height} v{view:.6g} n"TIFF_m c:LZW"\nm i0\n'
-        f'i w{width} h{height} f{projection} {lens} r0 p0 y0 TrX0 TrY0 TrZ0 n"image.jpg"\n'
+        f'{HEAD}{comments(camera, fit, "a, b, c")}p f0 w{width} h{height} v{float(view):.6g} n"TIFF_m c:LZW"\nm i0\n'
+        f'i {lens} r0 p0 y0 TrX0 TrY0 TrZ0 n"image.jpg"\n'
     )
 
 

@@ -3,6 +3,7 @@
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.composer import Composer
+from rdstitch.pipeline.hugin_project import project_of_hugin
 from rdstitch.pipeline.layers import write_layers
 from rdstitch.pipeline.poses import PosesFrame, poses_table
 from rdstitch.pipeline.recipes import calibrate, mosaic, mosaic_blocks, pano, trajectory
@@ -26,6 +27,7 @@ __all__ = [
     "pano",
     "place_tiles",
     "poses_table",
+    "project_of_hugin",
     "tiles",
     "trajectory",
     "undistort",

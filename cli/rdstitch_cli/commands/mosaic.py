@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -67,6 +68,7 @@ def mosaic(
     report: Path | None,
     layers: Path | None,
     whole_layers: bool,
+    hugin_project: Path | None,
     poses: Path | None,
     frame: Literal["enu", "camera", "map"],
     as_json: bool,
@@ -79,9 +81,8 @@ def mosaic(
     list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
-    from rdstitch.io.atomic import check_distinct, check_output
     from rdstitch.pipeline import mosaic as recipe
-    from rdstitch.pipeline import mosaic_blocks
+    from rdstitch.pipeline import mosaic_blocks, poses_table, project_of_hugin
 
     if all_blocks and (following or given["strict"]):
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
@@ -89,14 +90,12 @@ def mosaic(
         stitch = stitch_options(reporter, pose_covariance=poses is not None, **given)
         named: list[Path] = [] if following else options.resolve(inputs)
         paths: Sequence[Named] = named
-        if poses is not None:
-            check_output(poses, given["overwrite"], named, suffixes=())
-            check_distinct([poses, output, f"{output}.json"])
         report_page = Report(report, reporter, named, given["overwrite"], output)
         if following:
             arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle, refresh=refresh)
             paths = stack.enter_context(arrived)
-        beside = staged_beside(report_page, reporter, layers, whole_layers=whole_layers, poses=poses, frame=frame)
+        texts = {poses: partial(poses_table, frame=frame)} | {hugin_project: project_of_hugin}
+        beside = staged_beside(report_page, reporter, layers, whole_layers=whole_layers, texts=texts)
         how: dict[str, Any] = {"every": every, "progress": report_page.progress, "beside": beside}
         with report_page.explaining():
             if all_blocks:
