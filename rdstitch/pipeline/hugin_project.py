@@ -19,7 +19,7 @@ _LARGEST_VIEW = 170.0  # degrees: of a plane seen from one height, which ends at
 
 
 def project_of_hugin(result: StitchResult) -> str:
-    """The project as text: images as their files store them, with yaw, pitch and roll, and over a plane with TrX, TrY and TrZ.
+    """The project: images as their files store them, with yaw, pitch and roll, and over a plane with TrX, TrY, TrZ.
 
     Its panorama is equirectangular, or the plane seen from one height of the reference image.
 

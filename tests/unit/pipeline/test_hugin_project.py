@@ -1,9 +1,9 @@
 """The project for Hugin, read back: control points of two images meet in the panorama."""
 
-import os
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -31,21 +31,20 @@ def _rays(image: dict[str, str], points: FloatArray) -> FloatArray:
     width, height, unit = value["w"], value["h"], min(value["w"], value["h"]) / 2
     bent = points - np.array([(width - 1) / 2 + value["d"], (height - 1) / 2 + value["e"]])
     a, b, c = value["a"], value["b"], value["c"]
-    straight = np.linalg.norm(bent, axis=1) / unit
+    measured = straight = np.linalg.norm(bent, axis=1) / unit
     for _ in range(60):  # r_d = r (a r³ + b r² + c r + 1 - a - b - c)
-        straight = (
-            np.linalg.norm(bent, axis=1) / unit / (((a * straight + b) * straight + c) * straight + 1 - a - b - c)
-        )
-    flat = bent * (straight * unit / np.maximum(np.linalg.norm(bent, axis=1), 1e-12))[:, None]
+        straight = measured / (((a * straight + b) * straight + c) * straight + 1 - a - b - c)
+    flat = bent * (straight / np.maximum(measured, 1e-12))[:, None]
     focal = width / 2 / np.tan(np.radians(value["v"]) / 2)
     rays = np.column_stack([flat / focal, np.ones(len(flat))])
     y, p, r = (np.radians(value[name]) for name in "ypr")
     turn = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
     turn = turn @ np.array([[1, 0, 0], [0, np.cos(p), -np.sin(p)], [0, np.sin(p), np.cos(p)]])
     turn = turn @ np.array([[np.cos(r), -np.sin(r), 0], [np.sin(r), np.cos(r), 0], [0, 0, 1]])
-    rays = rays @ turn.T
+    rays = np.asarray(rays @ turn.T, dtype=np.float64)
     if "TrX" not in value:
-        return rays / np.linalg.norm(rays, axis=1)[:, None]
+        rays /= np.linalg.norm(rays, axis=1)[:, None]
+        return rays
     place = np.array([value["TrX"], value["TrY"], -value["TrZ"]])
     met: FloatArray = place + rays * ((1.0 - place[2]) / rays[:, 2])[:, None]
     return met
@@ -68,8 +67,7 @@ def _turn(folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("taken", [_plane, _turn])
-def test_control_points_meet(taken: "object", tmp_path: Path) -> None:
-    assert callable(taken)
+def test_control_points_meet(taken: Callable[[Path], list[Path]], tmp_path: Path) -> None:
     paths = taken(tmp_path)
     result = mosaic(paths, options=StitchOptions(workers=1, dry_run=True))
     (tmp_path / "a.pto").write_text(text := project_of_hugin(result), encoding="utf-8")
@@ -93,7 +91,7 @@ def test_control_points_meet(taken: "object", tmp_path: Path) -> None:
     assert np.median(off) * focal < 1.0
     lens = read_camera_file(tmp_path / "a.pto").camera
     assert lens.nearest_distortion == pytest.approx(result.distortion, abs=0.01)
-    if (tool := shutil.which("pano_trafo", path=os.environ.get("HUGIN_PATH", os.environ["PATH"]))) is not None:
+    if (tool := shutil.which("pano_trafo")) is not None:
         ends = [[c[n], c[x], c[y]] for c in control for n, x, y in (("n", "x", "y"), ("N", "X", "Y"))]
         given = "\n".join(map(" ".join, ends))
         done = subprocess.run([tool, str(tmp_path / "a.pto")], input=given, capture_output=True, text=True, check=True)
