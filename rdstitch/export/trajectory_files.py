@@ -36,8 +36,11 @@ _PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
 _COLUMNS = ("frame", "name", "source_frame", "timestamp", "x", "y", "yaw_deg", "height")
 
 
-def path_as_svg(path: Trajectory) -> str:
-    """The path seen from above, x to the right and y downwards, with arrows where the camera heads; as SVG."""
+def path_as_svg(path: Trajectory, unit_name: str = "heights") -> str:
+    """The path seen from above, x to the right and y downwards, with arrows where the camera heads; as SVG.
+
+    ``unit_name`` is that of the positions, for the scale bar.
+    """
     low, extent = path.position.min(axis=0), np.ptp(path.position, axis=0)
     unit = _SIDE / max(float(extent.max()), 1e-12)
     points = (path.position - low) * unit + _MARGIN
@@ -59,7 +62,7 @@ def path_as_svg(path: Trajectory) -> str:
 <g stroke="#c33" stroke-width="1.2">{arrows}</g>
 <circle cx="{points[0, 0]:.1f}" cy="{points[0, 1]:.1f}" r="5" fill="#2a2"/>
 <path d="M20,{height - 20:.1f} h{scale * unit:.1f}" stroke="black" stroke-width="2"/>
-<text x="20" y="{height - 26:.1f}" font-size="14">{scale:g}</text>
+<text x="20" y="{height - 26:.1f}" font-size="14">{scale:g} {unit_name}</text>
 </svg>
 """
 

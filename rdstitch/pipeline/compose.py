@@ -290,8 +290,10 @@ def write_page(
     if page is None or written is None:
         return []
 
+    gsd = None if composed.place is None else composed.place.gsd
+
     def stage() -> None:
-        text = viewer_page(output, composed.canvas.size, images(), written.seams, written.origin)
+        text = viewer_page(output, composed.canvas.size, images(), written.seams, written.origin, gsd)
         # Names of files need not be UTF-8.
         outputs.write(page, text.encode("utf-8", "backslashreplace"))
 
