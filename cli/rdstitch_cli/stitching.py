@@ -171,7 +171,7 @@ def staged_beside(
     texts: Mapping[Path | None, Callable[["StitchResult"], str]],
 ) -> Callable[["Outputs", "StitchResult"], None]:
     """What stages the report, the layers where they are wanted, and texts by their files, together with the image."""
-    from rdstitch.io.atomic import check_distinct, check_output
+    from rdstitch.outputs import check_distinct, check_output
 
     given, files = click.get_current_context().params, [file for file in texts if file is not None]
     for file in files:
