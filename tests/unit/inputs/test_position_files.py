@@ -105,7 +105,7 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
         ('{"a": 1}', "expected a list of objects"),
         ("<gpx></gpx>", "has no points with a time"),
         ("<gpx>", "is not XML"),
-        ("<!DOCTYPE a [<!ENTITY b 'c'>]><gpx/>", "has a document type"),
+        ("<!DOCTYPE a [<!ENTITY b 'c'>]><gpx/>", "defines entities"),
         (GPX.replace("2023", "2022"), "the track goes from 2022-11-14T22:13:10 to 2022-11-14T22:13:30 UTC, the images"),
         (GPX.replace('lat="10.0"', 'lat="x"'), "cannot be read"),
     ],
