@@ -62,6 +62,13 @@ class StitchOptions:
         Measured tilt of each image: CSV of name, psi, theta, degrees; or "xmp".
     attitude_std : float
         Standard deviation of these tilts, radians; 0: exact.
+    positions : path, optional
+        Positions of the images instead of those of EXIF; see :mod:`rdstitch.inputs.positions`. Their x and y are in the
+        system of ``composite.epsg``.
+    positions_offset : float
+        Seconds to add to the images' times for those of a GPX track, which are in UTC.
+    gcp : path, optional
+        Ground control points, as OpenDroneMap's ``gcp_list.txt``: they alone place the output on the Earth.
     mask : path, optional
         Image, or folder of them, that is dark where the images do not count.
     channel_order : str
@@ -73,6 +80,8 @@ class StitchOptions:
         Topic of the images in ROS bags; None: the only one.
     reference : str, optional
         Name of the image whose frame is kept; None: the best connected.
+    pose_covariance : bool
+        Compute covariances of the poses, for the sidecar and tables of poses.
     local_alignment : "auto", "off" or int
         Smooth displacements of the images where the ground is rough: where held-out matches come nearer by them,
         never, or always, with so many cells along the longer side of an image.
@@ -120,12 +129,16 @@ class StitchOptions:
     tilt: tuple[float, float] | None = None
     attitude: str | Path | None = None
     attitude_std: float = math.radians(1.0)
+    positions: str | Path | None = None
+    positions_offset: float = 0.0
+    gcp: str | Path | None = None
     mask: str | Path | None = None
     channel_order: ChannelOrder = "bgr"
     exclude: tuple[str, ...] = ()
     include_only: tuple[str, ...] = ()
     topic: str | None = None
     reference: str | None = None
+    pose_covariance: bool = False
     local_alignment: LocalAlignmentMode = "auto"
     composite: CompositeOptions = field(default_factory=CompositeOptions)
     cache: Path | None = None
@@ -161,6 +174,8 @@ class StitchOptions:
             raise ArgumentError(f"the focal length must be positive, not {self.focal}")
         if not 0.0 <= self.attitude_std < float("inf"):
             raise ArgumentError(f"the standard deviation of attitudes must not be negative, not {self.attitude_std}")
+        if not math.isfinite(self.positions_offset):
+            raise ArgumentError(f"positions_offset must be seconds, not {self.positions_offset}")
         if not self.threshold > 0.0 or not 0.0 < self.confidence < 1.0 or self.max_iterations < 1:
             raise ArgumentError("threshold and max_iterations must be positive, confidence between 0 and 1")
         if not self.threshold <= _MAX_THRESHOLD:
@@ -192,7 +207,7 @@ class StitchOptions:
     @property
     def files(self) -> list[Path]:
         """The files that are read besides the images, none of which may be written over."""
-        named = (self.mask, self.attitude, self.lightglue_model, self.features.aliked_model)
+        named = (self.mask, self.attitude, self.positions, self.gcp, self.lightglue_model, self.features.aliked_model)
         given = [Path(file) for file in named if file is not None]
         return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
 

@@ -1,10 +1,11 @@
-"""JSON and YAML as records: every value is checked by its type, and every complaint names the file and the field."""
+"""JSON, YAML and XML as records: values are checked by their types, complaints name the file and the field."""
 
 import json
 import math
 import re
 from collections.abc import Callable
 from typing import Annotated, Any, TypeVar
+from xml.etree import ElementTree
 
 import msgspec
 import numpy as np
@@ -62,6 +63,25 @@ def parse_yaml(text: str, file: str) -> Any:
         raise InputError(f"{file}: line {line}: is not YAML: {error.problem}; no camera file?") from error
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError) as error:
         raise InputError(f"{file}: is not YAML that can be read: {error}") from error
+
+
+def parse_xml(text: str, file: str) -> ElementTree.Element:
+    """The root of XML text whose tags are without their namespaces.
+
+    Raises
+    ------
+    InputError
+        When it is no XML, or defines entities, which can grow without end.
+    """
+    if "<!ENTITY" in text:
+        raise InputError(f"{file}: defines entities, which are not read; remove them")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"{file}: is not XML: {error}") from error
+    for item in root.iter():
+        item.tag = item.tag.rpartition("}")[2]
+    return root
 
 
 def convert(value: Any, kind: Callable[..., Kind], file: str, field: str = "", *, strict: bool = True) -> Kind:

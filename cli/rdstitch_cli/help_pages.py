@@ -16,14 +16,14 @@ _GROUPS = {
     ),
     "Stage": "grid overlap positions positions_only pixel_size search channel flat_field save_flat_field",
     "Input": "following idle refresh every exclude include_only match topic timestamps",
-    "Camera": "distortion lens tilt attitude attitude_std save_camera",
+    "Camera": "distortion lens tilt attitude attitude_std positions_offset gcp save_camera",
     "Features and registration": (
         "features aliked_model lightglue_model max_features work_megapixels solver model threshold"
     ),
     "Output": (
         "gsd epsg north_up rotate straighten rectangle level yaw pitch roll crop projection max_stretch max_size "
-        "local_alignment exposure seam blend interpolation background quality layers whole_layers all_blocks plot "
-        "as_json"
+        "local_alignment exposure seam blend interpolation background quality layers whole_layers all_blocks poses "
+        "hugin_project plot as_json"
     ),
     "Control": "strict force dry_run cache max_memory workers scheduler seed verbose config help help_all",
 }

@@ -147,7 +147,7 @@ lens = together(
     _file(
         "--camera",
         "FILE",
-        "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap or Hugin; its lens is kept.",
+        "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is kept.",
     ),
     distortion,
 )
@@ -170,6 +170,19 @@ known = together(
         default="1",
         show_default=True,
         help="Standard deviation of the attitudes, degrees; 0 for exact ones.",
+    ),
+    _file(
+        "--positions",
+        "FILE",
+        "Where images were taken, instead of EXIF: CSV name,lat,lon or name,x,y (see --crs), exiftool's -csv or -json, "
+        "OpenDroneMap's geo.txt, or a GPX track.",
+    ),
+    _number(
+        "--positions-offset",
+        RealNumber(),
+        0.0,
+        "Seconds to add to the images' times to have those of the GPX track, which are in UTC.",
+        "S",
     ),
 )
 
@@ -363,7 +376,8 @@ compositing = together(
         "--crs",
         "epsg",
         type=EPSG,
-        help="Coordinate system of the map; otherwise UTM on WGS 84. Others than UTM need rasterio.",
+        help="Coordinate system of the map, and of x and y in --positions; otherwise UTM on WGS 84. Others than UTM "
+        "need rasterio.",
     ),
 )
 
@@ -400,11 +414,21 @@ stitching = together(
         "where matches that took no part in it come nearer; a number of cells along an image's longer side: always.",
     ),
     compositing,
+    _file(
+        "--gcp",
+        "FILE",
+        "Ground control points, as OpenDroneMap's gcp_list.txt; they place the output on the Earth.",
+    ),
     layers,
+    _file(
+        "--hugin-project",
+        "FILE",
+        "Write a project for Hugin (.pto): all images with lens and pose, and control points.",
+    ),
     _file(
         "--save-camera",
         "FILE",
-        "Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), camera_info.yaml (ROS) and others.",
+        "Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), .xml (lensfun), camera_info.yaml (ROS) …",
     ),
     registration,
     as_json("the sidecar"),

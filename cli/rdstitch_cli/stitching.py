@@ -3,7 +3,7 @@
 import math
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -102,7 +102,7 @@ def _check_written(read: Iterable[Path | None]) -> None:
 
     context = click.get_current_context()
     files = [file for file in (*read, context.meta.get(CONFIG_FILE)) if file is not None]
-    for name in ("output", "save_camera", "plot", "report"):
+    for name in ("output", "save_camera", "plot", "report", "poses", "hugin_project"):
         if context.params.get(name) is not None:
             check_not_read([context.params[name]], files)
 
@@ -163,9 +163,20 @@ class Report:
 
 
 def staged_beside(
-    report: Report, reporter: Reporter, layers: Path | None, *, whole_layers: bool
+    report: Report,
+    reporter: Reporter,
+    layers: Path | None,
+    *,
+    whole_layers: bool,
+    texts: Mapping[Path | None, Callable[["StitchResult"], str]],
 ) -> Callable[["Outputs", "StitchResult"], None]:
-    """What stages the report, and the layers where they are wanted, together with the image."""
+    """What stages the report, the layers where they are wanted, and texts by their files, together with the image."""
+    from rdstitch.outputs import check_distinct, check_output
+
+    given, files = click.get_current_context().params, [file for file in texts if file is not None]
+    for file in files:
+        check_output(file, given["overwrite"], given["inputs"], suffixes=())
+    check_distinct([*files, given["output"], f"{given['output']}.json"])
     if whole_layers and layers is None:
         raise click.UsageError("--whole-layers goes with --layers DIR")
     if layers is not None:
@@ -175,6 +186,11 @@ def staged_beside(
 
     def stage(outputs: "Outputs", result: "StitchResult") -> None:
         report.stage(outputs, result)
+        for file, text in texts.items():
+            if file is not None and result.plan is None:
+                write_text = partial(_write_text, outputs, file, text, result)
+                for message in outputs.attempt(file, write_text):
+                    reporter.warn(str(message))
         if (folder := layers) is None:
             return
         from rdstitch.pipeline import write_layers
@@ -185,6 +201,12 @@ def staged_beside(
             reporter.warn(str(message))
 
     return stage
+
+
+def _write_text(outputs: "Outputs", file: Path, text: Callable[["StitchResult"], str], result: "StitchResult") -> None:
+    from rdstitch.outputs import text_bytes
+
+    outputs.write(file, text_bytes(text(result)))
 
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:

@@ -163,6 +163,7 @@ def align(
         options.layout_matters,
         None if options.gravity is None else np.asarray(options.gravity, dtype=np.float64),
         disagreement,
+        options.pose_covariance,
     )
     return build_alignment(found)
 

@@ -16,6 +16,7 @@ from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.planarity import coherence, judge_relief
+from rdstitch.alignment.pose_covariance import pose_covariances
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
 from rdstitch.alignment.rotation_frame import levelled
 from rdstitch.alignment.sandwich import sandwich_covariance
@@ -69,6 +70,8 @@ class AdjustedImages:
         Direction down in the axes of every camera; NaN where it is unknown.
     positions_disagree : str
         Why the positions were not used; empty where they were, or where there are none.
+    pose_covariance : bool
+        Whether covariances of the poses are wanted.
     """
 
     cameras: Sequence[Camera]
@@ -83,6 +86,7 @@ class AdjustedImages:
     layout_matters: bool = True
     gravity: FloatArray | None = None
     positions_disagree: str = ""
+    pose_covariance: bool = False
 
 
 def build_alignment(found: AdjustedImages) -> Alignment:
@@ -240,8 +244,12 @@ def _in_frame_of_reference(found: AdjustedImages) -> tuple[FloatArray, PlanarPos
     homographies[found.images] = np.linalg.inv(fit.model.matrices(poses, shared).matrices)
     every = np.full((count, 6), np.nan)
     every[found.images] = fit.model.metric_poses(poses, shared)
+    covariances = []
+    for values in pose_covariances(found.problem, fit) if found.pose_covariance else ():
+        covariances.append(np.full((count, 4, 4), np.nan))
+        covariances[-1][found.images] = values
     return homographies, PlanarPoses(
-        every[:, YAW], every[:, [X, Y]], np.exp(every[:, LOG_HEIGHT]), every[:, [PSI, THETA]]
+        every[:, YAW], every[:, [X, Y]], np.exp(every[:, LOG_HEIGHT]), every[:, [PSI, THETA]], *covariances
     )
 
 

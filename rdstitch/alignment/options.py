@@ -43,6 +43,8 @@ class AlignmentOptions:
         Whether a turn on the spot is taken where a plane explains the images as well.
     layout_matters : bool
         Whether images are to be laid out on the plane, so that an absurd layout rules a model out.
+    pose_covariance : bool
+        Compute covariances of the poses, in time that grows with the square of the number of images.
     most : int
         Correspondences used of each link at most; fewer where there are thousands of links.
     """
@@ -58,6 +60,7 @@ class AlignmentOptions:
     lens: str = "auto"
     prefer_turn: bool = False
     layout_matters: bool = True
+    pose_covariance: bool = False
     most: int = 250
 
     def __post_init__(self) -> None:

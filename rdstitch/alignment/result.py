@@ -60,12 +60,24 @@ class PlanarPoses:
         Height above the plane in the same unit.
     tilt : ndarray of shape (N, 2)
         (ψ, θ), radians.
+    covariance, with_first : ndarray of shape (N, 4, 4), or None
+        Of x, y, height and yaw: of each image, and of each with the first that is used; where they were asked for.
     """
 
     yaw: FloatArray
     position: FloatArray
     height: FloatArray
     tilt: FloatArray
+    covariance: FloatArray | None = None
+    with_first: FloatArray | None = None
+
+    def turned(self, matrix: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
+        """The covariances after a rotation (2, 2) of the plane."""
+        if self.covariance is None or self.with_first is None:
+            return None, None
+        change = np.eye(4)
+        change[:2, :2] = matrix
+        return change @ self.covariance @ change.T, change @ self.with_first @ change.T
 
 
 @dataclass(frozen=True)

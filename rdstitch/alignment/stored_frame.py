@@ -102,7 +102,8 @@ def _turned_poses(poses: PlanarPoses, turn: FloatArray, reference: int) -> tuple
     yaw = np.arctan2(level[:, 1, 0], level[:, 0, 0])
     plane = _about_axis(yaw[reference])
     yaw = np.remainder(yaw - yaw[reference] + np.pi, 2.0 * np.pi) - np.pi
-    return PlanarPoses(yaw, poses.position @ plane[:2, :2].T, poses.height, tilt), plane
+    around = plane[:2, :2]
+    return PlanarPoses(yaw, poses.position @ around.T, poses.height, tilt, *poses.turned(around)), plane
 
 
 def _about_axis(angle: FloatArray) -> FloatArray:

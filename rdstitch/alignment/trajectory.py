@@ -38,6 +38,8 @@ class Trajectory:
         Number of each frame in the video or bag that it was taken from, else in the sequence.
     timestamp : ndarray of shape (F,), or None
         s; NaN where not known.
+    covariance : ndarray of shape (F, 4, 4), or None
+        Of x, y, height and yaw, relative to the first frame, in the unit of the positions and radians.
     """
 
     frame: NDArray[np.intp]
@@ -47,6 +49,7 @@ class Trajectory:
     name: tuple[str, ...] = ()
     source_frame: NDArray[np.intp] | None = None
     timestamp: FloatArray | None = None
+    covariance: FloatArray | None = None
 
     def labelled(self, names: Sequence[str], numbers: ArrayLike, timestamps: ArrayLike) -> Self:
         """The same with name, number and time stamp of each image of the whole sequence."""
@@ -94,7 +97,40 @@ class Trajectory:
         turned = (poses.position[frame] - poses.position[first]) @ np.array([[c, -s], [s, c]]).T
         unit = height / poses.height[first]
         yaw = np.unwrap(poses.yaw[frame] - poses.yaw[first])
-        return cls(frame, turned * unit, yaw, poses.height[frame] * unit)
+        path = cls(frame, turned * unit, yaw, poses.height[frame] * unit)
+        if poses.covariance is None or poses.with_first is None:
+            return path
+        one, both = poses.covariance[frame], poses.with_first[frame]
+        own = np.diag([unit, unit, unit, 1.0])
+        own[:2, :2] = unit * np.array([[c, -s], [s, c]])
+        # The first frame moves all others: by its place, by its height, which is the unit, and by its yaw.
+        first_moves = np.tile(-own, (len(frame), 1, 1))
+        first_moves[:, :2, 2] = -path.position / poses.height[first]
+        first_moves[:, 2, 2] = -path.height / poses.height[first]
+        first_moves[:, :2, 3] = np.stack([-path.position[:, 1], path.position[:, 0]], axis=1)
+        mixed = own @ both @ first_moves.transpose(0, 2, 1)
+        moved = first_moves @ one[0] @ first_moves.transpose(0, 2, 1)
+        return replace(path, covariance=own @ one @ own.T + mixed + mixed.transpose(0, 2, 1) + moved)
+
+    @classmethod
+    def on_map(cls, poses: PlanarPoses, to_map: FloatArray) -> Self:
+        """The poses that are not NaN on a map: positions are (easting, -northing), so that "enu" gives both.
+
+        Parameters
+        ----------
+        to_map : ndarray of shape (2, 3)
+            A similarity from the plane of the poses, y downwards, to easting and northing.
+        """
+        frame = np.flatnonzero(np.isfinite(poses.yaw))
+        change = np.diag([1.0, -1.0]) @ to_map
+        unit, turn = math.hypot(to_map[0, 0], to_map[1, 0]), math.atan2(to_map[1, 0], to_map[0, 0])
+        position = poses.position[frame] @ change[:, :2].T + change[:, 2]
+        path = cls(frame, position, np.unwrap(poses.yaw[frame] + turn), poses.height[frame] * unit)
+        if poses.covariance is None:
+            return path
+        whole = np.diag([1.0, 1.0, unit, 1.0])
+        whole[:2, :2] = change[:, :2]
+        return replace(path, covariance=whole @ poses.covariance[frame] @ whole.T)
 
     def __repr__(self) -> str:
         """One line: the number of frames and the length of the path."""

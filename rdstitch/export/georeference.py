@@ -1,7 +1,8 @@
-"""Where the output lies on the Earth, by the positions in the images' EXIF: GeoTIFF tags, or a world file.
+"""Where the output lies on the Earth, by the images' positions or ground control points: GeoTIFF tags, or a world file.
 
 The output is a plane seen straight from above, so that a similarity takes its pixels to map coordinates. It is fitted
-robustly to the positions of the cameras, which are taken to be above the centres of their images.
+robustly to ground control points, or to the positions of the cameras, which are taken to be above the centres of their
+images.
 """
 
 import math
@@ -15,8 +16,8 @@ from numpy.typing import ArrayLike
 from rdstitch.alignment.position_priors import POSITION_STD
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.export.crs import Crs
-from rdstitch.io.metadata import GpsPosition
+from rdstitch.crs import WGS84, Crs
+from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.radial_homography import to_plane
 from rdstitch.robust.similarity_fit import fit_similarity
@@ -25,8 +26,25 @@ MIN_POSITIONS = 3
 # Positions must agree with the images to this share of their own spread: else it is no view from above, or the GPS
 # says less than nothing.
 _MAX_ERROR = 0.25
+_CONTROL_STD = 0.03  # m: of a point surveyed by satellite with corrections
+_GPS, _CONTROL = "GPS positions", "ground control points"
 _MODEL_SCALE, _MODEL_TIEPOINT, _MODEL_TRANSFORMATION, _GEO_KEYS = 33550, 33922, 34264, 34735
 _SHORT, _DOUBLE = 3, 12
+
+
+@dataclass(frozen=True)
+class Residual:
+    """How far east and north of a position, of an image or a control point, the output has it, m."""
+
+    name: str
+    east: float
+    north: float
+    used: bool
+
+    @property
+    def off(self) -> float:
+        """The distance, m."""
+        return math.hypot(self.east, self.north)
 
 
 @dataclass(frozen=True)
@@ -42,19 +60,28 @@ class Georeference:
         Easting + i northing of the centre of the top-left pixel, m.
     rms : float
         Root mean square distance of the positions used from where the images put them, m.
-    used, positions : int
-        Of the positions, how many were used, and how many there are.
-    rejected : tuple of (str, float)
-        Names of images whose positions were not used, and how far these are off, m.
+    source : str
+        What the positions are.
+    residuals : tuple of Residual
+        Of every position.
     """
 
     crs: Crs
     scale: complex
     origin: complex
     rms: float
-    used: int = 0
-    positions: int = 0
-    rejected: tuple[tuple[str, float], ...] = ()
+    source: str = _GPS
+    residuals: tuple[Residual, ...] = ()
+
+    @property
+    def used(self) -> int:
+        """How many positions were used."""
+        return sum(residual.used for residual in self.residuals)
+
+    @property
+    def rejected(self) -> tuple[tuple[str, float], ...]:
+        """Names of images, or control points, whose positions were not used, and how far these are off, m."""
+        return tuple((residual.name, residual.off) for residual in self.residuals if not residual.used)
 
     @property
     def gsd(self) -> float:
@@ -76,8 +103,8 @@ class Georeference:
         """Everything that there is to say of it, in one line."""
         turned = "" if self.north_up else f", north {abs(self.clockwise_deg):.1f}° {self._side} of up"
         return (
-            f"georeferenced: {self.crs.name}, {self.gsd:.4g} m a pixel{turned}; {self.used} of {self.positions} GPS "
-            f"positions used, {self.rms:.1f} m rms"
+            f"georeferenced: {self.crs.name}, {self.gsd:.4g} m a pixel{turned}; {self.used} of {len(self.residuals)} "
+            f"{self.source} used, {self.rms:.2f} m rms"
         )
 
     @property
@@ -150,6 +177,7 @@ def georeference(
     to_output: FloatArray,
     names: Sequence[str],
     epsg: int | None = None,
+    control: Sequence[Sequence[GroundControl]] = (),
 ) -> tuple[Georeference | None, str]:
     """Place the output on the Earth, or say why that cannot be done.
 
@@ -162,7 +190,9 @@ def georeference(
     names : sequence of str
         Of the images.
     epsg : int, optional
-        Of the map coordinates; None: UTM on WGS 84.
+        Of the map coordinates; None: that of the control points, else UTM on WGS 84.
+    control : sequence of sequence of GroundControl, optional
+        That each image shows; where there are any, positions do not count.
 
     Returns
     -------
@@ -172,36 +202,50 @@ def georeference(
     Raises
     ------
     ArgumentError
-        When the coordinate system cannot be used; see :class:`rdstitch.export.crs.Crs`.
+        When the coordinate system cannot be used; see :class:`rdstitch.crs.Crs`.
     """
-    known = [k for k, position in enumerate(positions) if position is not None]
-    if not has_place(positions):
-        return None, f"{len(known)} of {len(positions)} images have a GPS position, and {MIN_POSITIONS} are needed"
-    latitude, longitude = np.array([(p.latitude, p.longitude) for p in positions if p is not None]).T
+    source, std = (_CONTROL, _CONTROL_STD) if any(control) else (_GPS, POSITION_STD)
+    if source == _GPS:
+        control = [
+            () if place is None else (GroundControl(name, place, WGS84, _middle(camera)),)
+            for name, place, camera in zip(names, positions, cameras, strict=True)
+        ]
+    # A control point that several images show counts once, at the mean of where they have it.
+    shown: dict[str | int, list[tuple[GroundControl, complex]]] = {}
+    for k, points in enumerate(control):
+        for point in points:
+            x, y = to_plane(cameras[k], to_output[k], np.array([point.pixel])).reshape(2)
+            shown.setdefault(k if source == _GPS else point.name, []).append((point, complex(x, -y)))
+    known = [same[0][0] for same in shown.values()]
+    if len(known) < MIN_POSITIONS:
+        what = f"of {len(names)} images have a GPS position" if source == _GPS else f"{source} are in the images"
+        return None, f"{len(known)} {what}, and {MIN_POSITIONS} are needed"
+    latitude, longitude = np.array([(point.place.latitude, point.place.longitude) for point in known]).T
+    if epsg is None and known[0].epsg != WGS84:
+        epsg = known[0].epsg
     crs = Crs.utm(float(np.median(latitude)), float(np.median(longitude))) if epsg is None else Crs(epsg)
     places = crs.project(latitude, longitude) @ np.array([1, 1j])
-    middles = np.stack([_middle(cameras[k], to_output[k]) for k in known]) @ np.array([1, -1j])
-    usable = np.isfinite(places) & np.isfinite(middles)
+    pixels = np.array([np.mean([pixel for _, pixel in same]) for same in shown.values()])
+    usable = np.isfinite(places) & np.isfinite(pixels)
     if usable.sum() < MIN_POSITIONS:
-        return None, f"{crs.name} does not reach the GPS positions"
-    fit = fit_similarity(middles[usable], places[usable], POSITION_STD)
+        return None, f"{crs.name} does not reach the {source}"
+    fit = fit_similarity(pixels[usable], places[usable], std)
     used = np.zeros(len(known), dtype=bool)
     used[usable] = fit.inliers
-    away = np.full(len(known), np.inf)
-    away[usable] = fit.residuals
-    rms = math.sqrt(float(np.mean(away[used] ** 2)))
+    off = np.full(len(known), complex(np.inf))
+    off[usable] = fit.scale * pixels[usable] + fit.origin - places[usable]
+    rms = math.sqrt(float(np.mean(np.abs(off[used]) ** 2)))
     spread = math.sqrt(float(np.mean(np.abs(places[used] - places[used].mean()) ** 2)))
     # Four of the coordinates are used up by the fit: three positions agree with anything to some extent.
     free = max(1.0 - 2.0 / max(int(used.sum()), 1), 1e-9)
     if used.sum() < max(MIN_POSITIONS, len(known) / 2) or not rms < _MAX_ERROR * spread * math.sqrt(free):
-        return None, (
-            f"the GPS positions are {float(np.median(away)):.1f} m off in the median, and spread over {spread:.1f} m"
-        )
-    rejected = tuple((names[known[k]], float(away[k])) for k in np.flatnonzero(~used))
-    return Georeference(crs, fit.scale, fit.origin, rms, int(used.sum()), len(known), rejected), ""
+        median = float(np.median(np.abs(off)))
+        return None, f"the {source} are {median:.1f} m off in the median, and spread over {spread:.1f} m"
+    residuals = tuple(Residual(p.name, e.real, e.imag, u) for p, e, u in zip(known, off, used.tolist(), strict=True))
+    return Georeference(crs, fit.scale, fit.origin, rms, source, residuals), ""
 
 
-def _middle(camera: Camera, to_output: FloatArray) -> FloatArray:
-    """Where the centre of an image lies in the output, pixels."""
+def _middle(camera: Camera) -> tuple[float, float]:
+    """The centre of an image, pixels."""
     width, height = camera.image_size
-    return to_plane(camera, to_output, np.array([[(width - 1) / 2, (height - 1) / 2]])).reshape(2)
+    return (width - 1) / 2, (height - 1) / 2

@@ -31,11 +31,16 @@ _SIGNS: dict[TrajectoryFrame, float] = {"enu": -1.0, "camera": 1.0}
 _SIDE = 800.0  # pixels of the drawing's longer side
 _MARGIN = 60.0  # pixels
 _ARROWS = 40  # at most so many headings are drawn
+_POSE = ("x", "y", "height", "yaw_deg")  # in the order of covariances
+_PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
 _COLUMNS = ("frame", "name", "source_frame", "timestamp", "x", "y", "yaw_deg", "height")
 
 
-def path_as_svg(path: Trajectory) -> str:
-    """The path seen from above, x to the right and y downwards, with arrows where the camera heads; as SVG."""
+def path_as_svg(path: Trajectory, unit_name: str = "heights") -> str:
+    """The path seen from above, x to the right and y downwards, with arrows where the camera heads; as SVG.
+
+    ``unit_name`` is that of the positions, for the scale bar.
+    """
     low, extent = path.position.min(axis=0), np.ptp(path.position, axis=0)
     unit = _SIDE / max(float(extent.max()), 1e-12)
     points = (path.position - low) * unit + _MARGIN
@@ -57,7 +62,7 @@ def path_as_svg(path: Trajectory) -> str:
 <g stroke="#c33" stroke-width="1.2">{arrows}</g>
 <circle cx="{points[0, 0]:.1f}" cy="{points[0, 1]:.1f}" r="5" fill="#2a2"/>
 <path d="M20,{height - 20:.1f} h{scale * unit:.1f}" stroke="black" stroke-width="2"/>
-<text x="20" y="{height - 26:.1f}" font-size="14">{scale:g}</text>
+<text x="20" y="{height - 26:.1f}" font-size="14">{scale:g} {unit_name}</text>
 </svg>
 """
 
@@ -73,19 +78,24 @@ def in_frame(x: float, y: float, frame: TrajectoryFrame) -> tuple[float, float]:
 
 
 def as_csv(path: Trajectory, frame: TrajectoryFrame) -> str:
-    """A table with a header; what is not known of a frame is empty."""
+    """A table with a header; what is not known of a frame is empty. Covariances, if known, are the last ten columns."""
     count = len(path)
     names = path.name or ("",) * count
     numbers = path.frame if path.source_frame is None else path.source_frame
     times = np.full(count, np.nan) if path.timestamp is None else path.timestamp
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(_COLUMNS)
-    rows = zip(path.frame, names, numbers, times, path.position, np.degrees(path.yaw), path.height, strict=True)
-    for index, name, number, time, (x, y), yaw, height in rows:
+    covariances = np.zeros((count, 0))
+    if path.covariance is not None:
+        units = np.array([1.0, _SIGNS[frame], 1.0, np.degrees(1.0)])
+        covariances = np.stack([(path.covariance * np.outer(units, units))[:, i, j] for i, j in _PAIRS], axis=1)
+    table.writerow([*_COLUMNS, *(f"cov_{_POSE[i]}_{_POSE[j]}" for i, j in _PAIRS if covariances.size)])
+    poses = (path.position, np.degrees(path.yaw), path.height)
+    rows = zip(path.frame, names, numbers, times, *poses, covariances + 0.0, strict=True)
+    for index, name, number, time, (x, y), yaw, height, more in rows:
         seconds = f"{time:.6f}" if np.isfinite(time) else ""
-        pose = (*in_frame(x, y, frame), yaw, height)
-        table.writerow([index, name, number, seconds, *(f"{value:.9g}" for value in pose)])
+        pose = (*in_frame(x, y, frame), yaw, height, *more)
+        table.writerow([index, name, number, seconds, *(f"{value:.10g}" for value in pose)])
     return text.getvalue()
 
 

@@ -20,7 +20,7 @@ from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.io.flat_field import FlatField
 from rdstitch.io.mask import read_mask
-from rdstitch.io.metadata import Metadata, read_metadata
+from rdstitch.io.metadata import GroundControl, Metadata, read_metadata
 from rdstitch.io.read import DecodedImage, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
 from rdstitch.messages import Message, left_out
@@ -55,6 +55,8 @@ class Source:
         What notices changes of the file, and damage.
     flat_field : FlatField or None
         Illumination that is taken out of the pixels.
+    control : tuple of GroundControl
+        Points of known place that it shows.
     """
 
     path: Path
@@ -69,6 +71,7 @@ class Source:
     )
     guard: InputGuard = field(default_factory=InputGuard, compare=False, repr=False)
     flat_field: FlatField | None = field(default=None, compare=False, repr=False)
+    control: tuple[GroundControl, ...] = ()
 
     @property
     def name(self) -> str:

@@ -51,6 +51,19 @@ class GpsPosition:
 
 
 @dataclass(frozen=True)
+class GroundControl:
+    """A point whose place is known: its name, the place, and the pixel of an image that shows it.
+
+    ``epsg`` is the code of the coordinate system that the place was given in.
+    """
+
+    name: str
+    place: GpsPosition
+    epsg: int
+    pixel: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class Metadata:
     """Everything known of an image file beside its pixels.
 

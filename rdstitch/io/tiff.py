@@ -1,8 +1,8 @@
 """TIFF from strips: compressed, BigTIFF where needed, with overviews of half the size again and again.
 
-Images are tiled, but for grey ones of 8 bits with alpha: OpenCV (4.11 to 5.0) reads tiles of two samples as stripes,
-and strips of them rightly. Deeper grey samples with alpha are something that Pillow does not read and OpenCV reduces to
-8 bits; their transparency is a mask on a page of its own, as GDAL writes it, and every program reads the first page.
+Grey samples with alpha are something that OpenCV (4.11 to 5.0) reads as stripes or reduces to 8 bits, and that Pillow
+does not read where they are deeper; their transparency is a mask on a page of its own, as GDAL writes it, and every
+program reads the first page. Where there are overviews, the file is in the order of a Cloud Optimized GeoTIFF.
 
 Overviews are made while the strips pass, and wait in temporary files beside the output until their turn; memory is that
 of one strip, whatever the size of the image.
@@ -20,13 +20,13 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from rdstitch.io.cloud_tiff import put_in_order
 from rdstitch.io.layout import STRIP_ROWS, Layout, Strip, with_alpha
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.reduction import halved
 
 TILE = 256
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
-_STRIP = 64  # rows
 # Smaller images need no overview.
 _MIN_OVERVIEW = 256
 # Rows that are reduced at a time, even.
@@ -69,11 +69,13 @@ def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: 
                 mask.clear()
             if spill is not None:
                 joined = _reread(spill, sizes[level + 1], layout)
+    if len(sizes) > 1:
+        put_in_order(path)
 
 
 def _has_mask(layout: Layout) -> bool:
     """Whether transparency goes onto a page of its own."""
-    return layout.transparent and layout.channels == 1 and layout.dtype != np.uint8
+    return layout.transparent and layout.channels == 1
 
 
 def _write_page(
@@ -91,16 +93,14 @@ def _write_page(
     colour = 3 if layout.channels == 3 else 1
     extra = ["unspecified"] * (layout.channels - colour) + ["unassalpha"] * transparent
     dpi = None if kind else layout.metadata.dpi
-    tiled = samples != 2
     tiff.write(
-        (encoded_tile(block) for block in (tiles_of(strips) if tiled else _short_strips(strips))),
+        (encoded_tile(tile) for tile in tiles_of(strips)),
         shape=(height, width, samples) if samples > 1 else (height, width),
         dtype=layout.dtype,
         photometric="rgb" if colour == 3 else "minisblack",
         planarconfig="contig" if samples > 1 else None,
         extrasamples=extra or None,
-        tile=(TILE, TILE) if tiled else None,
-        rowsperstrip=None if tiled else _STRIP,
+        tile=(TILE, TILE),
         compression="zlib",
         predictor=has_predictor(layout.dtype),
         # Tiles that tifffile holds before it writes them; 256 MB by default.
@@ -146,11 +146,6 @@ def tiles_of(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
                 tile = strip[y : y + TILE, x : x + TILE]
                 missing = [(0, TILE - n) for n in tile.shape[:2]] + [(0, 0)]
                 yield np.pad(tile, missing) if any(b for _, b in missing) else tile
-
-
-def _short_strips(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
-    for strip in strips:
-        yield from (strip[y : y + _STRIP] for y in range(0, strip.shape[0], _STRIP))
 
 
 def has_predictor(dtype: np.dtype[Any]) -> bool:

@@ -257,6 +257,7 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
         attitudes_std=options.attitude_std,
         gravity=_gravity(sources, back),
         positions=positions_of(sources) if sources else None,
+        pose_covariance=options.pose_covariance,
     )
 
 

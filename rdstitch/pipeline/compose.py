@@ -25,7 +25,7 @@ from rdstitch.compositing.blocks import Block, BlockRunner
 from rdstitch.compositing.tiles import OutputStrip
 from rdstitch.errors import OutputError
 from rdstitch.executors import in_order
-from rdstitch.export.georeference import Georeference, has_place, world_file_paths
+from rdstitch.export.georeference import Georeference, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space
@@ -194,7 +194,7 @@ def _files_beside(output: str | Path | None, placed: PlacedImages, overwrite: bo
     """The world files that will be written; they and the viewer's page must not exist, or be replaceable."""
     if output is None:
         return ()
-    world_files = tuple(map(Path, world_file_paths(output))) if has_place(placed.positions) else ()
+    world_files = tuple(map(Path, world_file_paths(output))) if placed.has_place else ()
     page = viewer_path(output)
     for file in world_files:
         check_output(file, overwrite, suffixes=())
@@ -290,8 +290,10 @@ def write_page(
     if page is None or written is None:
         return []
 
+    gsd = None if composed.place is None else composed.place.gsd
+
     def stage() -> None:
-        text = viewer_page(output, composed.canvas.size, images(), written.seams, written.origin)
+        text = viewer_page(output, composed.canvas.size, images(), written.seams, written.origin, gsd)
         # Names of files need not be UTF-8.
         outputs.write(page, text.encode("utf-8", "backslashreplace"))
 

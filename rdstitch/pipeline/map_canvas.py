@@ -1,20 +1,20 @@
 """The canvas of georeferenced images: north up, and of the ground sample distance that was requested."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from rdstitch.compositing import Canvas, CompositeOptions
+from rdstitch.crs import Crs
 from rdstitch.errors import ArgumentError
-from rdstitch.export.crs import Crs
 from rdstitch.export.georeference import MIN_POSITIONS, Georeference, georeference, has_place
 from rdstitch.inputs.source import Source
 from rdstitch.messages import MAX_NAMED, Message
 from rdstitch.pipeline.placed_images import PlacedImages, plan
 
 
-def check_map(sources: Iterable[Source], options: CompositeOptions) -> None:
+def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
     """Find out before long work whether what is requested of the map can be had.
 
     Raises
@@ -24,9 +24,13 @@ def check_map(sources: Iterable[Source], options: CompositeOptions) -> None:
     """
     if options.epsg is not None:
         Crs(options.epsg)
+    placed = has_place([source.metadata.gps for source in sources]) or any(source.control for source in sources)
     for name, value in (("gsd", options.gsd), ("crs", options.epsg)):
-        if value is not None and not has_place([source.metadata.gps for source in sources]):
-            raise ArgumentError(f"{name} needs GPS positions of {MIN_POSITIONS} images in their EXIF; leave it out")
+        if value is not None and not placed:
+            raise ArgumentError(
+                f"{name} needs GPS positions of {MIN_POSITIONS} images, in EXIF or a file, or ground control points; "
+                "leave it out"
+            )
 
 
 def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas, Georeference | None, str]:
@@ -45,7 +49,8 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
     else:
         names = [source.name for source in placed.sources]
         to_output = canvas.matrix @ placed.homographies
-        place, reason = georeference(placed.positions, placed.cameras, to_output, names, options.epsg)
+        control = [source.control for source in placed.sources]
+        place, reason = georeference(placed.positions, placed.cameras, to_output, names, options.epsg, control)
     if place is None:
         if options.gsd is not None:
             raise ArgumentError(f"gsd needs a georeferenced output: {reason}; leave it out")
@@ -71,7 +76,7 @@ def moved(place: Georeference | None, one: Canvas, other: Canvas) -> Georeferenc
 def place_messages(place: Georeference | None, reason: str, placed: PlacedImages) -> list[Message]:
     """What the user should know of the place; nothing where hardly an image has a position."""
     if place is None:
-        return [Message(f"not georeferenced: {reason}")] if has_place(placed.positions) else []
+        return [Message(f"not georeferenced: {reason}")] if placed.has_place else []
     found = [Message(place.summary, severity="note")]
     if place.rejected:
         names = [name for name, _ in place.rejected]
@@ -79,7 +84,7 @@ def place_messages(place: Georeference | None, reason: str, placed: PlacedImages
         off = max(away for _, away in place.rejected)
         found.append(
             Message(
-                f"GPS positions that the images contradict, by up to {off:.0f} m, were not used: "
+                f"{place.source} that the images contradict, by up to {off:.0f} m, were not used: "
                 f"{', '.join(names[:MAX_NAMED])}{more}"
             )
         )

@@ -16,7 +16,7 @@ from rdstitch.compositing.near_part import NearPart
 from rdstitch.compositing.placed_image import Displacement, PlacedImage, place_images
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.errors import ArgumentError
-from rdstitch.export.georeference import Georeference
+from rdstitch.export.georeference import Georeference, has_place
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.read import DecodedImage
@@ -119,6 +119,11 @@ class PlacedImages:
     def positions(self) -> list[GpsPosition | None]:
         """Where each image was taken; a camera that turned on the spot was at one place, and shows no plane."""
         return [None if self.turned else source.metadata.gps for source in self.sources]
+
+    @property
+    def has_place(self) -> bool:
+        """Whether enough is known for a place of the output on the Earth to be expected."""
+        return has_place(self.positions) or (not self.turned and any(source.control for source in self.sources))
 
     def images(self, near: Sequence[NearPart | None]) -> list[PlacedImage]:
         """As the compositor takes them, with only the near parts of those that are not drawn whole."""

@@ -7,6 +7,7 @@ from rdstitch.inputs.find import natural_key
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.measurements import with_attitudes
+from rdstitch.inputs.positions import with_ground_control, with_positions
 from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO
@@ -43,7 +44,7 @@ def read_frames(
 def read_inputs(
     frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool
 ) -> tuple[list[Source], list[Message]]:
-    """The images that options leave, with masks and attitudes; and why others cannot be read.
+    """The images that options leave, with what was measured of them; and why others cannot be read.
 
     Raises
     ------
@@ -61,4 +62,6 @@ def read_inputs(
         twice = f"{chosen[0].path} is named twice: " if len(chosen) > 1 else ""
         raise ArgumentError(f"{twice}stitching needs two different images or more; name at least one more")
     sources = with_attitudes(with_masks(sources, options.mask), options.attitude)
+    sources = with_positions(sources, options.positions, options.composite.epsg, options.positions_offset)
+    sources = with_ground_control(sources, options.gcp)
     return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), unread

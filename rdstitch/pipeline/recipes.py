@@ -291,7 +291,7 @@ def trajectory(
     plot : path, optional
         SVG file to draw the path to.
     height : float
-        Height of the first frame above the plane, in the unit that positions shall have.
+        Height of the first frame above the plane, metres; positions are in metres then, and in heights with 1.
     frame : str, optional
         "enu" or "camera": the axes of the file, see :mod:`rdstitch.export.trajectory_files`. "enu" if not given, but
         for "kitti", whose axes are the camera's.
@@ -301,7 +301,7 @@ def trajectory(
     Trajectory, Registration
         The path, and the registration that it comes from.
     """
-    options = options or StitchOptions()
+    options = replace(options or StitchOptions(), pose_covariance=True)
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         files = [file for file in (output, plot) if file is not None]
         for file in files:
@@ -324,8 +324,8 @@ def trajectory(
         if output is not None:
             outputs.write(output, text_bytes(WRITERS[layout](path, frame or frame_of(layout))))
         if plot is not None:
-            file = plot
-            failed = outputs.attempt(file, lambda: outputs.write(file, text_bytes(path_as_svg(path))))
+            file, drawn = plot, path_as_svg(path, "heights" if height == 1.0 else "m")
+            failed = outputs.attempt(file, lambda: outputs.write(file, text_bytes(drawn)))
             registration = registration.with_messages(failed)
     return path, registration
 

@@ -6,12 +6,12 @@ import numpy as np
 
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.report.geometry import of_mosaic
-from rdstitch.report.svg import BLUE, GREY, YELLOW, drawing, element, joined, label, line, path, section
+from rdstitch.report.svg import BLUE, GREY, YELLOW, drawing, element, joined, label, line, path, section, table
 from rdstitch.stitch_result import StitchResult
 from rdstitch.viewer import viewer_path
 
 _MOSAIC_SIDE = 1200
-_MAX_NAMES = 12
+_MAX_NAMES, _MAX_RESIDUALS = 12, 20
 _WIDTH, _COLUMNS, _GAP, _TEXT = 940.0, 4, 12.0, 18.0
 _ARROWS = 9  # along the longer side of an image
 _LONGEST = 0.8  # of the distance between arrows, for the largest displacement of all images
@@ -42,6 +42,17 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
     page = None if result.output is None else viewer_path(result.output)
     more = "" if page is None else f" {page.name} beside it shows it with zoom."
     return section("Mosaic", f"{name}{width} x {height} pixels; outlines are those of the images in it.{more}", shown)
+
+
+def place(result: StitchResult) -> str:
+    """Where the output lies on the Earth, and the largest residuals of the positions that say so."""
+    found = result.georeference
+    if found is None:
+        return ""
+    residuals = sorted(found.residuals, key=lambda residual: -residual.off)[:_MAX_RESIDUALS]
+    rows = [(r.name, f"{r.east:+.3f}", f"{r.north:+.3f}", "" if r.used else "not used") for r in residuals]
+    explanation = f"{found.summary}. Where the output has them less where they were measured to be, the largest first:"
+    return section("Place on the Earth", explanation, table([("", "east, m", "north, m", ""), *rows]))
 
 
 def local_alignment(result: StitchResult) -> str:

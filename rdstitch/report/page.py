@@ -8,7 +8,7 @@ from rdstitch.outputs import Outputs
 from rdstitch.registration import Registration
 from rdstitch.report.camera_path import path_over_plane
 from rdstitch.report.lens import grid, lens_curve, votes
-from rdstitch.report.output import local_alignment, mosaic
+from rdstitch.report.output import local_alignment, mosaic, place
 from rdstitch.report.pairs import match_graph, matched, residual_map
 from rdstitch.report.stage import stage
 from rdstitch.report.summary import notices, run, summary, timings
@@ -87,6 +87,7 @@ def report_page(
         notices(registration),
         stage(registration),
         "" if stitched is None else mosaic(stitched, staged),
+        "" if stitched is None else place(stitched),
         match_graph(registration),
         votes(registration),
         grid(registration),

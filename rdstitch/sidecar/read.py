@@ -10,9 +10,9 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
+from rdstitch.crs import Crs
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.export.crs import Crs
-from rdstitch.export.georeference import Georeference
+from rdstitch.export.georeference import Georeference, Residual
 from rdstitch.file_access import read_text
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.outputs import Fingerprint, fingerprint, tiles_folder
@@ -146,9 +146,16 @@ def _place(output: "OutputRecord") -> Georeference | None:
         complex(a, b),
         complex(east, north),
         record.rms_m,
-        record.positions_used,
-        record.positions,
-        tuple((item.name, math.inf if item.off_m is None else item.off_m) for item in record.rejected),
+        record.source,
+        tuple(
+            Residual(
+                item.name,
+                math.inf if item.east_m is None else item.east_m,
+                math.inf if item.north_m is None else item.north_m,
+                item.used,
+            )
+            for item in record.residuals
+        ),
     )
     return place.after(np.linalg.inv(output.plane_to_output).astype(np.float64))
 

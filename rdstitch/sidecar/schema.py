@@ -16,6 +16,7 @@ from rdstitch.sidecar.write import VERSION
 
 Lens = Literal["division", "division-center", "division2", "division3"]
 Model = Literal["rigid", "similarity", "tilting", "pose", "homography", "rotation"]
+_Row = tuple[float, float, float, float]
 _Positive = Annotated[float, Meta(gt=0.0)]
 _FileName = Annotated[str, Meta(pattern=r"^[^/\\]+$", description="in the folder of the sidecar")]
 _Digest = Annotated[
@@ -24,11 +25,13 @@ _Digest = Annotated[
 ]
 
 
-class Rejected(Struct):
-    """A GPS position that was not used."""
+class ResidualRecord(Struct):
+    """How far east and north of a position, of an image or a control point, the output has it."""
 
     name: str
-    off_m: float | None
+    east_m: float | None
+    north_m: float | None
+    used: bool
 
 
 class GeoreferenceRecord(Struct, kw_only=True):
@@ -39,10 +42,11 @@ class GeoreferenceRecord(Struct, kw_only=True):
     gsd_m: _Positive | None = None
     pixel_to_map: tuple[Triple, Triple] | None = None
     north_up: bool | None = None
+    source: Literal["GPS positions", "ground control points"] = "GPS positions"
     positions: Count = 0
     positions_used: Count = 0
     rms_m: NonNegative = 0.0
-    rejected: list[Rejected] = []
+    residuals: list[ResidualRecord] = []
 
     def __post_init__(self) -> None:
         if self.crs is not None and (self.pixel_to_map is None or not any(self.pixel_to_map[0][:2])):
@@ -113,6 +117,9 @@ class PoseRecord(Struct):
     height: _Positive
     yaw_deg: float
     tilt_deg: Pair
+    covariance: Annotated[
+        tuple[_Row, _Row, _Row, _Row] | None, Meta(description="of x, y, height and yaw, heights and radians")
+    ] = None
 
 
 class ImageRecord(LensRecord, kw_only=True):

@@ -98,6 +98,7 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
                 "height": poses.height[index],
                 "yaw_deg": np.degrees(poses.yaw[index]),
                 "tilt_deg": np.degrees(poses.tilt[index]),
+                "covariance": None if poses.covariance is None else poses.covariance[index],
             }
         entries.append(entry)
     unread = [
@@ -129,10 +130,14 @@ def georeference_fields(place: Georeference | None, reason: str) -> dict[str, An
         "gsd_m": place.gsd,
         "pixel_to_map": place.pixel_to_map,
         "north_up": place.north_up,
-        "positions": place.positions,
+        "source": place.source,
+        "positions": len(place.residuals),
         "positions_used": place.used,
         "rms_m": place.rms,
-        "rejected": [{"name": name, "off_m": away} for name, away in place.rejected],
+        "residuals": [
+            {"name": residual.name, "east_m": residual.east, "north_m": residual.north, "used": residual.used}
+            for residual in place.residuals
+        ],
     }
 
 

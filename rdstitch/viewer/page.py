@@ -81,6 +81,7 @@ def viewer_page(
     images: Sequence[ViewedImage],
     seams: SeamMap | None = None,
     origin: tuple[int, int] = (0, 0),
+    gsd: float | None = None,
 ) -> str:
     """The page of a ``.dzi`` file, as HTML.
 
@@ -92,10 +93,13 @@ def viewer_page(
         Width and height of the mosaic, pixels.
     origin : (int, int)
         Where the mosaic begins in the canvas of the seams, pixels.
+    gsd : float, optional
+        Metres that a pixel takes, for the scale bar; without it that counts pixels.
     """
     output = Path(output)
     data: dict[str, Any] = {
         "size": size,
+        "metres": gsd,
         # As the .dzi file says; a page from the disk may not read it.
         "tiles": {
             "Image": {
@@ -129,7 +133,8 @@ def viewer_page(
         f"<style>{_file('viewer.css')}</style></head><body>\n<!--\n{_file('openseadragon.LICENSE.txt')}-->\n"
         f'<div id="view"></div><div id="names"></div><div id="controls"><b>{title}</b>{boxes}<span><button id="in" '
         'title="larger">+</button> <button id="out" title="smaller">-</button> <button id="home" title="all">all'
-        '</button></span></div><div id="facts"></div>\n'
+        '</button> <button id="turn" title="turn by 15 degrees; r and R by 90">↻</button> <button id="full" '
+        'title="full screen">⛶</button></span></div><div id="facts"></div><div id="bar"></div>\n'
         f'<script type="application/json" id="data">{text}</script>\n'
         f"<script>{_file('openseadragon.min.js')}</script>\n<script>{_file('viewer.js')}</script>\n</body></html>\n"
     )

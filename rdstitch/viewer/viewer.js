@@ -4,7 +4,8 @@ const [width, height] = data.size;
 // The canvas drawer shows tiles that a browser loads from the disk, where WebGL refuses them.
 const viewer = OpenSeadragon({
   element: document.getElementById("view"), tileSources: data.tiles, drawer: "canvas", showNavigationControl: false,
-  gestureSettingsMouse: { clickToZoom: false }, gestureSettingsTouch: { clickToZoom: false }, maxZoomPixelRatio: 4,
+  gestureSettingsMouse: { clickToZoom: false }, gestureSettingsTouch: { clickToZoom: false, pinchRotate: true },
+  maxZoomPixelRatio: 4, showNavigator: true, navigatorPosition: "BOTTOM_RIGHT", navigatorRotate: true,
 });
 const make = (name, parent, attributes) => {
   const node = document.createElementNS("http://www.w3.org/2000/svg", name);
@@ -27,14 +28,30 @@ const images = data.images.map((image) => ({
   label: names.appendChild(Object.assign(document.createElement("span"), { textContent: image.name })),
 }));
 
+// The longest of 1, 2, 5, 10, … units that takes no more than so many pixels of the page.
+const barLength = (unit, most) => {
+  const power = 10 ** Math.floor(Math.log10(most / unit));
+  return power * [5, 2, 1].find((step) => step * power * unit <= most);
+};
+const bar = document.getElementById("bar");
+const showScale = (scale) => {
+  const unit = scale / (data.metres || 1), length = barLength(unit, 150);
+  bar.style.width = `${length * unit}px`;
+  const [size, name] = !data.metres ? [length, "pixels"] : length >= 1000 ? [length / 1000, "km"]
+    : length >= 1 ? [length, "m"] : [length * 100, "cm"];
+  bar.textContent = `${Number(size.toPrecision(3))} ${name}`;
+};
 // Pixels of the mosaic to pixels of the page: one unit of the viewport is the width of the mosaic.
 const place = () => {
   const at = (x, y) => viewer.viewport.pixelFromPoint(new OpenSeadragon.Point(x / width, y / width), true);
-  const origin = at(0, 0), scale = (at(width, 0).x - origin.x) / width;
-  drawing.setAttribute("transform", `translate(${origin.x},${origin.y}) scale(${scale})`);
+  const origin = at(0, 0), across = at(width, 0);
+  // Along the first row of the mosaic, which may be turned.
+  const a = (across.x - origin.x) / width, b = (across.y - origin.y) / width;
+  drawing.setAttribute("transform", `matrix(${a},${b},${-b},${a},${origin.x},${origin.y})`);
+  showScale(Math.hypot(a, b));
   const taken = [];
   for (const { label, center } of images) {
-    const x = origin.x + center[0] * scale, y = origin.y + center[1] * scale;
+    const x = origin.x + a * center[0] - b * center[1], y = origin.y + b * center[0] + a * center[1];
     label.style.left = `${x}px`; label.style.top = `${y}px`;
     const half = label.textContent.length * 3.6 + 6;
     const free = taken.every(([a, b, c]) => Math.abs(a - x) > half + c || Math.abs(b - y) > 18);
@@ -82,4 +99,9 @@ toggle("show-names", names);
 toggle("show-seams", seams);
 document.getElementById("in").onclick = () => viewer.viewport.zoomBy(1.5);
 document.getElementById("out").onclick = () => viewer.viewport.zoomBy(1 / 1.5);
-document.getElementById("home").onclick = () => viewer.viewport.goHome();
+document.getElementById("home").onclick = () => { viewer.viewport.setRotation(0); viewer.viewport.goHome(); };
+document.getElementById("turn").onclick = () => viewer.viewport.rotateBy(15);
+// The whole page, not the viewer alone, which is without outlines and names.
+document.getElementById("full").onclick = () => {
+  if (document.fullscreenElement) document.exitFullscreen(); else document.documentElement.requestFullscreen();
+};

@@ -40,6 +40,7 @@ def test_the_page_knows_the_images_and_needs_no_network(
     data, text = _data(page), page.read_text(encoding="utf-8")
     record = json.loads((tmp_path / "x.dzi.json").read_text(encoding="utf-8"))
     assert data["size"] == record["output"]["size"]
+    assert data["metres"] is None
     assert [image["name"] for image in data["images"]] == [frame.name for frame in frames]
     corners = np.concatenate([outline for image in data["images"] for outline in image["outlines"]])
     assert corners.min() >= -1
@@ -86,7 +87,21 @@ def test_in_a_browser(page: Path, tmp_path: Path) -> None:
     )
     assert "<title>3 outlines</title>" in done.stdout, done.stderr
     assert re.search(r'<div id="facts"><h2>frame_0001\.png</h2>.*400 x 300 pixels', done.stdout)
-    assert re.search(r'<g transform="translate\([^)]*\) scale\(0\.\d+', done.stdout)
+    assert re.search(r'<g transform="matrix\(0\.\d+', done.stdout)
+
+
+@pytest.mark.parametrize(("unit", "length"), [(1.0, 100.0), (0.02, 5000.0), (31.0, 2.0), (160.0, 0.5)])
+def test_the_scale_bar_has_a_round_length_that_fits(unit: float, length: float) -> None:
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("there is no Node.js")
+    script = (_ROOT / "rdstitch" / "viewer" / "viewer.js").read_text(encoding="utf-8")
+    assert subprocess.run([node, "--check", "-"], input=script, text=True, check=False).returncode == 0
+    found = re.search(r"^const barLength = .*?^};", script, re.MULTILINE | re.DOTALL)
+    assert found is not None
+    code = f"{found[0]} console.log(barLength({unit}, 150));"
+    done = subprocess.run([node, "-e", code], capture_output=True, text=True, check=True)
+    assert float(done.stdout) == pytest.approx(length)
 
 
 def test_seams_are_where_labels_change() -> None:

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -40,6 +41,20 @@ Examples:
     help="Stitch what is left out again while it overlaps: the largest block of images becomes OUTPUT, the others "
     "OUTPUT with -2, -3, … before its suffix.",
 )
+@click.option(
+    "--poses",
+    type=options.IMAGE,
+    metavar="FILE",
+    help="Write the pose of the camera for each image, with covariances: CSV, as 'rdstitch trajectory' does.",
+)
+@click.option(
+    "--frame",
+    type=click.Choice(["enu", "camera", "map"]),
+    default="enu",
+    show_default=True,
+    help="Axes of --poses. enu, camera: of the first image, in heights of it, as for 'rdstitch trajectory'. map: "
+    "easting, northing and height in metres, where the output is georeferenced.",
+)
 @live.follow
 @live.refresh
 def mosaic(
@@ -53,6 +68,9 @@ def mosaic(
     report: Path | None,
     layers: Path | None,
     whole_layers: bool,
+    hugin_project: Path | None,
+    poses: Path | None,
+    frame: Literal["enu", "camera", "map"],
     as_json: bool,
     reporter: Reporter,
     **given: Any,
@@ -64,19 +82,20 @@ def mosaic(
     With --follow, frames are registered as they arrive.
     """
     from rdstitch.pipeline import mosaic as recipe
-    from rdstitch.pipeline import mosaic_blocks
+    from rdstitch.pipeline import mosaic_blocks, poses_table, project_of_hugin
 
     if all_blocks and (following or given["strict"]):
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
     with ExitStack() as stack:
-        stitch = stitch_options(reporter, **given)
+        stitch = stitch_options(reporter, pose_covariance=poses is not None, **given)
         named: list[Path] = [] if following else options.resolve(inputs)
         paths: Sequence[Named] = named
         report_page = Report(report, reporter, named, given["overwrite"], output)
         if following:
             arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle, refresh=refresh)
             paths = stack.enter_context(arrived)
-        beside = staged_beside(report_page, reporter, layers, whole_layers=whole_layers)
+        texts = {poses: partial(poses_table, frame=frame)} | {hugin_project: project_of_hugin}
+        beside = staged_beside(report_page, reporter, layers, whole_layers=whole_layers, texts=texts)
         how: dict[str, Any] = {"every": every, "progress": report_page.progress, "beside": beside}
         with report_page.explaining():
             if all_blocks:

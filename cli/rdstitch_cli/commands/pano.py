@@ -32,6 +32,7 @@ def pano(
     report: Path | None,
     layers: Path | None,
     whole_layers: bool,
+    hugin_project: Path | None,
     as_json: bool,
     reporter: Reporter,
     **given: Any,
@@ -42,10 +43,13 @@ def pano(
     everything estimated to the output's name with .json added, and λ to standard output.
     """
     from rdstitch.pipeline import pano as recipe
+    from rdstitch.pipeline import project_of_hugin
 
     paths = options.resolve(inputs)
     report_page = Report(report, reporter, paths, given["overwrite"], output)
-    beside = staged_beside(report_page, reporter, layers, whole_layers=whole_layers)
+    beside = staged_beside(
+        report_page, reporter, layers, whole_layers=whole_layers, texts={hugin_project: project_of_hugin}
+    )
     with report_page.explaining():
         result = recipe(
             paths,

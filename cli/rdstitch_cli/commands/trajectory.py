@@ -37,8 +37,8 @@ Examples:
     type=click.Choice(["csv", "tum", "kitti"]),
     default="csv",
     show_default=True,
-    help="csv: a table with names, time stamps, x, y, yaw_deg and height. tum: time, position and quaternion. "
-    "kitti: matrices.",
+    help="csv: a table with names, time stamps, x, y, yaw_deg, height and their covariances. tum: time, position and "
+    "quaternion. kitti: matrices.",
 )
 @click.option(
     "--frame",

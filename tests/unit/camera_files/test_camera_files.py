@@ -417,7 +417,7 @@ def test_complaints_name_file_and_field(tmp_path: Path, name: str, old: str, new
     assert named in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["camera", "camera.xml", "camera.yml.txt"])
+@pytest.mark.parametrize("name", ["camera", "camera.csv", "camera.yml.txt"])
 def test_a_name_that_says_no_format_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(OutputError, match="camera file"):
         save_camera(CAMERAS[0], tmp_path / name)

@@ -14,12 +14,14 @@ from PIL import ExifTags, Image
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
+from rdstitch.crs import Crs, epsg_of, utm
 from rdstitch.errors import ArgumentError, OutputError
-from rdstitch.export.crs import Crs, utm
 from rdstitch.export.georeference import Georeference, georeference
 from rdstitch.io import Layout, write_strips
-from rdstitch.io.metadata import GpsPosition
-from rdstitch.pipeline import StitchOptions, apply, mosaic
+from rdstitch.io.metadata import GpsPosition, GroundControl
+from rdstitch.pipeline import StitchOptions, apply, mosaic, poses_table
+from rdstitch.radial_homography import from_plane
+from rdstitch.report import report_page
 from tests.cli.running import flight, transfers
 
 
@@ -223,12 +225,105 @@ def test_one_bad_position_of_eight_is_named_and_left_out(wrong: GpsPosition, off
     place, _ = georeference([*straight[:4], wrong, *straight[5:]], lens, to_output, names)
     assert whole is not None
     assert place is not None
-    assert (place.used, place.positions) == (7, 8)
+    assert (place.used, len(place.residuals)) == (7, 8)
     ((name, away),) = place.rejected
     assert name == "4.jpg"
     assert away == pytest.approx(off, rel=0.2)
     corner = [(0.0, 0.0)]
     np.testing.assert_allclose(place.to_map(corner), whole.to_map(corner), atol=0.1)
+
+
+def test_control_points_place_the_output_instead_of_positions() -> None:
+    """A point in two images counts once; one that is 2 m off is named; the system is that of the list."""
+    straight, lens, to_output, names = _row(8)
+    truth = Georeference(Crs(32632), 0.05 * np.exp(0.2j), complex(448_000.0, 5_500_000.0), 0.0)
+    control: list[list[GroundControl]] = [[] for _ in names]
+    for number, (x, y) in enumerate(
+        [(40.0, 90.0), (330.0, -80.0), (900.0, 70.0), (1000.0, 10.0), (1500.0, 130.0), (2100.0, 90.0)]
+    ):
+        ((east, north),) = truth.to_map([(x, y)]) + (2.0 if number == 4 else 0.0)
+        latitude, longitude = Crs(32632).geographic([(east, north)])[0]
+        for image in range(int(x // 300), int(x // 300) + 1 + (number == 1)):
+            u, v = from_plane(lens[image], to_output[image], np.array([(x, y)]))[0]
+            control[image].append(GroundControl(f"P{number}", GpsPosition(latitude, longitude), 32632, (u, v)))
+    place, _ = georeference(straight, lens, to_output, names, control=control)
+    assert place is not None
+    assert (place.crs, place.source, place.used) == (Crs(32632), "ground control points", 5)
+    assert [name for name, _ in place.rejected] == ["P4"]
+    assert place.rejected[0][1] == pytest.approx(2.0 * 2**0.5, rel=0.01)
+    np.testing.assert_allclose(
+        place.to_map([(0.0, 0.0), (2000.0, 300.0)]), truth.to_map([(0, 0), (2000, 300)]), atol=0.01
+    )
+    assert max(r.off for r in place.residuals if r.used) < 0.01
+    few = [points if k < 2 else [] for k, points in enumerate(control)]
+    assert georeference(straight, lens, to_output, names, control=few)[1] == (
+        "2 ground control points are in the images, and 3 are needed"
+    )
+
+
+def test_utm_back_to_degrees() -> None:
+    latitude, longitude = np.array([48.8582222, -33.9, 80.0]), np.array([2.2945, 5.0, 0.5])
+    for zone in (31, -31):
+        system = Crs((32600 if zone > 0 else 32700) + abs(zone))
+        back = system.geographic(utm(latitude, longitude, zone))
+        np.testing.assert_allclose(back, np.stack([latitude, longitude], axis=1), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("text", "epsg"),
+    [
+        ("EPSG:25832", 25832),
+        ("WGS84 UTM 16N", 32616),
+        ("WGS84 UTM 34 S", 32734),
+        ("+proj=utm +zone=10 +ellps=WGS84 +datum=WGS84 +units=m +no_defs", 32610),
+        ("+proj=utm +zone=10 +south +datum=WGS84", 32710),
+        ("+proj=longlat +datum=WGS84 +no_defs", 4326),
+        ("name,lat,lon", None),
+    ],
+)
+def test_coordinate_systems_of_opendronemap(text: str, epsg: int | None) -> None:
+    assert epsg_of(text) == epsg
+
+
+def test_positions_and_control_points_from_files(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
+) -> None:
+    """Also where EXIF has none; the residuals are in the sidecar, the report, and the sidecar of what is applied."""
+    truth = located[1]
+    plain = flight(4, 3, 2).write(tmp_path, "f{}.jpg")
+    rows = [f"{path.name},{east},{north}" for path, (east, north) in zip(plain, truth.tolist(), strict=True)]
+    (tmp_path / "p.csv").write_text("\n".join(["name,x,y", *rows]), encoding="utf-8")
+    small = CompositeOptions(scale=0.3, epsg=32734)
+    options = replace(cached, positions=tmp_path / "p.csv", composite=small)
+    by_positions = mosaic(plain, options=options).georeference
+    lines = [
+        f"{east} {north} 0 199.5 149.5 {path.name} {path.stem}"
+        for path, (east, north) in zip(plain, truth, strict=True)
+    ]
+    (tmp_path / "gcp.txt").write_text("\n".join(["EPSG:32734", *lines]), encoding="utf-8")
+    options = replace(cached, gcp=tmp_path / "gcp.txt", composite=replace(small, epsg=None))
+    result = mosaic(plain, tmp_path / "a.tif", options)
+    assert by_positions is not None
+    assert result.georeference is not None
+    assert by_positions.used == 6
+    np.testing.assert_allclose(result.georeference.pixel_to_map, by_positions.pixel_to_map, atol=0.1)
+    record = json.loads((tmp_path / "a.tif.json").read_text(encoding="utf-8"))["output"]["georeference"]
+    assert record["source"] == "ground control points"
+    away = {r["name"]: np.hypot(r["east_m"], r["north_m"]) for r in record["residuals"]}
+    assert away.keys() == {path.stem for path in plain}
+    assert max(away.values()) < 4 * METRES_PER_TEXEL
+    assert "f0" in report_page(result).partition("Place on the Earth")[2][:3000]
+    again = apply(tmp_path / "a.tif.json", plain, workers=1)
+    assert again.georeference == result.georeference
+    table = np.genfromtxt(poses_table(result, "map").splitlines(), delimiter=",", names=True)
+    # The camera is above the middle of its image but for the tilt, which is the same in all.
+    off = np.stack([table["x"], table["y"]], axis=1) - truth
+    assert np.abs(off).max() < 0.1 * table["height"].mean()
+    assert np.ptp(off, axis=0).max() < 8 * METRES_PER_TEXEL
+    assert np.ptp(table["yaw_deg"]) < 30.0
+    blind = mosaic(plain, options=replace(options, gcp=None))
+    with pytest.raises(ArgumentError, match="there is no map for the poses: 0 of 6 images have a GPS position"):
+        poses_table(blind, "map")
 
 
 def test_images_without_positions_leave_no_world_file(cached: StitchOptions, tmp_path: Path) -> None:

@@ -1,0 +1,259 @@
+"""Where images were taken, by a table, exiftool or a track, instead of by EXIF; and ground control points.
+
+================================= ====================================================================
+CSV with a header                 a name, and latitude and longitude, or x and y; as ``exiftool -csv`` too
+JSON                              what ``exiftool -json`` writes
+GPX                               a track, in which images have their places by their times
+a coordinate system, then lines   OpenDroneMap's ``geo.txt``: NAME X Y [Z …]
+================================= ====================================================================
+"""
+
+import csv
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path, PureWindowsPath
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.crs import WGS84, Crs, epsg_of
+from rdstitch.errors import InputError
+from rdstitch.file_access import canonical_text, read_text
+from rdstitch.inputs.measurements import timestamps_of
+from rdstitch.inputs.source import Source
+from rdstitch.io.metadata import GpsPosition, GroundControl
+from rdstitch.records import parse_json, parse_xml
+
+_COLUMNS = {
+    "name": "name filename sourcefile image imagename file label",
+    "latitude": "latitude lat gpslatitude",
+    "longitude": "longitude lon lng long gpslongitude",
+    "altitude": "altitude alt elevation ele height z gpsaltitude",
+    "x": "x easting east",
+    "y": "y northing north",
+    "south": "gpslatituderef",
+    "west": "gpslongituderef",
+}
+_MEANING = {alias: column for column, aliases in _COLUMNS.items() for alias in aliases.split()}
+_NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?")
+_DELIMITERS = ",;\t"
+
+_Rows = Iterable[tuple[str, Mapping[str, str]]]
+"""Of each image: where in the file it is, and its values by the keys of :data:`_COLUMNS`."""
+
+
+def with_positions(
+    sources: Sequence[Source], file: str | Path | None, epsg: int | None = None, offset: float = 0.0
+) -> list[Source]:
+    """The sources with the positions of a file, if there is one, instead of those of EXIF.
+
+    Parameters
+    ----------
+    epsg : int, optional
+        Code of the coordinate system of x and y.
+    offset : float
+        Seconds to add to the times of the images for those of a track, which are in UTC.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, is none of those above, or has no position of any of the images.
+    ArgumentError
+        When the coordinate system cannot be used.
+    """
+    if file is None:
+        return list(sources)
+    text, name = read_text(file), str(file)
+    lines = text.split("\n", 1)
+    if text.lstrip().startswith("<"):
+        places = _on_track(sources, text, name, offset)
+    else:
+        if text.lstrip().startswith(("[", "{")):
+            rows = _json_rows(text, name)
+        elif (system := epsg_of(lines[0])) is not None:
+            rows, epsg = _listed_rows(lines[1:]), system
+        else:
+            rows = _csv_rows(text, name)
+        table = _table(rows, name, epsg)
+        places = [table.get(source.name) for source in sources]
+        if not any(places):
+            raise InputError(f"{file}: has no position of {sources[0].name}, nor of any other of the images")
+    return [
+        replace(source, metadata=replace(source.metadata, gps=place))
+        for source, place in zip(sources, places, strict=True)
+    ]
+
+
+def _csv_rows(text: str, file: str) -> _Rows:
+    lines = text.splitlines()
+    header = lines[0].lstrip("# ") if lines else ""
+    delimiter = max(_DELIMITERS, key=header.count)
+    table = csv.DictReader([header, *lines[1:]], delimiter=delimiter, skipinitialspace=True)
+    columns = {_meaning(column) for column in table.fieldnames or ()}
+    if "name" not in columns or not ({"latitude", "longitude"} <= columns or {"x", "y"} <= columns):
+        raise InputError(f"{file}: its first line names no columns like name,lat,lon or name,x,y")
+    try:
+        yield from ((f"line {table.line_num}", _known(row)) for row in table)
+    except csv.Error as error:
+        raise InputError(f"{file}: is not a CSV file: {error}") from error
+
+
+def _json_rows(text: str, file: str) -> _Rows:
+    content = parse_json(text, file)
+    if not isinstance(content, list) or not all(isinstance(item, dict) for item in content):
+        raise InputError(f"{file}: expected a list of objects with SourceFile, GPSLatitude and GPSLongitude")
+    return ((f"[{number}]", _known(item)) for number, item in enumerate(content))
+
+
+def _listed_rows(lines: Iterable[str]) -> _Rows:
+    for number, line in enumerate("\n".join(lines).splitlines(), start=2):
+        if fields := line.split():
+            yield f"line {number}", dict(zip(("name", "x", "y", "altitude"), fields, strict=False))
+
+
+def _meaning(column: object) -> str | None:
+    """Which of :data:`_COLUMNS` a column is, without its group (``EXIF:``) and unit."""
+    plain = re.sub(r"[\[(].*", "", str(column).rpartition(":")[2])
+    return _MEANING.get(re.sub(r"[^a-z]", "", plain.lower()))
+
+
+def _known(row: Mapping[str, object]) -> dict[str, str]:
+    """The values that mean something; of several the last, which in exiftool's output is the one with a sign."""
+    named = ((_meaning(key), str(value or "").strip()) for key, value in row.items())
+    return {key: value for key, value in named if key and value}
+
+
+def _table(rows: _Rows, file: str, epsg: int | None) -> dict[str, GpsPosition]:
+    """The positions by the names of the images; what has no position, or no fix, is not in it."""
+    table: dict[str, GpsPosition] = {}
+    projected: dict[str, tuple[float, float, float | None]] = {}
+    for where, row in rows:
+        name = canonical_text(PureWindowsPath(row.get("name", "")).name)
+        geographic = row.keys() & {"latitude", "longitude"}
+        first, second = ("latitude", "longitude") if geographic else ("y", "x")
+        y, x = (_number(row, *part) for part in ((first, "south"), (second, "west")))
+        if x is None or y is None or (geographic and x == y == 0.0):
+            continue
+        if not name or name in table or name in projected:
+            raise InputError(f"{file}: {where}: {f'{name} is here twice; remove one' if name else 'has no name'}")
+        altitude = _number(row, "altitude")
+        if altitude is not None and "below" in row["altitude"].lower():
+            altitude = -altitude
+        if geographic or epsg == WGS84:
+            if not (abs(y) <= 90.0 and abs(x) <= 180.0):
+                raise InputError(f"{file}: {where}: expected latitude and longitude in degrees, not {y:g} and {x:g}")
+            table[name] = GpsPosition(y, x, altitude)
+        elif epsg is None:
+            raise InputError(f"{file}: {where}: in which coordinate system x and y are is not known; give --crs")
+        else:
+            projected[name] = x, y, altitude
+    if projected:
+        assert epsg is not None
+        values = np.array([(x, y) for x, y, _ in projected.values()])
+        for (name, (_, _, altitude)), place in zip(projected.items(), _geographic(epsg, values, file), strict=True):
+            table[name] = GpsPosition(*place, altitude)
+    return table
+
+
+def _geographic(epsg: int, places: FloatArray, file: str) -> list[tuple[float, float]]:
+    """Latitude and longitude of eastings and northings (N, 2)."""
+    found = np.asarray(Crs(epsg).geographic(places))
+    if not (np.isfinite(found).all() and (np.abs(found) <= (90.0, 180.0)).all()):
+        raise InputError(f"{file}: EPSG:{epsg} has no such places; give the coordinate system of x and y")
+    return [(latitude, longitude) for latitude, longitude in found.tolist()]
+
+
+def _number(row: Mapping[str, str], key: str, reference: str = "") -> float | None:
+    """A number, or degrees, minutes and seconds, of this or the other side (N, S, E, W); None where there is none."""
+    text = row.get(key, "")
+    parts = [float(part.replace(",", ".")) for part in _NUMBER.findall(text)]
+    if not parts or not all(map(math.isfinite, parts)):
+        return None
+    if not reference or key in "xy":
+        return parts[0]
+    value = sum(abs(part) / 60.0**k for k, part in enumerate(parts[:3]))
+    side = re.search(r"\b([NSEW])\w*\s*$", f"{text} {row.get(reference, '')}", re.IGNORECASE)
+    return -value if text.startswith("-") or (side is not None and side[1] in "SsWw") else value
+
+
+def _on_track(sources: Sequence[Source], text: str, file: str, offset: float) -> list[GpsPosition | None]:
+    """Where the images are on a track, straight from point to point."""
+    points = []
+    for item in parse_xml(text, file).iter():
+        time = item.findtext("time")
+        if item.tag not in ("trkpt", "rtept", "wpt") or time is None:
+            continue
+        try:
+            moment = datetime.fromisoformat(time.strip())
+            values = (float(item.get("lat", "")), float(item.get("lon", "")), float(item.findtext("ele") or "nan"))
+        except ValueError as error:
+            raise InputError(f"{file}: a point of the track at {time!r} cannot be read: {error}") from error
+        points.append(((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp(), *values))
+    if not points:
+        raise InputError(f"{file}: has no points with a time; give a GPX track")
+    seconds, latitude, longitude, altitude = np.array(sorted(points)).T
+    times = timestamps_of(sources) + offset
+    if not ((times >= seconds[0]) & (times <= seconds[-1])).any():
+        taken = f"from {_moment(np.nanmin(times))} to {_moment(np.nanmax(times))}" if np.isfinite(times).any() else ""
+        raise InputError(
+            f"{file}: the track goes from {_moment(seconds[0])} to {_moment(seconds[-1])} UTC, the images "
+            f"{f'were taken {taken}; give --positions-offset' if taken else 'have no time'}"
+        )
+    known = (latitude, np.unwrap(longitude, period=360.0), altitude)
+    rows = np.stack([np.interp(times, seconds, values, left=np.nan, right=np.nan) for values in known], axis=1)
+    return [
+        None if math.isnan(y) else GpsPosition(y, (x + 180.0) % 360.0 - 180.0, None if math.isnan(z) else z)
+        for y, x, z in rows.tolist()
+    ]
+
+
+def _moment(seconds: float) -> str:
+    return str(np.datetime64(int(seconds), "s"))
+
+
+def with_ground_control(sources: Sequence[Source], file: str | Path | None) -> list[Source]:
+    """The sources with the ground control points that they show by OpenDroneMap's ``gcp_list.txt``, if there is one.
+
+    Its first line names the coordinate system, each other one is ``X Y Z PX PY IMAGE [NAME]``: pixels of the upright
+    image, the centre of the top-left one at (0, 0).
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, a line is wrong, or none is of any of the images.
+    ArgumentError
+        When the coordinate system cannot be used.
+    """
+    if file is None:
+        return list(sources)
+    system, *lines = read_text(file).splitlines() or [""]
+    epsg = epsg_of(system)
+    if epsg is None:
+        raise InputError(f"{file}: line 1: expected a coordinate system like EPSG:32632 or WGS84 UTM 32N")
+    sizes = {source.name: source.metadata.size for source in sources}
+    shown: list[tuple[str, str, FloatArray]] = []
+    for number, line in enumerate(lines, start=2):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            values, image = np.array([float(field) for field in fields[:5]]), canonical_text(fields[5])
+        except (ValueError, IndexError):
+            raise InputError(f"{file}: line {number}: expected X Y Z PX PY IMAGE [NAME]") from None
+        if image in sizes:
+            if not ((values[3:] >= -0.5) & (values[3:] < np.array(sizes[image]) - 0.5)).all():
+                size = "{} x {}".format(*sizes[image])
+                raise InputError(f"{file}: line {number}: is not within the {size} pixels of {image}")
+            shown.append((image, fields[6] if len(fields) > 6 else " ".join(fields[:2]), values))
+    if not shown:
+        raise InputError(f"{file}: has no ground control point in any of the images")
+    xy = np.array([values[:2] for _, _, values in shown])
+    places = [(y, x) for x, y in xy.tolist()] if epsg == WGS84 else _geographic(epsg, xy, str(file))
+    control: dict[str, list[GroundControl]] = {}
+    for (image, name, values), place in zip(shown, places, strict=True):
+        pixel = (float(values[3]), float(values[4]))
+        control.setdefault(image, []).append(GroundControl(name, GpsPosition(*place), epsg, pixel))
+    return [replace(source, control=tuple(control.get(source.name, ()))) for source in sources]

@@ -1,0 +1,107 @@
+"""A project of Hugin with all images of a result: their lens, their poses, and control points between them."""
+
+import math
+
+import numpy as np
+
+from rdstitch.alignment.result import Alignment
+from rdstitch.alignment.stored_frame import stored, turned_alignment
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.camera_files.hugin import HEAD, hugin_lens
+from rdstitch.errors import ArgumentError
+from rdstitch.orientation import quarter_turn, turning_matrix
+from rdstitch.planar_motion import rotation_from_tilt
+from rdstitch.stitch_result import StitchResult
+
+_CONTROL_POINTS = 20  # of a pair; Hugin's own finder takes about as many
+_LARGEST_VIEW = 170.0  # degrees: of a plane seen from one height, which ends at 180
+
+
+def project_of_hugin(result: StitchResult) -> str:
+    """The project: images as their files store them, with yaw, pitch and roll, and over a plane with TrX, TrY, TrZ.
+
+    Its panorama is equirectangular, or the plane seen from one height of the reference image.
+
+    Raises
+    ------
+    ArgumentError
+        When images have no files, or no poses: the model with one homography for each.
+    """
+    registration, sources = result.registration, result.registration.sources
+    if any(source.frame is not None and source.frame.number is not None for source in sources):
+        raise ArgumentError("Hugin opens image files, not frames of videos; write them as files first")
+    orientations = [quarter_turn(source.metadata.orientation) for source in sources]
+    alignment = turned_alignment(registration.alignment, stored(orientations), None)
+    if alignment.poses is None and not alignment.on_sphere:
+        raise ArgumentError("Hugin knows no images with a homography of their own; --model pose gives poses")
+    used = np.flatnonzero(alignment.used).tolist()
+    number = {k: place for place, k in enumerate(used)}
+    lenses: dict[Camera, int] = {}
+    lines, variables = [], []
+    for place, k in enumerate(used):
+        camera = alignment.cameras[k]
+        lens = hugin_lens(camera)[0].split()
+        if camera in lenses:  # linked with the image that has the same
+            lens = [part if part[0] in "whf" else f"{part[0]}={lenses[camera]}" for part in lens]
+        lenses.setdefault(camera, place)
+        path = str(sources[k].path.absolute())
+        lines.append(" ".join(["i", *lens, *(f"{n}{v!r}" for n, v in _pose(alignment, k).items()), f'n"{path}"']))
+        if k != alignment.reference:
+            variables += [f"v {name}{place}" for name in _pose(alignment, k)]
+    control = []
+    for pair in registration.pairs:
+        ends = (pair.image1, pair.image2)
+        if ends in alignment.support and set(ends) <= number.keys():
+            link = pair.link().thinned(_CONTROL_POINTS)
+            points = [
+                _in_file(points, registration.alignment.cameras[k], alignment.cameras[k], orientations[k])
+                for points, k in zip((link.points1, link.points2), ends, strict=True)
+            ]
+            control += [
+                f"c n{number[ends[0]]} N{number[ends[1]]} x{x:.4f} y{y:.4f} X{X:.4f} Y{Y:.4f} t0"
+                for (x, y), (X, Y) in zip(*(found.tolist() for found in points), strict=True)
+            ]
+    parts = [f"{HEAD}{_panorama(alignment, used)}", "m i0", *lines, *variables, "v", *control]
+    return "\n".join(parts) + "\n"
+
+
+def _pose(alignment: Alignment, k: int) -> dict[str, float]:
+    """Hugin's parameters of where an image was taken: degrees, and heights to the right, down and back."""
+    poses = alignment.poses
+    if poses is None:
+        focal = alignment.cameras[k].with_focal().focal or 1.0
+        scaled = alignment.homographies[k] @ np.diag([1.0, 1.0, focal / alignment.cameras[k].half_diagonal])
+        left, _, right = np.linalg.svd(scaled)
+        rotation = left @ right * np.sign(np.linalg.det(scaled))
+        place = {}
+    else:
+        c, s = np.cos(poses.yaw[k]), np.sin(poses.yaw[k])
+        about_axis = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        rotation = (rotation_from_tilt(poses.tilt[k]) @ about_axis).T
+        x, y = poses.position[k].tolist()
+        place = {"TrX": x, "TrY": y, "TrZ": float(poses.height[k]) - 1.0}
+    angles = {
+        "y": math.atan2(rotation[0, 2], rotation[2, 2]),
+        "p": -math.asin(float(np.clip(rotation[1, 2], -1.0, 1.0))),
+        "r": math.atan2(rotation[1, 0], rotation[1, 1]),
+    }
+    return {**{name: math.degrees(angle) for name, angle in angles.items()}, **place}
+
+
+def _panorama(alignment: Alignment, used: list[int]) -> str:
+    """The line of the output, at the resolution of the reference image."""
+    camera = alignment.cameras[alignment.reference].with_focal()
+    focal = camera.focal or 1.0
+    if alignment.poses is None:
+        width = 2 * round(math.pi * focal)
+        return f'p f2 w{width} h{width // 2} v360 n"TIFF_m c:LZW"'
+    reach = camera.half_diagonal / focal + np.abs(alignment.poses.position[used]).max(axis=0)
+    half = np.minimum(reach, math.tan(math.radians(_LARGEST_VIEW / 2)))
+    width, height = (2 * math.ceil(side * focal) for side in half.tolist())
+    return f'p f0 w{width} h{height} v{2 * math.degrees(math.atan(width / 2 / focal)):.8g} n"TIFF_m c:LZW"'
+
+
+def _in_file(points: FloatArray, upright: Camera, camera: Camera, orientation: int) -> FloatArray:
+    """Pixels (N, 2) of an upright image as pixels of its file."""
+    return camera.denormalize(upright.normalize(points) @ turning_matrix(orientation))

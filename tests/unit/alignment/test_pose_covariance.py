@@ -1,0 +1,93 @@
+"""Covariances of poses: what the poses scatter by, whatever frame and unit they are given in."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
+from rdstitch.alignment.result import PlanarPoses
+from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.arrays import FloatArray
+from rdstitch.export.trajectory_files import TrajectoryFrame, as_csv
+from tests.alignment_scenes import grid, scene
+
+FOCAL = 520.0
+
+
+def _values(path: Trajectory) -> FloatArray:
+    return np.column_stack([path.position, path.height, path.yaw])
+
+
+def test_standard_deviations_are_what_poses_scatter_by() -> None:
+    """Of positions, which the focal length rules; of the rest at least, since links may share their keypoints."""
+    errors, predicted = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        poses = grid(3, 2, (0.3, 0.25), 0.2, rng)
+        guess = FOCAL * float(np.exp(rng.normal(0.0, 0.01)))
+        given = scene(poses, focal=FOCAL, guess=guess, tilt=(0.1, -0.05), rng=rng, per_link=80)
+        p = given.poses
+        truth = PlanarPoses(p[:, YAW], p[:, [X, Y]], np.exp(p[:, LOG_HEIGHT]), p[:, [PSI, THETA]])
+        options = AlignmentOptions(model="similarity", pose_covariance=True)
+        path = Trajectory.from_alignment(align(given.cameras, given.links, options))
+        assert path.covariance is not None
+        np.testing.assert_allclose(path.covariance[0], 0.0, atol=1e-12)
+        errors.append(_values(path)[-1] - _values(Trajectory.from_poses(truth))[-1])
+        predicted.append(np.diag(path.covariance[-1]))
+    scatter, std = np.sqrt(np.mean(np.square(errors), axis=0)), np.sqrt(np.mean(predicted, axis=0))
+    assert (std[:2] / scatter[:2] > 0.6).all()
+    assert (std[:2] / scatter[:2] < 1.7).all()
+    assert (std[2:] / scatter[2:] > 0.8).all()
+    assert (std[2:] / scatter[2:] < 10.0).all()
+
+
+def test_they_are_not_computed_unless_asked_for() -> None:
+    rng = np.random.default_rng(0)
+    given = scene(grid(2, 2, (0.3, 0.25), 0.2, rng), rng=rng, per_link=60)
+    found = align(given.cameras, given.links, AlignmentOptions(model="rigid"))
+    assert Trajectory.from_alignment(found).covariance is None
+
+
+def _sampled() -> tuple[PlanarPoses, list[PlanarPoses]]:
+    """Three poses with a joint covariance, and draws from it."""
+    rng = np.random.default_rng(3)
+    mean = np.array([[1.0, 2.0, 2.0, 0.3], [2.0, 2.5, 2.2, 0.9], [4.0, 1.0, 1.8, -2.0]])
+    root = 1e-4 * rng.normal(size=(12, 12))
+    joint = (root @ root.T).reshape(3, 4, 3, 4)
+
+    def poses(values: FloatArray) -> PlanarPoses:
+        return PlanarPoses(values[:, 3], values[:, :2], values[:, 2], np.zeros((3, 2)))
+
+    draws = [poses(mean + (root @ rng.normal(size=12)).reshape(3, 4)) for _ in range(4000)]
+    own = np.stack([joint[k, :, k] for k in range(3)])
+    return replace(poses(mean), covariance=own, with_first=joint[:, :, 0]), draws
+
+
+def test_the_frame_of_the_first_image_and_the_map_keep_them_true() -> None:
+    given, draws = _sampled()
+    to_map = np.array([[0.6, 0.8, 500_000.0], [0.8, -0.6, 5_000_000.0]]) * [[3.0], [3.0]]
+    for moved in (partial(Trajectory.from_poses, height=1.5), partial(Trajectory.on_map, to_map=to_map)):
+        path = moved(given)
+        spread = np.array([_values(moved(draw)) - _values(path) for draw in draws])
+        found = np.einsum("kni,knj->nij", spread, spread) / len(spread)
+        assert path.covariance is not None
+        scale = np.sqrt(np.einsum("nii->ni", np.maximum(found, 1e-20)))
+        scale = scale[:, :, None] * scale[:, None]
+        np.testing.assert_allclose(path.covariance / scale, found / scale, atol=0.08)
+
+
+@pytest.mark.parametrize(("frame", "sign"), [("enu", -1.0), ("camera", 1.0)])
+def test_the_table_has_them_in_its_own_axes_and_units(frame: TrajectoryFrame, sign: float) -> None:
+    path = Trajectory.from_poses(_sampled()[0])
+    assert path.covariance is not None
+    table = np.genfromtxt(as_csv(path, frame).splitlines(), delimiter=",", names=True)
+    degrees = np.degrees(1.0)
+    np.testing.assert_allclose(table["cov_x_x"], path.covariance[:, 0, 0], rtol=1e-8)
+    np.testing.assert_allclose(table["cov_x_y"], sign * path.covariance[:, 0, 1], rtol=1e-8)
+    np.testing.assert_allclose(table["cov_y_yaw_deg"], sign * degrees * path.covariance[:, 1, 3], rtol=1e-8)
+    np.testing.assert_allclose(table["cov_height_height"], path.covariance[:, 2, 2], rtol=1e-8)
+    np.testing.assert_allclose(table["cov_yaw_deg_yaw_deg"], degrees**2 * path.covariance[:, 3, 3], rtol=1e-8)
+    np.testing.assert_allclose(table["y"], sign * path.position[:, 1], atol=1e-9)
