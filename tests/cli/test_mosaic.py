@@ -24,7 +24,7 @@ def test_a_folder_becomes_one_rectified_image(
     record = json.loads((tmp_path / "mosaic.tif.json").read_text(encoding="utf-8"))
     assert alignment_error(sequence, transfers(record), model="homography").median < 1.0
     poses = [image["pose"] for image in record["images"]]
-    assert all(set(pose) == {"x", "y", "height", "yaw_deg", "tilt_deg"} for pose in poses)
+    assert all(set(pose) == {"x", "y", "height", "yaw_deg", "tilt_deg", "covariance"} for pose in poses)
     true = sequence.poses.yaw - sequence.poses.yaw[[i["name"] for i in record["images"]].index(record["reference"])]
     np.testing.assert_allclose([pose["yaw_deg"] for pose in poses], np.degrees(true), atol=0.5)
 
