@@ -313,14 +313,25 @@ def test_positions_and_control_points_from_files(
     assert away.keys() == {path.stem for path in plain}
     assert max(away.values()) < 4 * METRES_PER_TEXEL
     assert "f0" in report_page(result).partition("Place on the Earth")[2][:3000]
-    again = apply(tmp_path / "a.tif.json", plain, workers=1)
-    assert again.georeference == result.georeference
+    applied = apply(tmp_path / "a.tif.json", plain, workers=1)
+    assert applied.georeference == result.georeference
     table = np.genfromtxt(poses_table(result, "map").splitlines(), delimiter=",", names=True)
     # The camera is above the middle of its image but for the tilt, which is the same in all.
     off = np.stack([table["x"], table["y"]], axis=1) - truth
     assert np.abs(off).max() < 0.1 * table["height"].mean()
     assert np.ptp(off, axis=0).max() < 8 * METRES_PER_TEXEL
     assert np.ptp(table["yaw_deg"]) < 30.0
+    c, s = np.cos(0.4), np.sin(0.4)
+    upright = np.array([[c, -s, 3.0], [s, c, 1.0], [0.0, 0.0, 1.0]]), np.array([[1.0, 0, 0], [0, 1, 0], [0.1, 0, 1]])
+    turned, tilted = (
+        replace(result, canvas=replace(result.canvas, orientation=by, matrix=result.canvas.matrix @ np.linalg.inv(by)))
+        for by in upright
+    )
+    again = np.genfromtxt(poses_table(turned, "map").splitlines(), delimiter=",", names=True)
+    assert again["x"] == pytest.approx(table["x"], abs=1e-3)
+    assert again["yaw_deg"] == pytest.approx(table["yaw_deg"], abs=1e-5)
+    with pytest.raises(ArgumentError, match="the plane was tilted to be upright"):
+        poses_table(tilted, "map")
     blind = mosaic(plain, options=replace(options, gcp=None))
     with pytest.raises(ArgumentError, match="there is no map for the poses: 0 of 6 images have a GPS position"):
         poses_table(blind, "map")
