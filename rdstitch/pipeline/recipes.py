@@ -99,13 +99,26 @@ def mosaic(
 ) -> StitchResult:
     """Stitch a whole sequence on the rectified plane: seen straight from above, metric up to scale.
 
-    Parameters and errors are those of :func:`pano`, but that images that cannot be read are left out by name.
-
     Parameters
     ----------
     inputs : path, ndarray, or iterable of them
         Folders, images, patterns, ``@list`` files, videos, and arrays of shape (H, W) or (H, W, C), whose channels
-        are in the order of ``options.channel_order``; see :func:`rdstitch.inputs.frame.as_inputs`.
+        are in the order of ``options.channel_order``; see :func:`rdstitch.inputs.frame.as_inputs`. Images that cannot
+        be read are left out by name.
+    output : path, optional
+        As for :func:`pano`.
+    options, every, progress, beside
+        As for :func:`pano`.
+
+    Returns
+    -------
+    StitchResult
+        The image or its file, with everything that was estimated.
+
+    Raises
+    ------
+    RdstitchError
+        See the tree in :mod:`rdstitch.errors`.
 
     Examples
     --------
