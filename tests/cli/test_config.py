@@ -118,6 +118,8 @@ def _plausible(option: click.Option) -> Any:
         "local_alignment": "auto",
         "every": "auto",
         "epsg": "25832",
+        "rectangle": "0,0,9,0,9,9,0,9",
+        "straighten": "auto",
     }.get(option.name or "", "name")
 
 
