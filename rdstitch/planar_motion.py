@@ -20,6 +20,14 @@ ABOUT_Z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 """Generators of rotations: with ``R = Rx(ψ) Ry(θ)`` the derivatives by ψ and θ are ``ABOUT_X R`` and ``R ABOUT_Y``."""
 
 
+def nearest_rotation(matrices: FloatArray) -> FloatArray:
+    """Rotations (..., 3, 3) nearest to matrices, up to a positive scale (orthogonal Procrustes, Kabsch)."""
+    left, _, right = np.linalg.svd(matrices)
+    left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    rotation: FloatArray = left @ right
+    return rotation
+
+
 def rotation_from_tilt(tilt: ArrayLike) -> FloatArray:
     """``R = Rx(ψ) Ry(θ)`` for tilts (ψ, θ) of shape (..., 2), radians; shape (..., 3, 3)."""
     angles = np.asarray(tilt, dtype=np.float64)

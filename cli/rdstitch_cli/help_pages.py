@@ -14,9 +14,10 @@ _GROUPS = {
         "output overwrite images preview reference camera focal mask scale report layout image_format frame height "
         "view quiet"
     ),
-    "Stage": "grid overlap positions positions_only pixel_size search channel flat_field save_flat_field",
+    "Places": "grid overlap positions positions_offset gcp positions_only pixel_size search",
+    "Tiles": "channel flat_field save_flat_field",
     "Input": "following idle refresh every exclude include_only match topic timestamps",
-    "Camera": "distortion lens tilt attitude attitude_std positions_offset gcp save_camera",
+    "Camera": "distortion lens tilt attitude attitude_std save_camera",
     "Features and registration": (
         "features aliked_model lightglue_model max_features work_megapixels solver model threshold"
     ),

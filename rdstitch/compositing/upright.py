@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
+from rdstitch.planar_motion import nearest_rotation
 from rdstitch.scipy_parts import linalg, special
 
 Segment = tuple[float, float, float, float]
@@ -146,12 +147,6 @@ def rotation(vector: ArrayLike) -> FloatArray:
     """Rotation (3, 3) about an axis (3,), by its length in radians."""
     matrix: FloatArray = linalg.expm(np.cross(np.asarray(vector, dtype=np.float64), np.eye(3)).T)
     return matrix
-
-
-def nearest_rotation(matrix: FloatArray) -> FloatArray:
-    """The rotation nearest to a matrix (3, 3) with positive determinant."""
-    left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ right)
 
 
 def of_rectangle(corners: FloatArray, focal: Focal, pixel: float) -> tuple[Upright, float, float]:

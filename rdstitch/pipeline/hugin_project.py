@@ -11,7 +11,7 @@ from rdstitch.camera import Camera
 from rdstitch.camera_files.hugin import HEAD, hugin_lens
 from rdstitch.errors import ArgumentError
 from rdstitch.orientation import quarter_turn, turning_matrix
-from rdstitch.planar_motion import rotation_from_tilt
+from rdstitch.planar_motion import nearest_rotation, rotation_from_tilt
 from rdstitch.stitch_result import StitchResult
 
 _CONTROL_POINTS = 20  # of a pair; Hugin's own finder takes about as many
@@ -72,8 +72,7 @@ def _pose(alignment: Alignment, k: int) -> dict[str, float]:
     if poses is None:
         focal = alignment.cameras[k].with_focal().focal or 1.0
         scaled = alignment.homographies[k] @ np.diag([1.0, 1.0, focal / alignment.cameras[k].half_diagonal])
-        left, _, right = np.linalg.svd(scaled)
-        rotation = left @ right * np.sign(np.linalg.det(scaled))
+        rotation = nearest_rotation(scaled * np.sign(np.linalg.det(scaled)))
         place = {}
     else:
         c, s = np.cos(poses.yaw[k]), np.sin(poses.yaw[k])

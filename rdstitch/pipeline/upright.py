@@ -14,7 +14,6 @@ from rdstitch.compositing.upright import (
     Upright,
     UprightOptions,
     nearest_axis,
-    nearest_rotation,
     of_edges,
     of_rectangle,
     of_scene,
@@ -24,6 +23,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.features.prepared_image import prepare
 from rdstitch.messages import Message
 from rdstitch.pipeline.placed_images import PlacedImages
+from rdstitch.planar_motion import nearest_rotation
 
 _MEGAPIXELS = 0.6  # of the images that edges are found in
 _MAX_IMAGES = 40

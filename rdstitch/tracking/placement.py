@@ -9,6 +9,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.planar_motion import nearest_rotation
 from rdstitch.radial_homography import to_plane
 
 _SAMPLES = 5  # points of an image's outline, a side, by which two planes are brought together
@@ -68,8 +69,7 @@ class Placement:
         columns /= math.copysign(float(np.linalg.norm(columns[:, :2]) / math.sqrt(2.0)), np.linalg.det(columns))
         first, second, last = columns.T
         # The nearest rotation, since the homography of an image on its own has none exactly.
-        left, _, right = np.linalg.svd(np.column_stack([first, second, np.cross(first, second)]))
-        rotation = left @ right
+        rotation = nearest_rotation(np.column_stack([first, second, np.cross(first, second)]))
         x, y, height = rotation.T @ last * np.array([-1.0, -1.0, 1.0])
         return CameraPose(float(x), float(y), math.atan2(-rotation[0, 1], rotation[0, 0]), float(height))
 

@@ -8,13 +8,13 @@ from itertools import chain
 
 import numpy as np
 
-from rdstitch.alignment.motion_models.rotation import nearest_rotation
 from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.camera import Camera
 from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import fitting_reduction
+from rdstitch.planar_motion import nearest_rotation
 from rdstitch.registration import Registration
 from rdstitch.verification.photometric_agreement import (
     COMPARED_SIDE,

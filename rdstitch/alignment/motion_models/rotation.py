@@ -12,6 +12,7 @@ import numpy as np
 
 from rdstitch.alignment.motion_models.base import ModelMatrices
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.planar_motion import nearest_rotation
 
 _FOCAL_STARTS = tuple(math.log(focal) for focal in (0.6, 0.9, 1.4, 2.2, 3.6, 6.0))
 """Logarithms of focal lengths in half diagonals: from fisheyes to long lenses, near enough to each other that the
@@ -97,14 +98,6 @@ class RotationModel:
 def _focal(shared: FloatArray) -> float:
     """Focal length, half diagonals, within what a lens can have."""
     return float(np.exp(np.clip(shared[0], *_LOG_FOCAL_LIMITS)))
-
-
-def nearest_rotation(matrices: FloatArray) -> FloatArray:
-    """Rotations (N, 3, 3) nearest to matrices, up to their scale (orthogonal Procrustes, Kabsch)."""
-    left, _, right = np.linalg.svd(matrices)
-    left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
-    rotation: FloatArray = left @ right
-    return rotation
 
 
 def rotation_from_vector(vectors: FloatArray) -> FloatArray:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment import AlignmentOptions, align
-from rdstitch.alignment.motion_models.rotation import ROTATION, nearest_rotation, rotation_from_vector
+from rdstitch.alignment.motion_models.rotation import ROTATION, rotation_from_vector
 from rdstitch.alignment.rotation_frame import level_frame
 from rdstitch.camera import Camera
 from rdstitch.matching.links import Link
+from rdstitch.planar_motion import nearest_rotation
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.synthetic.panorama import camera_rotations, panorama_rotations
 

@@ -2,14 +2,16 @@
 
 from dataclasses import replace
 from importlib import import_module
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Problem
-from rdstitch.alignment.motion_models import PSI
-from rdstitch.alignment.select import ModelChoice, Posterior, select_model
+from rdstitch.alignment.motion_models import PSI, RIGID, ROTATION, MotionModel
+from rdstitch.alignment.select import Hypothesis, ModelChoice, Posterior, _best, select_model
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.matching.links import Link
@@ -121,6 +123,19 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
     assert [message.severity for message in found.messages if "depth" in message.text] == ["detail"]
     lens = align(*given, AlignmentOptions(layout_matters=False))
     assert [message.severity for message in lens.messages if "depth" in message.text] == ["failure"]
+
+
+@pytest.mark.parametrize(("field", "chosen"), [(1.1, "rotation"), (1.5, "rigid")])
+def test_instead_of_an_absurd_plane_a_turn_may_leave_what_seams_hide_and_the_noise(field: float, chosen: str) -> None:
+    evidence = SimpleNamespace(farthest=4.0, noise=0.6)  # a quarter of 4 px, and the noise: 1.17 px
+    posterior: Any = SimpleNamespace(evidence=evidence, problem=SimpleNamespace(count=2))
+
+    def hypothesis(model: MotionModel, score: float, field: float, *, absurd: bool) -> Hypothesis:
+        fit: Any = SimpleNamespace(model=model)
+        return Hypothesis(fit, score, field, absurd)
+
+    plane, turn = hypothesis(RIGID, 0.0, 0.5, absurd=True), hypothesis(ROTATION, 60.0, field, absurd=False)
+    assert _best(posterior, [turn, plane]).fit.model.name == chosen
 
 
 def test_a_model_that_was_requested_is_taken() -> None:

@@ -166,6 +166,24 @@ def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest
     assert asked == ["auto", "auto", "pose"]
 
 
+@pytest.mark.parametrize(("rms", "rough"), [(8.9, True), (9.1, False)])
+def test_rough_ground_that_nothing_fits_is_no_ground(monkeypatch: pytest.MonkeyPatch, rms: float, rough: bool) -> None:
+    planes, ground = (_pairs_of_two() for _ in range(2))
+
+    def aligned(aligner: Aligner, pairs: object, former: object) -> Any:
+        return SimpleNamespace(rms=1.0 if pairs is planes else rms)
+
+    monkeypatch.setattr(Aligner, "_aligned", aligned)
+    monkeypatch.setattr(Aligner, "_explains", lambda *given: False)
+    monkeypatch.setattr("rdstitch.pipeline.aligner.over_rough_ground", lambda pairs, threshold: ground)
+    found = Aligner.of([], OPTIONS, NO_CACHE).align(planes)
+    assert (found.rough, found.alignment.rms) == (rough, rms if rough else 1.0)
+
+
+def _pairs_of_two() -> list[Any]:
+    return [SimpleNamespace(image1=0, image2=1)]
+
+
 def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path: Path) -> None:
     """What drives ahead fills a good third of every image, and has more matches where images overlap little."""
     plane, ahead = flight(3, 3, overlap=0.4), flight(5, 3, overlap=0.4)
