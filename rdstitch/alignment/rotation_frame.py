@@ -1,5 +1,7 @@
 """The common frame of images taken by turning on the spot: level, and centred on what they show."""
 
+import math
+
 import numpy as np
 
 from rdstitch.arrays import FloatArray
@@ -9,6 +11,9 @@ _FULL_CIRCLE = np.pi / 2
 
 _MAX_GRAVITY_SPREAD = np.radians(5.0)
 """Median angle between measured directions of gravity and their mean, up to which they are believed."""
+
+_ROLL = np.radians(3.0)
+"""Standard deviation of the roll of a camera that is held by hand: chosen."""
 
 _STEEP = np.cos(np.radians(30.0))
 """Images that look within 30 degrees of straight up or down do not show how the camera was held."""
@@ -58,16 +63,17 @@ def measured_down(rotations: FloatArray, gravity: FloatArray | None) -> FloatArr
 def level_frame(rotations: FloatArray, reference: int, down_by_gravity: FloatArray | None = None) -> FloatArray:
     """Rotation (3, 3) to the level frame from the one that rotations (N, 3, 3) lead from to the cameras.
 
-    People hold cameras so that the horizon is level, whichever way they turn: the x axes of all images lie in one
-    plane, and the direction down is the one they have least in common with (Brown and Lowe 2007, section 5). The less
-    the images turn, the more counts what is down in them; a few may be taken with the camera on its side. Gravity,
-    where cameras have measured it, decides alone.
+    People hold cameras level, whichever way they turn them: the x axes of all images lie in one plane,
+    and the direction down is the one they have least in common with (Brown and Lowe 2007, section 5). The less the
+    images turn, beyond what hands roll, the more counts what is down in them; a few may be taken with the camera on its
+    side. Gravity, where cameras have measured it, decides alone.
     """
     right, down, ahead = _upright(rotations)
     mean_down = _unit(down.mean(axis=0))
     spread, axes = np.linalg.eigh(right.T @ right)
     axis = axes[:, 0] * (1.0 if axes[:, 0] @ mean_down > 0.0 else -1.0)
     certainty = (spread[1] - spread[0]) / max(spread[1] + spread[0], 1e-12)
+    certainty *= -math.expm1(-spread[1] / (2.0 * len(right) * _ROLL**2))  # that roll alone spreads them less (Rayleigh)
     y = _unit(certainty * axis + (1.0 - certainty) * mean_down) if down_by_gravity is None else down_by_gravity
     x = _unit(np.cross(y, ahead[reference]))
     z = np.cross(x, y)

@@ -82,6 +82,13 @@ def test_the_horizon_is_level_whatever_the_frame(pitch: float) -> None:
     assert middle.max() == pytest.approx(65.0, abs=1e-6)
 
 
+def test_two_images_one_above_the_other_are_shown_as_they_were_taken() -> None:
+    """They hardly turn about the vertical: what hands roll says nothing of the horizon."""
+    rotations = camera_rotations(np.radians([0.0, 3.0]), np.radians([-5.0, 5.0]), np.radians([1.5, -1.5]))
+    ahead = (rotations @ level_frame(rotations, 0).T)[:, 2]
+    assert np.abs(np.degrees(np.arcsin(ahead[:, 1].mean()))) < 15.0  # their x axes alone say 45
+
+
 def test_images_taken_with_the_camera_on_its_side_do_not_tip_the_horizon() -> None:
     heading, roll = np.radians(np.arange(6) * 25.0), np.radians([2.0, -1.0, 91.0, -2.0, -89.0, 1.0])
     rotations = camera_rotations(heading, 0.1, roll)
