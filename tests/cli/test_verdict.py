@@ -94,11 +94,7 @@ def test_images_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tmp_
     ("models", "lengths", "told"),
     [
         (("One", "One", "Two"), (35, 35, 35), "come from 2 cameras: One (2: 0.jpg, 1.jpg); Two (1: 2.jpg)"),
-        (
-            ("One", "One", "One"),
-            (28, 28, 35),
-            "was zoomed between the images, by up to 1.25 (between 0.jpg and 2.jpg)",
-        ),
+        (("One", "One", "One"), (28, 28, 35), "was zoomed between the images, by up to 1.25 (between 0.jpg and 2.jpg)"),
     ],
 )
 def test_images_of_several_cameras_are_reported(
