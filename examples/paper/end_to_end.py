@@ -98,20 +98,9 @@ def compare(
 ) -> Report:
     """Every set through every stitcher, a table a set.
 
-    Parameters
-    ----------
-    settings : Settings
-    name : str
-        Of the figure; images are named after it.
-    sets : sequence of ImageSet or of the like
-    first_seed : int
-        Of the first set.
-    stitchers : sequence of Stitcher
-    notes : tuple of str
-        On stitchers that are not installed.
-    measured : callable
-        Takes a mosaic, the truth and the set; gives the median error and 95 % of them, px of the images, inf
-        beyond what was searched, and the share that is covered.
+    ``name``: of the figure; images are named after it. ``first_seed``: of the first set. ``notes``: on stitchers that
+    are not installed. ``measured``: takes a mosaic, the truth and the set; gives the median error and 95 % of them, px
+    of the images, inf beyond what was searched, and the share that is covered.
     """
     timeout = float(settings.count(60, 120, 600))
     tables, images = [], {}
