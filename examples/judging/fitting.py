@@ -40,7 +40,7 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> FloatArray:
 def fit_homography(source: ArrayLike, target: ArrayLike) -> FloatArray:
     """Homography that minimises the sum of squared distances in ``target``.
 
-    ``source``, ``target``: at least four points, no three of four on a line; shape (N, 2). Returns the normalized direct
+    ``source``, ``target``: at least four points (N, 2), no three of four on a line. Returns the normalized direct
     linear transform, refined by Gauss-Newton; from source to target, ``H[2, 2] = 1``. Raises :class:`ArgumentError`
     when the points determine no homography.
     """
