@@ -21,17 +21,9 @@ from rdstitch.io.read import read_image
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 
 HEADER = (
-    "stitcher",
-    "exit",
-    "median error, px",
-    "95 % error, px",
-    "coverage, %",
-    "λ error",
-    "time, s",
-    "processor time, s",
-    "memory, MB",
-    "last words",
-)
+    "stitcher", "exit", "median error, px", "95 % error, px", "coverage, %", "λ error",
+    "time, s", "processor time, s", "memory, MB", "last words",
+)  # fmt: skip
 
 SEARCH = 16  # px of the mosaic about each of its places, within which the place is looked for in the truth
 
