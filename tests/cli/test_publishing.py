@@ -79,19 +79,9 @@ def _check_all_failures(
 def test_whatever_fails(
     rdstitch: Run, located: Path, tmp_path: Path, operation: Operation, overwrite: bool, name: str
 ) -> None:
-    # The writes of tiles and strips are many, and alike; all of them are in the slow test.
+    # The writes of tiles and strips are many, and alike.
     step = 5 if operation == "write" else 3
     _check_all_failures(rdstitch, located, tmp_path, operation, name, overwrite, step)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("operation", OPERATIONS)
-@pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize("name", ["out.jpg", "out.png", "out.webp", "out.tif", "out.dzi"])
-def test_whatever_fails_every_single_time(
-    rdstitch: Run, located: Path, tmp_path: Path, operation: Operation, overwrite: bool, name: str
-) -> None:
-    _check_all_failures(rdstitch, located, tmp_path, operation, name, overwrite, 1)
 
 
 @pytest.mark.parametrize(
@@ -215,7 +205,8 @@ def test_an_image_beside_any_sidecar_does_not_vanish(rdstitch: Run, located: Pat
     only.mkdir()
     for name in ("field.tif", "field.tif.json"):
         shutil.copy(located / name, only)
-    assert "no images but those that rdstitch wrote" in rdstitch("mosaic", only, "-o", tmp_path / "x.tif", status=3).line
+    told = "no images but those that rdstitch wrote"
+    rdstitch("mosaic", only, "-o", tmp_path / "x.tif", status=3, told=told)
 
 
 def test_a_link_as_output(rdstitch: Run, located: Path, tmp_path: Path) -> None:
