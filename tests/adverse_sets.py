@@ -37,25 +37,16 @@ def _unchanged(index: int, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
 class AlteredSequence(Sequence):
     """Images of a surface, altered after they were taken.
 
-    Attributes
-    ----------
-    alter : callable
-        Takes the index of an image and its pixels to other pixels of the same shape.
-    height : callable, optional
-        Height of the ground over places (..., 2), all in texels; smooth.
-    shutter : ndarray of shape (N, 2)
-        How far the camera moves while an image is read out from its first to its last row, texels.
-    offset : ndarray of shape (N, 2)
-        Where the corner of each image lies in the uncropped one, pixels.
-    dispensable : frozenset of int
-        Images without which the set is solved, too.
+    ``alter``: takes the index of an image and its pixels to other pixels of the same shape. ``shutter``: how far the
+    camera moves while an image is read out from its first to its last row, texels; shape (N, 2). ``offset``: where the
+    corner of each image lies in the uncropped one, pixels; shape (N, 2).
     """
 
     alter: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]] = _unchanged
-    height: Surface | None = None
+    height: Surface | None = None  # height of the ground over places (..., 2), all in texels; smooth
     shutter: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
     offset: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
-    dispensable: frozenset[int] = frozenset()
+    dispensable: frozenset[int] = frozenset()  # images without which the set is solved, too
 
     def frame(self, index: int) -> NDArray[np.uint8]:
         """See :meth:`Sequence.frame`."""
@@ -98,18 +89,10 @@ class AlteredSequence(Sequence):
 
 @dataclass(frozen=True)
 class RottenSequence(AlteredSequence):
-    """Images of which one has flipped bits in its JPEG file.
+    """Images of which one has flipped bits in its JPEG file."""
 
-    Attributes
-    ----------
-    rotten : int
-        Index of that image.
-    flips : int
-        Bits that are flipped.
-    """
-
-    rotten: int = 0
-    flips: int = 1
+    rotten: int = 0  # index of that image
+    flips: int = 1  # bits that are flipped
 
     def write(self, folder: str | Path, name: str = "frame_{:04d}.jpg") -> list[Path]:
         """See :meth:`Sequence.write`."""

@@ -14,24 +14,12 @@ from rdstitch.radial_homography import RadialHomography
 
 @dataclass(frozen=True)
 class Scene:
-    """What the adjustment is given, and the truth.
+    """What the adjustment is given, and the truth."""
 
-    Attributes
-    ----------
-    cameras : list of Camera
-        Without λ.
-    links : list of Link
-    truth : ndarray of shape (N, 3, 3)
-        True plane-to-image homographies.
-    poses : ndarray of shape (N, 6)
-        True poses in the columns of the planar models.
-    distortion : float
-    """
-
-    cameras: list[Camera]
+    cameras: list[Camera]  # without λ
     links: list[Link]
-    truth: FloatArray
-    poses: FloatArray
+    truth: FloatArray  # true plane-to-image homographies; shape (N, 3, 3)
+    poses: FloatArray  # true poses in the columns of the planar models; shape (N, 6)
     distortion: float
 
 

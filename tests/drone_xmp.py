@@ -26,14 +26,8 @@ DIALECTS: dict[str, tuple[tuple[str, str, str], list[list[float]]]] = {
 def euler_angles(source: str, first_axes: FloatArray, north: float = 0.0) -> tuple[float, float, float]:
     """Yaw, pitch and roll, degrees, of a camera over level ground.
 
-    Parameters
-    ----------
-    source : str
-        Of :data:`DIALECTS`.
-    first_axes : ndarray of shape (3, 2)
-        The plane's X and Y axes in the camera's: the first columns of its rotation.
-    north : float
-        Direction of north in the plane, radians from X to Y.
+    ``source``: of :data:`DIALECTS`. ``first_axes``: the plane's X and Y axes in the camera's: the first columns of its
+    rotation; shape (3, 2). ``north``: direction of north in the plane, radians from X to Y.
     """
     x, y = first_axes.T
     c, s = np.cos(north), np.sin(north)

@@ -20,11 +20,7 @@ _FUNCTIONS = {"rename": ("rename", "replace", "link"), "fsync": ("fsync",), "mkd
 class FailingDisk:
     """Counts operations of one kind, and fails the one of a number.
 
-    Parameters
-    ----------
-    operation : str
-    failing : int or None
-        Number of the operation that fails, from 0; None for none.
+    ``failing``: number of the operation that fails, from 0; None for none.
     """
 
     def __init__(self, operation: Operation, failing: int | None = None) -> None:

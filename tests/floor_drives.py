@@ -21,17 +21,8 @@ def floor_drive(
 ) -> Sequence:
     """Frames of one of :data:`PATHS`, through a lens of λ = :data:`DISTORTION` that is tilted by 3 and -2 degrees.
 
-    Parameters
-    ----------
-    path : str
-    count : int
-        Frames.
-    seed : int
-        Of the floor and the noise.
-    size : (int, int)
-        Width and height of the frames, px.
-    overlap : float
-        Of consecutive frames.
+    ``count``: frames. ``seed``: of the floor and the noise. ``size``: width and height of the frames, px. ``overlap``:
+    of consecutive frames.
     """
     lens = Camera(size, DISTORTION, focal=0.8 * size[0])
     poses = PATHS[path](lens, count, overlap=overlap, heading=0.3, tilt=(np.radians(3.0), np.radians(-2.0)))

@@ -15,14 +15,8 @@ def constraint_residuals(homography: ArrayLike) -> tuple[FloatArray, FloatArray]
       ``3A⁴ - 14A² t2 + 3 t2² - 4 t2 |v|² - 4|v|⁴ + 12 A t3 + 4 A v'Sv = 0``;
     * the sextic ``tr(adj H)³ = det(H) tr(H)³``.
 
-    Parameters
-    ----------
-    homography : array_like of shape (..., 3, 3)
-        In focal-normalized coordinates. The scale cancels: both are computed for unit Frobenius norm.
-
-    Returns
-    -------
-    quartic, sextic : ndarray of shape (...)
+    ``homography``: in focal-normalized coordinates. The scale cancels: both are computed for unit Frobenius norm; shape
+    (..., 3, 3). Returns shape (...).
     """
     h = np.asarray(homography, dtype=np.float64)
     h = h / np.linalg.norm(h, axis=(-2, -1), keepdims=True)

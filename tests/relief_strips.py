@@ -25,22 +25,11 @@ _OPTIONS = EstimationOptions("auto", None, RansacOptions(3.0, 0.999, 10000, 0), 
 
 @dataclass(frozen=True)
 class Strip:
-    """Images in a row, each linked with the three after it.
+    """Images in a row, each linked with the three after it."""
 
-    Attributes
-    ----------
-    truth : Sequence
-        Not meant to be rendered.
-    distortion : float
-        Its λ.
-    cameras : list of Camera
-        Without λ.
-    links : list of Link
-    """
-
-    truth: Sequence
-    distortion: float
-    cameras: list[Camera]
+    truth: Sequence  # not meant to be rendered
+    distortion: float  # its λ
+    cameras: list[Camera]  # without λ
     links: list[Link]
 
     def window(self, first: int, count: int) -> "Strip":

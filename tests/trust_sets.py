@@ -55,24 +55,12 @@ MAX_MEDIAN, MAX_OF_AN_IMAGE = 1.5, 4.0
 
 @dataclass(frozen=True)
 class MixedSequence(Sequence):
-    """Images of one plane of which some were taken with another lens, or show other ground.
+    """Images of one plane of which some were taken with another lens, or show other ground."""
 
-    Attributes
-    ----------
-    other : Sequence
-        The same poses with what else there is.
-    taken : frozenset of int
-        Images that come from ``other``.
-    usable : bool
-        Whether these may be registered rightly with the rest.
-    damaged : bool
-        Whether their files are cut off or have flipped bits.
-    """
-
-    other: Sequence | None = None
-    taken: frozenset[int] = frozenset()
-    usable: bool = False
-    damaged: bool = False
+    other: Sequence | None = None  # the same poses with what else there is
+    taken: frozenset[int] = frozenset()  # images that come from ``other``
+    usable: bool = False  # whether these may be registered rightly with the rest
+    damaged: bool = False  # whether their files are cut off or have flipped bits
 
     def write(self, folder: str | Path, name: str = "frame_{:04d}.png") -> list[Path]:
         """See :meth:`Sequence.write`."""
@@ -107,50 +95,24 @@ class MixedSequence(Sequence):
 
 @dataclass(frozen=True)
 class TrustSet:
-    """One random set.
+    """One random set."""
 
-    Attributes
-    ----------
-    kind : str
-        One of :data:`SOLVABLE`, :data:`ODD`, :data:`HOPELESS` or :data:`tests.adverse_sets.ADVERSE`.
-    sequence : Sequence
-    """
-
-    kind: str
+    kind: str  # one of :data:`SOLVABLE`, :data:`ODD`, :data:`HOPELESS` or :data:`tests.adverse_sets.ADVERSE`
     sequence: Sequence
 
 
 @dataclass(frozen=True)
 class Judged:
-    """What became of a set.
-
-    Attributes
-    ----------
-    kind : str
-    status : int
-        That the command line would have ended with.
-    right : bool
-        Whether the registration of all images used agrees with the truth; True without one.
-    complete : bool
-        Whether every image was used that is needed.
-    error : float
-        Median error, px.
-    text : str
-        What the user would have read.
-    warned : bool
-        Whether a warning names the place, or a decision that the user has to judge.
-    warnings : tuple of str
-        Codes of the warnings that are printed without ``-v``.
-    """
+    """What became of a set."""
 
     kind: str
-    status: int
-    right: bool
-    complete: bool
-    error: float
-    text: str
-    warned: bool = False
-    warnings: tuple[str, ...] = ()
+    status: int  # that the command line would have ended with
+    right: bool  # whether the registration of all images used agrees with the truth; True without one
+    complete: bool  # whether every image was used that is needed
+    error: float  # median error, px
+    text: str  # what the user would have read
+    warned: bool = False  # whether a warning names the place, or a decision that the user has to judge
+    warnings: tuple[str, ...] = ()  # codes of the warnings that are printed without ``-v``
 
 
 def trust_set(seed: int, kind: str | None = None) -> TrustSet:

@@ -58,21 +58,8 @@ def main(
     model: tuple[str, ...] = ("auto", "homography"),
 ) -> None:
     """Print one line per model and number of frames."""
-    columns = (
-        "model",
-        "frames",
-        "aligned",
-        "links",
-        "s",
-        "ms/frame",
-        "ratio",
-        "MB",
-        "chosen",
-        "Δλ",
-        "transl. %",
-        "rot. °",
-    )
-    print("".join(f"{column:>11}" for column in (*columns, "drift %", "largest %")))
+    columns = "model|frames|aligned|links|s|ms/frame|ratio|MB|chosen|Δλ|transl. %|rot. °|drift %|largest %"
+    print("".join(f"{column:>11}" for column in columns.split("|")))
     for one in model:
         first = math.nan
         for count in counts:

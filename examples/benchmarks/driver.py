@@ -4,7 +4,9 @@
 """
 
 import inspect
+import json
 import resource
+import subprocess
 import sys
 import time
 import types
@@ -60,6 +62,26 @@ def images_of(folder: Path) -> list[Path]:
 
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+
+
+def apart(benchmark: str, *arguments: str) -> dict[str, Any]:
+    """What a benchmark that runs in a process of its own, so that memory is its own, prints last as JSON."""
+    command = [sys.executable, "-m", f"examples.benchmarks.{benchmark}", *arguments]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    row: dict[str, Any] = json.loads(printed.splitlines()[-1])
+    return row
+
+
+def costliest(values: dict[str, float], count: int = 8) -> str:
+    """The stages that cost most, and what."""
+    most = sorted(values.items(), key=lambda stage: -stage[1])[:count]
+    return ", ".join(f"{stage} {value:.1f}" for stage, value in most)
+
+
+def processor_time() -> float:
+    """Of this process since it began, its threads included, s."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, Any]:

@@ -26,14 +26,7 @@ from rdstitch.inputs.source import read_sources
 from rdstitch.options import LensName, StitchOptions
 from rdstitch.pipeline.register import register
 from rdstitch.radial_homography import to_plane
-from rdstitch.synthetic import (
-    BrownLens,
-    FisheyeLens,
-    Sequence,
-    grid_poses,
-    ground,
-    sequence_over,
-)
+from rdstitch.synthetic import BrownLens, FisheyeLens, Sequence, grid_poses, ground, sequence_over
 from rdstitch.synthetic.lenses import Lens
 
 NAMES = ("fisheye 90", "fisheye 120", "fisheye 140", "phone", "action camera", "one parameter")

@@ -7,9 +7,6 @@ those of one run compare.
 """
 
 import json
-import resource
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import rdstitch
-from examples.benchmarks.driver import StagePeaks, StageTimes, run
+from examples.benchmarks.driver import StagePeaks, StageTimes, apart, costliest, processor_time, run
 from examples.judging import alignment_error
 from rdstitch.camera import Camera
 from rdstitch.io.write import write_image
@@ -30,7 +27,6 @@ DISTORTION = -0.25
 SIZE = (480, 360)
 _SEED = 19
 _GRID = (5, 4)  # points of a frame at which its place is compared
-_STAGES_SHOWN = 6
 
 
 def survey(count: int) -> Sequence:
@@ -53,7 +49,7 @@ def write_frames(sequence: Sequence, order: list[int], folder: Path) -> None:
 
 def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> dict[str, Any]:
     """Stitch a folder of rendered frames in this process; what that cost, and how near it came to the truth."""
-    stages, peaks, before = StageTimes(), StagePeaks(), resource.getrusage(resource.RUSAGE_SELF)
+    stages, peaks, before = StageTimes(), StagePeaks(), processor_time()
 
     def note(stage: str, done: int, total: int) -> None:
         stages(stage, done, total)
@@ -65,8 +61,7 @@ def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> di
     else:
         with TemporaryDirectory() as output:
             registration = rdstitch.mosaic([folder], Path(output) / "out.tif", options, progress=note).registration
-    own, begun = resource.getrusage(resource.RUSAGE_SELF), before.ru_utime + before.ru_stime
-    seconds = own.ru_utime + own.ru_stime - begun
+    seconds = processor_time() - before
     note("the rest", 0, 0)
     alignment = registration.alignment
     sequence, order = survey(count), frame_order(count, shuffled)
@@ -105,8 +100,7 @@ def print_row(row: dict[str, Any], first: dict[str, Any]) -> None:
         ("ms/frame", {stage: 1e3 * taken / count for stage, taken in row["stages"].items()}),
         ("MB", row["peaks"]),
     ):
-        most = sorted(values.items(), key=lambda stage: -stage[1])[:_STAGES_SHOWN]
-        print(f"{'':8s}{unit}: " + ", ".join(f"{stage} {value:.1f}" for stage, value in most), flush=True)
+        print(f"{'':8s}{unit}: {costliest(values, 6)}", flush=True)
 
 
 def main(
@@ -123,10 +117,8 @@ def main(
     for count in counts:
         with TemporaryDirectory() as rendered:
             write_frames(survey(count), frame_order(count, shuffled), Path(rendered))
-            command = [sys.executable, "-m", "examples.benchmarks.scale", str(count), "--folder", rendered]
-            command += ["--shuffled"] * shuffled + ["--register"] * register
-            printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-        row = json.loads(printed.splitlines()[-1])
+            options = ["--shuffled"] * shuffled + ["--register"] * register
+            row = apart("scale", str(count), "--folder", rendered, *options)
         first = first or row
         print_row(row, first)
 

@@ -27,23 +27,14 @@ SCALES = (1.0, 0.5, 2.0)
 class Outcome:
     """What became of a folder.
 
-    Attributes
-    ----------
-    status : int
-        Exit status of the command line.
-    used : tuple of bool
-        Which images are in the result.
-    distortion, deviation : float
-        λ and its standard deviation; NaN without a result.
-    text : str
-        Why it was refused, or all messages.
+    ``distortion``, ``deviation``: λ and its standard deviation; NaN without a result.
     """
 
-    status: int
-    used: tuple[bool, ...]
+    status: int  # exit status of the command line
+    used: tuple[bool, ...]  # which images are in the result
     distortion: float
     deviation: float
-    text: str
+    text: str  # why it was refused, or all messages
 
 
 def images_of(folder: Path) -> list[PixelArray]:

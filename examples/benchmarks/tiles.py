@@ -78,10 +78,7 @@ def grids(rows: int, tile: int) -> Iterator[tuple[str, StageGrid]]:
         for overlap in (0.05, 0.1, 0.2):
             for distortion in (0.0, -0.02):
                 name = f"{specimen}, {overlap:.0%} overlap, λ = {distortion:g}"
-                yield (
-                    name,
-                    StageGrid(rows, rows, tile, overlap, specimen, content=0.5, distortion=distortion, seed=7),
-                )
+                yield (name, StageGrid(rows, rows, tile, overlap, specimen, content=0.5, distortion=distortion, seed=7))
 
 
 def errors(stage: StageGrid, places: FloatArray, groups: Sequence[Sequence[int]]) -> FloatArray:

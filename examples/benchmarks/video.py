@@ -7,8 +7,6 @@ is in the mosaic. Times depend on the machine: only those of one run compare.
 """
 
 import json
-import resource
-import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -19,7 +17,7 @@ import cv2
 import numpy as np
 
 import rdstitch
-from examples.benchmarks.driver import StageTimes, peak_memory, run
+from examples.benchmarks.driver import StageTimes, apart, costliest, peak_memory, processor_time, run
 from examples.judging import alignment_error
 from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import Sequence
@@ -28,7 +26,6 @@ from tests.floor_drives import DISTORTION, floor_drive
 
 _SEED = 3
 _GRID = (5, 4)  # points of a frame at which its place is compared
-_STAGES_SHOWN = 8
 _FRAMES_A_SECOND = 30.0
 
 
@@ -59,12 +56,12 @@ def ground_shown(sequence: Sequence, frames: list[int]) -> float:
 
 def measure(file: Path, sequence: Sequence, every: int | None) -> dict[str, Any]:
     """Stitch the video in this process; what that cost, and how near it came to the truth."""
-    stages, before = StageTimes(), resource.getrusage(resource.RUSAGE_SELF)
+    stages, before = StageTimes(), processor_time()
     options = rdstitch.StitchOptions(workers=1, overwrite=True, force=True)
     with TemporaryDirectory() as output:
         out = Path(output) / "out.jpg"
         registration = rdstitch.mosaic([file], out, options, every=every, progress=stages).registration
-    own = resource.getrusage(resource.RUSAGE_SELF)
+    seconds = processor_time() - before
     stages("the rest", 0, 0)
     alignment = registration.alignment
     numbers = [source.number(place) for place, source in enumerate(registration.sources)]
@@ -72,7 +69,7 @@ def measure(file: Path, sequence: Sequence, every: int | None) -> dict[str, Any]
     places = {numbers[i]: partial(to_plane, alignment.cameras[i], alignment.homographies[i]) for i in used}
     error = alignment_error(sequence, places, points_per_side=_GRID)
     return {
-        "seconds": own.ru_utime + own.ru_stime - before.ru_utime - before.ru_stime,
+        "seconds": seconds,
         "memory": peak_memory(),
         "taken": len(numbers),
         "used": len(used),
@@ -104,16 +101,13 @@ def main(
         file = video or Path(folder) / "drive.avi"
         if not file.exists():
             write_video(drive, file)
-        command = [sys.executable, "-m", "examples.benchmarks.video", "--run-here", *sys.argv[1:], "--video", str(file)]
-        printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    row = json.loads(printed.splitlines()[-1])
+        row = apart("video", "--run-here", *sys.argv[1:], "--video", str(file))
     each = row["seconds"] / frames
     print(f"{row['seconds']:.1f} s, {each:.3f} s a frame; {row['memory']:.0f} MB", end="; ")
     print(f"{row['taken']} of {frames} frames taken, {row['used']} aligned; {row['ground']:.2%} of the ground")
     print(f"λ - truth {row['distortion'] - DISTORTION:+.5f}; error of position in px: median", end=" ")
     print(f"{row['median']:.3f}, 95 % {row['percentile95']:.3f}, largest {row['largest']:.3f}")
-    costliest = sorted(row["stages"].items(), key=lambda stage: -stage[1])[:_STAGES_SHOWN]
-    print("ms a frame: " + ", ".join(f"{stage} {1e3 * taken / frames:.1f}" for stage, taken in costliest))
+    print("ms a frame: " + costliest({stage: 1e3 * taken / frames for stage, taken in row["stages"].items()}))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,27 +34,22 @@ class Row:
 
     name: str
     status: int
-    used: int
     count: int
-    model: str
-    distortion: float
-    stretch: float
-    folded: bool
-    focal: float
     seconds: float
     messages: tuple[str, ...]
-    peer_seconds: float = math.nan
+    peer_seconds: float
+    used: int = 0
+    model: str = ""
+    distortion: float = math.nan
+    stretch: float = math.nan
+    folded: bool = False
+    focal: float = math.nan
 
     @property
     def good(self) -> bool:
         """Whether a person would keep it, as far as numbers tell."""
-        distorted = abs(self.distortion) > _MAX_DISTORTION
-        return (
-            self.status == 0
-            and self.used == self.count
-            and not (distorted or self.folded)
-            and self.stretch <= _MAX_STRETCH
-        )
+        whole = self.status == 0 and self.used == self.count and not self.folded
+        return whole and not abs(self.distortion) > _MAX_DISTORTION and self.stretch <= _MAX_STRETCH
 
     def __str__(self) -> str:
         """One line of the table."""
@@ -111,31 +106,19 @@ def stitch(folder: Path, output: Path, options: list[str], peer: str | None) -> 
     (output / f"{folder.name}.txt").write_text(errors)
     peer_seconds = math.nan
     if peer is not None:
-        peer_seconds = execute(
-            ["timeout", str(_MAX_SECONDS), peer, *files, "--output", str(output / f"{folder.name}.peer.jpg")]
-        )[2]
+        theirs = str(output / f"{folder.name}.peer.jpg")
+        peer_seconds = execute(["timeout", str(_MAX_SECONDS), peer, *files, "--output", theirs])[2]
+    row = Row(folder.name, status, len(files), seconds, messages, peer_seconds)
     sidecar = Path(f"{written}.json")
     if status or not sidecar.exists():
-        return Row(
-            folder.name, status, 0, len(files), "", math.nan, math.nan, False, math.nan, seconds, messages, peer_seconds
-        )
-    found = json.loads(sidecar.read_text())
-    used = [image for image in found["images"] if image["used"]]
-    focal = (found["focal_px"] or math.nan) / (math.hypot(*used[0]["size"]) / 2.0)
-    distortion = math.nan if found["lambda"] is None else found["lambda"]
-    return Row(
-        folder.name,
-        status,
-        len(used),
-        len(files),
-        found["model"],
-        distortion,
-        *shape_of(used),
-        focal,
-        seconds,
-        messages,
-        peer_seconds,
-    )
+        return row
+    record = json.loads(sidecar.read_text())
+    used = [image for image in record["images"] if image["used"]]
+    stretch, folded = shape_of(used)
+    focal = (record["focal_px"] or math.nan) / (math.hypot(*used[0]["size"]) / 2.0)
+    distortion = math.nan if record["lambda"] is None else record["lambda"]
+    row = replace(row, used=len(used), model=record["model"], distortion=distortion)
+    return replace(row, stretch=stretch, folded=folded, focal=focal)
 
 
 def main(

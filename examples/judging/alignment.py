@@ -18,24 +18,15 @@ Transfer = Callable[[FloatArray], FloatArray]
 class AlignmentError:
     """Errors of a registration on a grid of points of its images, after the best transform to the true plane.
 
-    Attributes
-    ----------
-    transform : ndarray of shape (3, 3)
-        Mosaic px to texels.
-    image : ndarray of shape (N,), intp
-        LinearPixels of each point.
-    points : ndarray of shape (N, 2)
-        Measured px in that image.
-    error : ndarray of shape (N,)
-        In px of that image: distance from the point to where the true camera sees the place on the plane that the
-        estimate gives to it; inf where the estimate gives none, or one that the true camera cannot see.
-    error_mosaic : ndarray of shape (N,)
-        In px of the mosaic: distance between the estimated and the true place of the point; inf as above.
+    ``error``: in px of that image: distance from the point to where the true camera sees the place on the plane that
+    the estimate gives to it; inf where the estimate gives none, or one that the true camera cannot see; shape (N,).
+    ``error_mosaic``: in px of the mosaic: distance between the estimated and the true place of the point; inf as above;
+    shape (N,).
     """
 
-    transform: FloatArray
-    image: NDArray[np.intp]
-    points: FloatArray
+    transform: FloatArray  # mosaic px to texels; shape (3, 3)
+    image: NDArray[np.intp]  # which image each point is in; shape (N,)
+    points: FloatArray  # measured px in that image; shape (N, 2)
     error: FloatArray
     error_mosaic: FloatArray
 
@@ -72,19 +63,9 @@ def alignment_error(
     transform between the two that minimises the sum of squared distances on the plane is what the mosaic is allowed to
     differ by; errors are what remains.
 
-    Parameters
-    ----------
-    transfers : mapping of int to callable
-        For each image that was registered: measured px (N, 2) to mosaic px (N, 2), NaN where there is no such place.
-    model : str
-        "similarity" or "homography": the transform to the plane.
-    points_per_side : (int, int)
-        Columns and rows of the grid, from border to border.
-
-    Raises
-    ------
-    ArgumentError
-        When nothing was registered.
+    ``transfers``: for each image that was registered: measured px (N, 2) to mosaic px (N, 2), NaN where there is no
+    such place. ``model``: "similarity" or "homography": the transform to the plane. ``points_per_side``: columns and
+    rows of the grid, from border to border. Raises :class:`ArgumentError` when nothing was registered.
     """
     width, height = sequence.lens.image_size
     columns, rows = points_per_side

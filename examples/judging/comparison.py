@@ -27,32 +27,19 @@ _MIN_MATCHES = 12
 class PlaneComparison:
     """A mosaic beside the true plane.
 
-    Attributes
-    ----------
-    transform : ndarray of shape (3, 3)
-        Mosaic px to texels, of the kind asked for; NaN where the mosaic shows nothing of the plane.
-    center : ndarray of shape (P, 2)
-        Centres of the mosaic's patches that have texture, px.
-    residual : ndarray of shape (P, 2)
-        From where the transform puts the plane to where the mosaic shows it, px of the mosaic; NaN for patches that do
-        not look like the plane anywhere near.
-    texels_per_pixel : float
-        Size of a mosaic px on the plane, in the middle of the mosaic.
-    coverage : float
-        Share of the reachable plane that the mosaic shows; NaN if what is reachable was not given.
-    grey_rms : float
-        Root mean square difference of the grey levels, 0-255, after the best gain and offset for the whole mosaic.
-    correlation : float
-        Of the grey levels of mosaic and plane.
+    ``transform``: mosaic px to texels, of the kind asked for; NaN where the mosaic shows nothing of the plane; shape
+    (3, 3). ``residual``: from where the transform puts the plane to where the mosaic shows it, px of the mosaic; NaN
+    for patches that do not look like the plane anywhere near; shape (P, 2). ``grey_rms``: root mean square difference
+    of the grey levels, 0-255, after the best gain and offset for the whole mosaic.
     """
 
     transform: FloatArray
-    center: FloatArray
+    center: FloatArray  # centres of the mosaic's patches that have texture, px; shape (P, 2)
     residual: FloatArray
-    texels_per_pixel: float
-    coverage: float
+    texels_per_pixel: float  # size of a mosaic px on the plane, in the middle of the mosaic
+    coverage: float  # share of the reachable plane that the mosaic shows; NaN if what is reachable was not given
     grey_rms: float
-    correlation: float
+    correlation: float  # of the grey levels of mosaic and plane
 
     @property
     def error(self) -> FloatArray:
@@ -96,29 +83,13 @@ def compare_with_plane(
     distances is found anew. In the first round patches more than three times the median away do not take part in the
     fit, afterwards all do that were found.
 
-    Parameters
-    ----------
-    mosaic : ndarray of shape (h, w), (h, w, 3) or (h, w, 4)
-        uint8 or uint16; RGB with an optional alpha.
-    plane : Texture
-        Held in memory once as a grey image.
-    model : str
-        "similarity" or "homography": what the mosaic may differ by from the plane.
-    reachable : ndarray of bool, optional
-        Which texels the images show, for the coverage; see :meth:`Sequence.reachable`. Two texels at its border do
-        not count.
-    valid : ndarray of shape (h, w), bool, optional
-        Which px of the mosaic are filled; if not given, those whose alpha is not zero or, without alpha, that are not
-        black.
-    start : array_like of shape (3, 3), optional
-        Mosaic px to texels, right to within ``search``.
-    patch, spacing, search : int
-        See :func:`examples.judging.patches.patch_displacements`.
-
-    Raises
-    ------
-    ArgumentError
-        When the mosaic has another shape or type.
+    ``mosaic``: uint8 or uint16; RGB with an optional alpha; shape (h, w), (h, w, 3) or (h, w, 4). ``plane``: held in
+    memory once as a grey image. ``model``: "similarity" or "homography": what the mosaic may differ by from the plane.
+    ``reachable``: which texels the images show, for the coverage; see :meth:`Sequence.reachable`. Two texels at its
+    border do not count. ``valid``: which px of the mosaic are filled; if not given, those whose alpha is not zero or,
+    without alpha, that are not black; shape (h, w). ``start``: mosaic px to texels, right to within ``search``; shape
+    (3, 3). ``patch``, ``spacing``, ``search``: see :func:`examples.judging.patches.patch_displacements`. Raises
+    :class:`ArgumentError` when the mosaic has another shape or type.
     """
     grey, filled = grey_and_filled(mosaic)
     filled = filled if valid is None else valid
@@ -161,15 +132,9 @@ def compare_with_plane(
 def coverage(filled: NDArray[np.bool_], transform: ArrayLike, reachable: NDArray[np.bool_]) -> float:
     """Share of the reachable texels that a mosaic shows.
 
-    Parameters
-    ----------
-    filled : ndarray of shape (h, w), bool
-        Which px of the mosaic are filled.
-    transform : array_like of shape (3, 3)
-        Mosaic px to texels.
-    reachable : ndarray of bool
-        Which texels the images show. Two texels at its border do not count: whether an image shows them is a
-        matter of rounding.
+    ``filled``: which px of the mosaic are filled; shape (h, w). ``transform``: mosaic px to texels; shape (3, 3).
+    ``reachable``: which texels the images show. Two texels at its border do not count: whether an image shows them is a
+    matter of rounding.
     """
     inner = cv2.erode(reachable.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=(0.0,)) > 0
     if not inner.any():

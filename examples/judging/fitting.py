@@ -22,20 +22,8 @@ def apply(transform: ArrayLike, points: ArrayLike) -> FloatArray:
 def fit_similarity(source: ArrayLike, target: ArrayLike) -> FloatArray:
     """Rotation, scale and shift (never a reflection) that minimise the sum of squared distances in ``target``.
 
-    Parameters
-    ----------
-    source, target : array_like of shape (N, 2)
-        At least two different points.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        Umeyama's closed form in the plane, from source to target.
-
-    Raises
-    ------
-    ArgumentError
-        When the points determine no similarity.
+    ``source``, ``target``: at least two different points; shape (N, 2). Returns Umeyama's closed form in the plane,
+    from source to target. Raises :class:`ArgumentError` when the points determine no similarity.
     """
     a, b = _checked(source, target, 2)
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
@@ -52,20 +40,9 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> FloatArray:
 def fit_homography(source: ArrayLike, target: ArrayLike) -> FloatArray:
     """Homography that minimises the sum of squared distances in ``target``.
 
-    Parameters
-    ----------
-    source, target : array_like of shape (N, 2)
-        At least four points, no three of four on a line.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        Normalized direct linear transform, refined by Gauss-Newton; from source to target, ``H[2, 2] = 1``.
-
-    Raises
-    ------
-    ArgumentError
-        When the points determine no homography.
+    ``source``, ``target``: at least four points (N, 2), no three of four on a line. Returns the normalized direct
+    linear transform, refined by Gauss-Newton; from source to target, ``H[2, 2] = 1``. Raises :class:`ArgumentError`
+    when the points determine no homography.
     """
     a, b = _checked(source, target, 4)
     to_a, to_b = _normalization(a), _normalization(b)

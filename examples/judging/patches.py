@@ -21,17 +21,12 @@ _FARTHEST_FROM_PEAK = 1.5
 class Displacements:
     """Patches with texture, and where they were found.
 
-    Attributes
-    ----------
-    center : ndarray of shape (P, 2)
-        Centre of each patch, px.
-    displacement : ndarray of shape (P, 2)
-        From there to where the other image shows the same, px; NaN where it was not found.
-    correlation : ndarray of shape (P,)
-        Normalized cross-correlation there; that of the best place, if too low, for patches that were not found.
+    ``displacement``: from there to where the other image shows the same, px; NaN where it was not found; shape (P, 2).
+    ``correlation``: normalized cross-correlation there; that of the best place, if too low, for patches that were not
+    found; shape (P,).
     """
 
-    center: FloatArray
+    center: FloatArray  # centre of each patch, px; shape (P, 2)
     displacement: FloatArray
     correlation: FloatArray
 
@@ -58,22 +53,11 @@ def patch_displacements(
     Each patch of a regular grid is looked for by normalized cross-correlation, and from the best whole pixel on by
     least squares over shift, gain and offset (Lucas and Kanade).
 
-    Parameters
-    ----------
-    image, other : ndarray of shape (h, w), float32
-        In [0, 1].
-    valid : ndarray of shape (h, w), bool
-        Where ``image`` and ``other`` mean something; a patch must lie inside with all its px.
-    patch : int
-        Side of a patch, px; odd.
-    spacing : int, optional
-        Distance between patches, px; if not given, 24 or what makes some 5,000 patches.
-    search : int
-        Largest displacement along each axis, px.
-    least_contrast : float
-        Patches with a smaller standard deviation have no texture and are left out.
-    least_correlation : float
-        What is less alike counts as not found.
+    ``image``, ``other``: in [0, 1]; shape (h, w). ``valid``: where ``image`` and ``other`` mean something; a patch must
+    lie inside with all its px; shape (h, w). ``patch``: side of a patch, px; odd. ``spacing``: distance between
+    patches, px; if not given, 24 or what makes some 5,000 patches. ``search``: largest displacement along each axis,
+    px. ``least_contrast``: patches with a smaller standard deviation have no texture and are left out.
+    ``least_correlation``: what is less alike counts as not found.
     """
     half = patch // 2
     step = max(24, int(np.sqrt(image.size / _PATCHES))) if spacing is None else spacing

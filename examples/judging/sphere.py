@@ -26,17 +26,12 @@ _GRID = 25  # places of an image, along each axis
 class SphereComparison:
     """A panorama beside the true sphere.
 
-    Attributes
-    ----------
-    error : ndarray of shape (P,)
-        Angles between what the panorama shows and what the best turn, size and horizon of the whole put there,
-        radians; inf for patches that do not look like the sphere anywhere near.
-    coverage : float
-        Share of the directions that the images show which the panorama shows.
+    ``error``: angles between what the panorama shows and what the best turn, size and horizon of the whole put there,
+    radians; inf for patches that do not look like the sphere anywhere near; shape (P,).
     """
 
     error: FloatArray
-    coverage: float
+    coverage: float  # share of the directions that the images show which the panorama shows
 
     def quantile(self, share: float) -> float:
         """So many of the errors are not above this, radians; inf where nothing was recognized."""
@@ -75,14 +70,9 @@ class _Placement:
 def compare_with_sphere(panorama: NDArray[Any], sequence: TurningSequence, search: int = 16) -> SphereComparison:
     """Lay a panorama on the true sphere, and measure how far each part of it is from where it belongs.
 
-    Parameters
-    ----------
-    panorama : ndarray of shape (h, w), (h, w, 3) or (h, w, 4)
-        Equirectangular, of any size, turned anyhow but nearly level.
-    sequence : TurningSequence
-        The images that it was made of.
-    search : int
-        Largest error that is told from a wrong place, pixels of the panorama.
+    ``panorama``: equirectangular, of any size, turned anyhow but nearly level; shape (h, w), (h, w, 3) or (h, w, 4).
+    ``sequence``: the images that it was made of. ``search``: largest error that is told from a wrong place, pixels of
+    the panorama.
     """
     grey, filled = grey_and_filled(panorama)
     width, height = sequence.texture.size[0] // 2, sequence.texture.size[1]

@@ -21,17 +21,9 @@ from rdstitch.io.read import read_image
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 
 HEADER = (
-    "stitcher",
-    "exit",
-    "median error, px",
-    "95 % error, px",
-    "coverage, %",
-    "λ error",
-    "time, s",
-    "processor time, s",
-    "memory, MB",
-    "last words",
-)
+    "stitcher", "exit", "median error, px", "95 % error, px", "coverage, %", "λ error",
+    "time, s", "processor time, s", "memory, MB", "last words",
+)  # fmt: skip
 
 SEARCH = 16  # px of the mosaic about each of its places, within which the place is looked for in the truth
 
@@ -98,20 +90,9 @@ def compare(
 ) -> Report:
     """Every set through every stitcher, a table a set.
 
-    Parameters
-    ----------
-    settings : Settings
-    name : str
-        Of the figure; images are named after it.
-    sets : sequence of ImageSet or of the like
-    first_seed : int
-        Of the first set.
-    stitchers : sequence of Stitcher
-    notes : tuple of str
-        On stitchers that are not installed.
-    measured : callable
-        Takes a mosaic, the truth and the set; gives the median error and 95 % of them, px of the images, inf
-        beyond what was searched, and the share that is covered.
+    ``name``: of the figure; images are named after it. ``first_seed``: of the first set. ``notes``: on stitchers that
+    are not installed. ``measured``: takes a mosaic, the truth and the set; gives the median error and 95 % of them, px
+    of the images, inf beyond what was searched, and the share that is covered.
     """
     timeout = float(settings.count(60, 120, 600))
     tables, images = [], {}

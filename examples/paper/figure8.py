@@ -65,26 +65,18 @@ class _Election:
 class BoardVotes:
     """What images of a chessboard vote for.
 
-    Attributes
-    ----------
-    votes : ndarray of shape (pairs,)
-        λ of each pair.
-    elected, adjusted : float
-        λ by the weighted votes, and by the adjustment of all images.
-    off_before, off_by_truth, off_by_adjusted : float
-        Rms distance of the corners from the grid after a homography, % of a square, mean over the images: as
-        measured, undistorted with the given λ, and with the adjusted one.
-    image : ndarray of shape (h, w, 3)
-        The image with the largest board, beside itself undistorted and rectified.
+    ``elected``, ``adjusted``: λ by the weighted votes, and by the adjustment of all images. ``off_before``,
+    ``off_by_truth``, ``off_by_adjusted``: rms distance of the corners from the grid after a homography, % of a square,
+    mean over the images: as measured, undistorted with the given λ, and with the adjusted one.
     """
 
-    votes: FloatArray
+    votes: FloatArray  # λ of each pair; shape (pairs,)
     elected: float
     adjusted: float
     off_before: float
     off_by_truth: float
     off_by_adjusted: float
-    image: Pixels
+    image: Pixels  # the image with the largest board, beside itself undistorted and rectified; shape (h, w, 3)
 
 
 def run(settings: Settings) -> Report:
@@ -190,15 +182,8 @@ def _rectified_chart(d: Drive, alignment: Alignment) -> tuple[Table, Pixels]:
 def vote_on_boards(files: list[Path], corners: tuple[int, int], truth: float, reach: int) -> BoardVotes:
     """λ of a camera from the corners of a board, by pairs of images that are told nothing of the board.
 
-    Parameters
-    ----------
-    files : list of path
-    corners : (int, int)
-        Inner corners across and down.
-    truth : float
-        λ that the corners are undistorted with for comparison.
-    reach : int
-        Images are paired with so many that follow.
+    ``corners``: inner corners across and down. ``truth``: λ that the corners are undistorted with for comparison.
+    ``reach``: images are paired with so many that follow.
     """
     camera, boards = find_boards(files, corners)
     grid, seen = board_grid(corners), list(boards.values())

@@ -27,7 +27,7 @@ def border_weight(geometry: Geometry) -> Float32Array:
     weight = one - np.abs(weight, out=weight)
     down = (map_y + half) * np.float32(2.0 / height) - one
     weight *= one - np.abs(down, out=down)
-    # Never 0 inside: a border pixels that one image alone covers must not get lost.
+    # Never 0 inside: a border pixel that one image alone covers must not get lost.
     np.maximum(weight, _MIN_WEIGHT, out=weight)
     weight[~geometry.inside] = 0.0
     return weight

@@ -69,7 +69,7 @@ class Lattice:
         return self.points[rows, columns]
 
     def maps(self, box: Box) -> tuple[Float32Array, Float32Array]:
-        """Measured pixels of every canvas pixels of a box within this one's: two arrays (h, w)."""
+        """Measured pixels of every canvas pixel of a box within this one's: two arrays (h, w)."""
         points = self.nodes(box, self.step)
         return interpolated(points[..., 0], box, self.step), interpolated(points[..., 1], box, self.step)
 

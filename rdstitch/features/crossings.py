@@ -51,5 +51,5 @@ def find_crossings(image: PreparedImage) -> FloatArray:
         step = np.column_stack([c * gx - b * gy, a * gy - b * gx]) / np.minimum(a * c - b * b, -_FLAT)[:, None]
         points = np.clip(points - step, start - 2.0 * _FARTHEST, start + 2.0 * _FARTHEST)
     near = np.linalg.norm(points - start, axis=1) < _FARTHEST
-    found = points[near & image.covers(points, np.full(len(points), _CLEARANCE))]
-    return image.to_full_size(found)
+    crossings = points[near & image.covers(points, np.full(len(points), _CLEARANCE))]
+    return image.to_full_size(crossings)

@@ -169,10 +169,10 @@ def _look(
 
 
 def _usable(image: PreparedImage, detection: Detection) -> NDArray[np.intp]:
-    """Which keypoints keep clear of the mask."""
+    """Select the keypoints that keep clear of the mask."""
     return np.flatnonzero(image.covers(detection.points, detection.scale / 2))
 
 
 def _find_at_less_contrast(image: PreparedImage, options: FeatureOptions) -> Detection:
-    """What is found where differences of grey levels are divided by what equalization multiplies them by at most."""
+    """Detect with differences of grey levels divided by the most that equalization multiplies them by."""
     return find(np.rint(image.grey / CLIP_LIMIT).astype(np.uint8), options)

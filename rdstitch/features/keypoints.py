@@ -1,4 +1,4 @@
-"""What detection and matching hand on: keypoints and descriptors of an image, and points of two that show the same."""
+"""Results of detection and matching: keypoints and descriptors of an image, and corresponding points of two."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -95,7 +95,7 @@ class Features:
 
     @property
     def binary(self) -> bool:
-        """Whether descriptors are bits, compared by the Hamming distance."""
+        """True for descriptors of bits, compared by the Hamming distance."""
         return self.descriptors.dtype == np.uint8
 
 

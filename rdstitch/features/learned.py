@@ -123,11 +123,11 @@ class LightGlue:
                     features1.image_size,
                     features2.image_size,
                 )
-                found = self._matcher.match(features1.descriptors, features2.descriptors)
+                matched = self._matcher.match(features1.descriptors, features2.descriptors)
         except cv2.error as error:
             raise InputError(f"{self._model}: not a LightGlue network for {features1.kind} features") from error
-        rows = np.array([(m.queryIdx, m.trainIdx) for m in found], dtype=np.intp).reshape(-1, 2)
-        doubt = np.clip(np.array([m.distance for m in found], dtype=np.float64), 0.0, 1.0)
+        rows = np.array([(m.queryIdx, m.trainIdx) for m in matched], dtype=np.intp).reshape(-1, 2)
+        doubt = np.clip(np.array([m.distance for m in matched], dtype=np.float64), 0.0, 1.0)
         order = np.lexsort((rows[:, 1], rows[:, 0], doubt))
         return Correspondences.of(features1, features2, rows[order], doubt[order])
 

@@ -17,7 +17,7 @@ from rdstitch.features.nearest import compare, mutual_nearest
 from rdstitch.scipy_parts import distance, spatial
 
 Matcher = Callable[[Features, Features], Correspondences]
-"""What matches the features of two images: :func:`match`, or a network's."""
+"""Matches the features of two images: :func:`match`, or a network's."""
 
 _DEFAULT_RATIO = 0.85
 _BLOCK_BYTES = 2**21  # two threads have room for it in the caches; the products of smaller ones take longer
@@ -79,8 +79,8 @@ def _match_signs(
     pairs, ratios = [], []
     for sign in (-1, 1):
         index1, index2 = np.flatnonzero(sign1 == sign), np.flatnonzero(sign2 == sign)
-        found, ratio = mutual_nearest(features1.take(index1), features2.take(index2), block_bytes, limit)
-        pairs.append(np.column_stack([index1[found[:, 0]], index2[found[:, 1]]]))
+        nearest, ratio = mutual_nearest(features1.take(index1), features2.take(index2), block_bytes, limit)
+        pairs.append(np.column_stack([index1[nearest[:, 0]], index2[nearest[:, 1]]]))
         ratios.append(ratio)
     return np.concatenate(pairs), np.concatenate(ratios)
 
@@ -126,7 +126,7 @@ def match_near(
         candidates = candidates[sign1[candidates[:, 0]] == sign2[candidates[:, 1]]]
     distance = similarity.distance(similarity.pairs(candidates[:, 0], candidates[:, 1]))
     farthest = np.quantile(similarity.distance(similarity.pairs(known[:, 0], known[:, 1])), _USUAL)
-    place1, place2 = (_places(found.points)[candidates[:, k]] for k, found in enumerate((features1, features2)))
+    place1, place2 = (_places(features.points)[candidates[:, k]] for k, features in enumerate((features1, features2)))
     kept = _best_of_each(np.column_stack([place1, place2]), distance)
     candidates, distance, place1, place2 = candidates[kept], distance[kept], place1[kept], place2[kept]
     worse = np.maximum(_ratios_within(place1, distance), _ratios_within(place2, distance))
@@ -147,7 +147,7 @@ def _within(expected: FloatArray, points: FloatArray, radius: float) -> NDArray[
 
 
 def _places(points: FloatArray) -> NDArray[np.intp]:
-    """Which points are at the same place: SIFT gives a point several descriptors."""
+    """Number the places of points, equal where they coincide: SIFT gives a point several descriptors."""
     number: NDArray[np.intp] = np.unique(points, axis=0, return_inverse=True)[1].reshape(-1)
     return number
 
@@ -219,9 +219,9 @@ def match_overlap(
     parts = overlapping(features1, features2, matches)
     if parts is None:
         return matcher(features1, features2)
-    found = matcher(features1.take(parts[0]), features2.take(parts[1]))
-    indices = np.column_stack([part[found.indices[:, k]] for k, part in enumerate(parts)])
-    return replace(found, indices=indices)
+    matched = matcher(features1.take(parts[0]), features2.take(parts[1]))
+    indices = np.column_stack([part[matched.indices[:, k]] for k, part in enumerate(parts)])
+    return replace(matched, indices=indices)
 
 
 def _around(features: Features, size: tuple[int, int], points: FloatArray, reach: FloatArray) -> Part:

@@ -62,7 +62,7 @@ class Euclidean:
 
     @classmethod
     def of(cls, descriptors1: NDArray[np.float32], descriptors2: NDArray[np.float32]) -> Self:
-        """Of the descriptors of two images."""
+        """Prepare the descriptors of two images."""
         both = descriptors1, descriptors2
         largest = float(np.sqrt(max(np.einsum("ij,ij->i", v, v).max(initial=0.0) for v in both)))
         # A power of two, so that integers stay integers.
@@ -103,7 +103,7 @@ class Hamming:
 
     @classmethod
     def of(cls, descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8]) -> Self:
-        """Of the descriptors of two images."""
+        """Prepare the descriptors of two images."""
         # Equal bits of a and b are the ones of a ^ ~b, and of ~a ^ b.
         return cls(_words(descriptors1), ~_words(descriptors2))
 
@@ -177,12 +177,12 @@ class Locations:
         return np.concatenate(self.layers)
 
     def places(self, chosen: slice) -> list[NDArray[np.intp]]:
-        """Where in that order the keypoints of a range of locations are, a layer each."""
+        """Index the keypoints of a range of locations in that order, a layer each."""
         places, offset = [], 0
         for layer in self.layers:
-            own = np.arange(offset + chosen.start, offset + min(chosen.stop, len(layer)))
-            if len(own):
-                places.append(own)
+            in_layer = np.arange(offset + chosen.start, offset + min(chosen.stop, len(layer)))
+            if len(in_layer):
+                places.append(in_layer)
             offset += len(layer)
         return places
 
@@ -225,15 +225,15 @@ def mutual_nearest(
     one, two = Locations.group(features1.points), Locations.group(features2.points)
     similarity = compare(features1.descriptors[one.order], features2.descriptors[two.order])
 
-    found = _two_best(similarity, one, two, block_bytes)
-    ratio = found.ratio(similarity)
+    candidates = _two_best(similarity, one, two, block_bytes)
+    ratio = candidates.ratio(similarity)
     chosen = np.flatnonzero(ratio < limit)
-    return _nearest_keypoints(similarity, one, two, chosen, found.nearest[chosen]), ratio[chosen]
+    return _nearest_keypoints(similarity, one, two, chosen, candidates.nearest[chosen]), ratio[chosen]
 
 
 @dataclass(frozen=True)
 class _TwoBest:
-    """Of each location of image 1 the nearest one in image 2, and how alike they are; shapes (L,).
+    """The nearest location in image 2 to each in image 1, and how alike they are; shapes (L,).
 
     ``second`` is how alike the best other pair is that either of the two is in: where that is less than ``best``, the
     two are each other's nearest.
@@ -272,7 +272,7 @@ def _two_best(similarity: DescriptorSimilarity, one: Locations, two: Locations, 
 
 
 def _rivals(nearest: NDArray[np.intp], best: NDArray[Any], lowest: float) -> NDArray[Any]:
-    """How alike another location of image 1 is that has the same nearest, (L,).
+    """Compute how alike another location of image 1 is that has the same nearest, (L,).
 
     Of the most alike of these that is the best of the others; of the rest one that is no less alike than themselves.
     """
@@ -281,9 +281,9 @@ def _rivals(nearest: NDArray[np.intp], best: NDArray[Any], lowest: float) -> NDA
     rival = np.full(len(order), lowest, best.dtype)
     rival[1:][same] = best[order][:-1][same]
     rival[:-1][same] = best[order][1:][same]
-    found = np.empty_like(rival)
-    found[order] = rival
-    return found
+    by_location = np.empty_like(rival)
+    by_location[order] = rival
+    return by_location
 
 
 def _merge(block: NDArray[Any], layers: list[NDArray[np.intp]], two: Locations) -> NDArray[Any]:
@@ -308,7 +308,7 @@ def _nearest_keypoints(
     location1: NDArray[np.intp],
     location2: NDArray[np.intp],
 ) -> NDArray[np.intp]:
-    """Of each pair of locations the most alike pair of keypoints, as indices into the features, shape (M, 2)."""
+    """Select the most alike pair of keypoints of each pair of locations, as indices into the features, shape (M, 2)."""
     pairs = np.column_stack([one.layers[0][location1], two.layers[0][location2]])
     best = np.full(len(pairs), similarity.lowest, similarity.dtype)
     row = 0
@@ -316,12 +316,12 @@ def _nearest_keypoints(
         column = 0
         for layer2 in two.layers:
             both = np.flatnonzero((location1 < len(layer1)) & (location2 < len(layer2)))
-            own, other = location1[both], location2[both]
-            value = similarity.pairs(row + own, column + other)
+            inside1, inside2 = location1[both], location2[both]
+            value = similarity.pairs(row + inside1, column + inside2)
             better = value > best[both]
             chosen = both[better]
             best[chosen] = value[better]
-            pairs[chosen] = np.column_stack([layer1[own[better]], layer2[other[better]]])
+            pairs[chosen] = np.column_stack([layer1[inside1[better]], layer2[inside2[better]]])
             column += len(layer2)
         row += len(layer1)
     return pairs

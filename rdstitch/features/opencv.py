@@ -133,7 +133,7 @@ def to_rootsift(descriptors: Descriptors) -> NDArray[np.float32]:
 
 
 def _strength(kind: str, response: FloatArray, size: FloatArray) -> FloatArray:
-    """By which keypoints are chosen.
+    """Strengths by which keypoints are chosen.
 
     For SIFT contrast times size: by contrast alone the choice is mostly tiny ones, which drown in noise. On real pairs
     of images the product gives a fifth to a half more inliers, among other detectors it does not help.

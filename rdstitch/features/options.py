@@ -22,7 +22,7 @@ made λ of single pairs of a flight less certain, not more."""
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """Which features to detect, and how many.
+    """Choice of the features to detect, and how many.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class FeatureOptions:
     @property
     def limits(self) -> tuple[int, float | None]:
         """Keypoints of an image, and its megapixels when they are detected; of many images where that is open."""
-        found = self.for_images(_BUDGET)
-        assert found.max_features is not None
-        assert found.work_megapixels != "auto"
-        return found.max_features, found.work_megapixels
+        budget = self.for_images(_BUDGET)
+        assert budget.max_features is not None
+        assert budget.work_megapixels != "auto"
+        return budget.max_features, budget.work_megapixels

@@ -12,15 +12,15 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 
 PixelArray = NDArray[Any]
-"""Of uint8, uint16 or float."""
+"""Pixels of uint8, uint16 or float."""
 
 Mask = NDArray[Any]
-"""Of bool or uint8."""
+"""A mask of bool or uint8."""
 
 _STRETCH_PERCENTILES = (0.1, 99.9)
 CLIP_LIMIT = 4.0
 _CLIP_TILES = 8
-"""Of contrast-limited adaptive histogram equalization (Zuiderveld 1994): largest slope, and tiles along a side."""
+"""Contrast-limited adaptive histogram equalization (Zuiderveld 1994): largest slope, and tiles along a side."""
 
 Stretch = tuple[float, float]
 """The two grey levels that become 0 and 255."""
@@ -74,11 +74,11 @@ class PreparedImage:
 
     @property
     def reduced(self) -> bool:
-        """Whether the working size is less than the full one."""
+        """True where the working size is less than the full one."""
         return bool(self.factor.max() > 1.0)
 
     def covers(self, points: FloatArray, radius: FloatArray) -> NDArray[np.bool_]:
-        """Whether discs (N, 2), (N,) keep clear of the mask; pixels of ``grey``."""
+        """Test that discs (N, 2), (N,) keep clear of the mask; pixels of ``grey``."""
         if self.clearance is None:
             return np.ones(len(points), dtype=bool)
         height, width = self.clearance.shape
@@ -129,7 +129,7 @@ def prepare(
 
 
 def _usable(image: PixelArray, mask: Mask | None) -> NDArray[np.bool_] | None:
-    """Where all of mask, alpha and finiteness allow features, or None for everywhere."""
+    """Combine mask, alpha and finiteness into where features are allowed; None for everywhere."""
     parts: list[NDArray[np.bool_]] = []
     if mask is not None:
         if mask.shape != image.shape[:2]:
@@ -166,14 +166,14 @@ def usual_stretch(view: View) -> Stretch | None:
 
 def common_stretch(usual: Iterable[Stretch | None]) -> Stretch | None:
     """One for all images of a set; a tenth of them may be darker, or brighter, than the rest."""
-    found = np.array([stretch for stretch in usual if stretch is not None])
-    if not len(found):
+    stretches = np.array([stretch for stretch in usual if stretch is not None])
+    if not len(stretches):
         return None
-    return float(np.quantile(found[:, 0], 0.1)), float(np.quantile(found[:, 1], 0.9))
+    return float(np.quantile(stretches[:, 0], 0.1)), float(np.quantile(stretches[:, 1], 0.9))
 
 
 def _stretch(grey: PixelArray, usable: NDArray[np.bool_] | None) -> Stretch | None:
-    """By percentiles of the part that is used, not by single hot pixels."""
+    """Stretch percentiles of the part that is used, not single hot pixels."""
     inside = grey if usable is None else grey[usable]
     if inside.size == 0:
         return None

@@ -57,12 +57,12 @@ class _Part:
 
     def describe(self, chosen: NDArray[np.intp]) -> Features:
         """Features in pixels of the whole image."""
-        found = self.detection.describe(chosen)
+        features = self.detection.describe(chosen)
         return replace(
-            found,
-            points=self._in_whole(found.points),
-            scale=found.scale * self.enlargement,
-            response=found.response * self.enlargement,
+            features,
+            points=self._in_whole(features.points),
+            scale=features.scale * self.enlargement,
+            response=features.response * self.enlargement,
         )
 
     def _in_whole(self, points: FloatArray) -> FloatArray:
@@ -98,11 +98,11 @@ class SiftTilesDetection:
     def describe(self, chosen: NDArray[np.intp]) -> Features:
         """Describe the chosen keypoints, part by part."""
         stops = np.cumsum([len(part.detection.points) for part in self.parts])
-        found = []
+        features = []
         for part, stop in zip(self.parts, stops, strict=True):
             start = stop - len(part.detection.points)
-            found.append(part.describe(chosen[(chosen >= start) & (chosen < stop)] - start))
-        return Features.concatenate(found)
+            features.append(part.describe(chosen[(chosen >= start) & (chosen < stop)] - start))
+        return Features.concatenate(features)
 
 
 def _parts(grey: Grey, options: FeatureOptions) -> Iterator[_Part]:
@@ -117,30 +117,32 @@ def _parts(grey: Grey, options: FeatureOptions) -> Iterator[_Part]:
         grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         if grey.size <= LARGE:
             break
-    found = OpenCVDetection.find(grey, options)
-    coarse = np.flatnonzero(_octave(found) != _UPSAMPLED)
-    yield _Part(found.take(coarse), np.zeros(2, dtype=np.intp), whole / grey.shape[::-1])
+    detection = OpenCVDetection.find(grey, options)
+    coarse = np.flatnonzero(_octave(detection) != _UPSAMPLED)
+    yield _Part(detection.take(coarse), np.zeros(2, dtype=np.intp), whole / grey.shape[::-1])
 
 
 def _tiles(grey: Grey, factor: FloatArray, octaves: list[int], options: FeatureOptions) -> Iterator[_Part]:
-    """What an image shows in some octaves, tile by tile."""
+    """Find the keypoints of some octaves, tile by tile."""
     for y in _intervals(grey.shape[0]):
         for x in _intervals(grey.shape[1]):
-            found = OpenCVDetection.find(grey[y.seen, x.seen], options)
-            own = x.owns(found.points[:, 0]) & y.owns(found.points[:, 1]) & np.isin(_octave(found), octaves)
-            yield _Part(found.take(np.flatnonzero(own)), np.array([x.seen.start, y.seen.start]), factor)
+            detection = OpenCVDetection.find(grey[y.seen, x.seen], options)
+            inside = (
+                x.owns(detection.points[:, 0]) & y.owns(detection.points[:, 1]) & np.isin(_octave(detection), octaves)
+            )
+            yield _Part(detection.take(np.flatnonzero(inside)), np.array([x.seen.start, y.seen.start]), factor)
 
 
 @dataclass(frozen=True)
 class _Interval:
-    """What a tile sees of a side of the image, and which of that is its own: infinite at the image's border."""
+    """The range of a side of the image that a tile covers, and the part it keeps: infinite at the image's border."""
 
     seen: slice
     start: float
     stop: float
 
     def owns(self, places: FloatArray) -> NDArray[np.bool_]:
-        """Whether places, pixels of the tile, are the tile's own."""
+        """Test that places, pixels of the tile, are in the part that it keeps."""
         places = places + self.seen.start
         inside: NDArray[np.bool_] = (places >= self.start) & (places < self.stop)
         return inside
@@ -159,6 +161,6 @@ def _intervals(length: int) -> list[_Interval]:
     ]
 
 
-def _octave(found: OpenCVDetection) -> NDArray[np.intp]:
+def _octave(detection: OpenCVDetection) -> NDArray[np.intp]:
     """The octave of each keypoint, as OpenCV packs it."""
-    return np.array([keypoint.octave & 255 for keypoint in found.keypoints], dtype=np.intp)
+    return np.array([keypoint.octave & 255 for keypoint in detection.keypoints], dtype=np.intp)

@@ -76,7 +76,7 @@ def read_deep_zoom(path: Path, size: tuple[int, int], side: int) -> NDArray[np.u
 
 
 def _sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
-    """Width and height of every level, from a single pixels up."""
+    """Width and height of every level, from a single pixel up."""
     sizes = [size]
     while max(sizes[-1]) > 1:
         sizes.append(reduced_size(sizes[-1], 2))
@@ -84,7 +84,7 @@ def _sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 def _levels(folder: Path, layout: Layout) -> "_Level":
-    """The largest level, each with the next smaller one, down to a single pixels."""
+    """The largest level, each with the next smaller one, down to a single pixel."""
     level = None
     for number, size in enumerate(_sizes(layout.size)):
         place = folder / str(number)

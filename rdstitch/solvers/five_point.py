@@ -76,7 +76,7 @@ class DirectionEquation(SampleArrays):
 
     @classmethod
     def of(cls, quadrangles: Quadrangles) -> "DirectionEquation":
-        """Of samples of five points."""
+        """Set up the equation of samples of five points."""
         (x, y), fifth = quadrangles.points[:, 1, :3], quadrangles.points[:, :, 4:]
         across = fifth[0, 1] * y - fifth[1, 1] * x
         gamma = determinants(fifth, quadrangles.opposite)[:, :1]

@@ -86,7 +86,7 @@ class QuarticEquation(SampleArrays):
 
     @classmethod
     def of(cls, quadrangles: Quadrangles) -> "QuarticEquation":
-        """Of samples of four points."""
+        """Set up the equation of samples of four points."""
         second = quadrangles.points[:, 1, :3]
         constant, slope = quadrangles.opposite.constant[:, 0], quadrangles.opposite.slope[:, 0]
         radius2 = squared_radii(second)
@@ -143,7 +143,7 @@ class SexticEquation(SampleArrays):
 
     @classmethod
     def of(cls, quadrangles: Quadrangles) -> "SexticEquation":
-        """Of samples of four points."""
+        """Set up the equation of samples of four points."""
         mixed = determinants(quadrangles.points[:, ::-1, :3], quadrangles.opposite)
         return cls(np.concatenate([quadrangles.triangles, mixed], axis=2))
 

@@ -42,7 +42,7 @@ class Quadrangles(SampleArrays):
 
     @classmethod
     def of(cls, points: FloatArray) -> "Quadrangles":
-        """Of points (2, 2, k, b)."""
+        """Prepare points (2, 2, k, b)."""
         opposite = Lines.opposite(points)
         return cls(points, opposite, triangle_determinants(points, opposite))
 

@@ -67,11 +67,11 @@ def four_point_dlt(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike) -> Solut
     lam = distortions(distortion, x1)
 
     def solve(points: FloatArray, samples: IndexArray) -> Solutions:
-        own = lam[samples]
+        given = lam[samples]
         low, _ = lens_range(points, (-np.inf, np.inf))
-        h, possible = Quadrangles.of(points).homography(own)
-        index = np.flatnonzero(possible & (own > low))
-        return Solutions(index, h[index], own[index])
+        h, possible = Quadrangles.of(points).homography(given)
+        index = np.flatnonzero(possible & (given > low))
+        return Solutions(index, h[index], given[index])
 
     return solve_in_blocks(solve, x1, x2, 4)
 
@@ -82,11 +82,11 @@ def _motion(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike, tilt: ArrayLike
     lam = distortions(distortion, x1)
 
     def solve(points: FloatArray, samples: IndexArray) -> Solutions:
-        own, rotation = lam[samples], rotations.take(samples)
+        given, rotation = lam[samples], rotations.take(samples)
         low, high = visible_range(points, depths(points, rotation), (-np.inf, np.inf))
-        index = np.flatnonzero((own > low) & (own < high))
-        h = motion_homography(np.take(points, index, axis=-1), rotation.take(index), own[index], height_free)
-        return Solutions(index, h, own[index])
+        index = np.flatnonzero((given > low) & (given < high))
+        h = motion_homography(np.take(points, index, axis=-1), rotation.take(index), given[index], height_free)
+        return Solutions(index, h, given[index])
 
     return solve_in_blocks(solve, x1, x2, 2)
 

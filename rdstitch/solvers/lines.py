@@ -41,7 +41,7 @@ class Lines(SampleArrays):
 
     @classmethod
     def opposite(cls, points: FloatArray) -> "Lines":
-        """Of the first three points, the line ``p_j × p_k`` opposite to each, in cyclic order."""
+        """Join the first three points: the line ``p_j × p_k`` opposite to each, in cyclic order."""
         ring = np.take(points, _RING, axis=2)
         return cls.through(ring[:, :, :3], ring[:, :, 1:])
 
@@ -78,8 +78,8 @@ def triangle_determinants(points: FloatArray, opposite: Lines) -> FloatArray:
     opposite : Lines
         From :meth:`Lines.opposite`.
     """
-    own = Lines(opposite.constant[:, :, :1], opposite.slope[:, :, :1])
-    whole = determinants(points[:, :, :1], own)
+    first_side = Lines(opposite.constant[:, :, :1], opposite.slope[:, :, :1])
+    whole = determinants(points[:, :, :1], first_side)
     if points.shape[2] == 3:
         return whole
     return np.concatenate([whole, determinants(points[:, :, 3:4], opposite)], axis=2)

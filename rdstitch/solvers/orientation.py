@@ -58,7 +58,7 @@ def oriented_samples(
 
 
 def mirrored(triangles: FloatArray, distortion: FloatArray) -> NDArray[np.bool_]:
-    """Whether any triangle has opposite orientations for one λ a sample (M,); shape (M,)."""
+    """Test for triangles of opposite orientations, for one λ a sample (M,); shape (M,)."""
     constant, slope = triangles
     first, second = constant + slope * distortion
     return np.asarray((first * second < 0.0).any(axis=0))

@@ -42,7 +42,7 @@ class RayPairs(SampleArrays):
 
     @classmethod
     def between(cls, first: FloatArray, second: FloatArray) -> "RayPairs":
-        """Of points (2, 2, P, b) each."""
+        """Pair the rays of points (2, 2, P, b) each."""
         (xa, ya), (xb, yb) = first, second
         ra, rb = squared_radii(first), squared_radii(second)
         turn = xa * yb - ya * xb
@@ -65,7 +65,7 @@ class RayPairs(SampleArrays):
         return value
 
     def same_side(self, distortion: FloatArray, focal2: FloatArray) -> BoolArray:
-        """Whether all angles, (b,), are acute or obtuse in both images alike, which tangents squared do not say."""
+        """Test that all angles, (b,), are acute or obtuse in both images alike, which squared tangents hide."""
         dot = self.dot + focal2 * self.products(distortion)[0]
         return np.asarray((dot[0] * dot[1] > 0.0).all(axis=0))
 
@@ -77,8 +77,8 @@ def _spread(values: FloatArray, distortion: FloatArray) -> FloatArray:
 
 def rays(points: FloatArray, distortion: FloatArray, focal: FloatArray | float = 1.0) -> FloatArray:
     """Unit rays (3, 2, k, b) of points (2, 2, k, b) for one λ and one focal length a sample."""
-    found = np.concatenate([points, (focal * (1.0 + distortion * squared_radii(points)))[None]])
-    unit: FloatArray = found / np.sqrt((found * found).sum(axis=0))
+    directions = np.concatenate([points, (focal * (1.0 + distortion * squared_radii(points)))[None]])
+    unit: FloatArray = directions / np.sqrt((directions * directions).sum(axis=0))
     return unit
 
 

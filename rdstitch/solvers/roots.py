@@ -73,7 +73,7 @@ def real_roots(equation: Equation, degree: int, low: FloatArray, high: FloatArra
     middle = low + half
     # With all nodes of all samples at once the intermediate values of an equation would not stay in cache.
     size = max(1, _VALUES_IN_CACHE // (degree + 1))
-    series, found = np.empty((2, degree + 1, len(half))), []
+    series, isolated = np.empty((2, degree + 1, len(half))), []
     for start in range(0, len(half), size):
         part = np.arange(start, min(start + size, len(half)))
         some = equation.take(part) if len(part) < len(half) else equation
@@ -81,10 +81,10 @@ def real_roots(equation: Equation, degree: int, low: FloatArray, high: FloatArra
         values[:, ~((half[part] > 0.0) & np.isfinite(values).all(axis=0))] = 1.0
         values = _filled(values)
         series[..., start : start + size] = (value_and_slope_from_values(degree) @ values)[..., : len(part)]
-        found.append(isolate(values, start))
-    if not found:
+        isolated.append(isolate(values, start))
+    if not isolated:
         return np.empty(0, dtype=np.intp), np.empty(0)
-    brackets = Brackets.joined(found)
+    brackets = Brackets.joined(isolated)
     sample = brackets.sample
     t, slope = bracketed_newton(np.take(series, sample, axis=-1), brackets)
     half = half[sample]
@@ -166,7 +166,7 @@ def isolate(values: FloatArray, first: int = 0) -> Brackets:
     cell, sample = np.nonzero(changes == 1)
     left = _EDGES[cell]
     ends = coefficients[:, [0, -1]][cell, :, sample]
-    found = [Brackets.of_cells(sample, left, width, ends)]
+    brackets = [Brackets.of_cells(sample, left, width, ends)]
     cell, sample = np.nonzero(changes > 1)
     left = _EDGES[cell]
     current = coefficients[cell, :, sample]
@@ -181,11 +181,11 @@ def isolate(values: FloatArray, first: int = 0) -> Brackets:
         positive = current > 0.0
         changes = (positive[:, 1:] != positive[:, :-1]).sum(axis=1, dtype=np.uint8)
         one, more = changes == 1, changes > 1
-        found.append(Brackets.of_cells(sample[one], left[one], width, current[one]))
+        brackets.append(Brackets.of_cells(sample[one], left[one], width, current[one]))
         sample, left, current = sample[more], left[more], current[more]
     if len(sample):
-        found.append(_close_pairs(current, sample, left, width, np.abs(values).max(axis=0)))
-    return Brackets.joined(found, first)
+        brackets.append(_close_pairs(current, sample, left, width, np.abs(values).max(axis=0)))
+    return Brackets.joined(brackets, first)
 
 
 def _filled(values: FloatArray) -> FloatArray:

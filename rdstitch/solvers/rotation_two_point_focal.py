@@ -50,17 +50,17 @@ def rotation_two_point_focal(
     known = distortions(distortion, x1)
 
     def solve(points: FloatArray, samples: IndexArray) -> Solutions:
-        own = known[samples]
-        inside = np.flatnonzero(own > lens_range(points, (-np.inf, np.inf))[0])
-        points, own = np.take(points, inside, axis=-1), own[inside]
+        lam = known[samples]
+        inside = np.flatnonzero(lam > lens_range(points, (-np.inf, np.inf))[0])
+        points, lam = np.take(points, inside, axis=-1), lam[inside]
         pairs = RayPairs.between(points[:, :, :1], points[:, :, 1:])
-        ends = (np.full(len(own), f * f / (1.0 + f * f)) for f in (low, high))
-        index, t = real_roots(_AngleEquation(*pairs.products(own), pairs.dot, pairs.cross), _DEGREE, *ends)
+        ends = (np.full(len(lam), f * f / (1.0 + f * f)) for f in (low, high))
+        index, t = real_roots(_AngleEquation(*pairs.products(lam), pairs.dot, pairs.cross), _DEGREE, *ends)
         focal2 = t / (1.0 - t)
-        possible = pairs.take(index).same_side(own[index], focal2)
+        possible = pairs.take(index).same_side(lam[index], focal2)
         index, focal2 = index[possible], focal2[possible]
         points = np.take(points, index, axis=-1)
-        return turned_solutions(points, inside[index], own[index], np.sqrt(focal2), rotation_of_two)
+        return turned_solutions(points, inside[index], lam[index], np.sqrt(focal2), rotation_of_two)
 
     return solve_in_blocks(solve, x1, x2, 2)
 

@@ -1,4 +1,4 @@
-"""What every minimal solver returns."""
+"""The result of every minimal solver."""
 
 from dataclasses import dataclass
 from typing import Self

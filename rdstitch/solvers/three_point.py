@@ -106,7 +106,7 @@ def three_point(
 
 
 def _in_front(points: FloatArray, state: FloatArray) -> BoolArray:
-    """Whether all points (2, 2, 3, b) are in front of the camera of each state (a, b, λ)."""
+    """Test that all points (2, 2, 3, b) are in front of the camera of each state (a, b, λ)."""
     a, b, distortion = state
     depth = 1.0 + a * points[0] + b * points[1] + distortion * squared_radii(points)
     return np.asarray((depth > 0.0).all(axis=(0, 1)))
@@ -127,7 +127,7 @@ class DistanceSystem(SampleArrays):
 
     @classmethod
     def of(cls, points: FloatArray, opposite: Lines) -> "DistanceSystem":
-        """Of points (2, 2, 3, b)."""
+        """Set up the equations of points (2, 2, 3, b)."""
         return cls(np.concatenate([points, squared_radii(points)[None], opposite.constant, opposite.slope]))
 
     def step(self, state: RealArray) -> RealArray:
@@ -215,7 +215,7 @@ def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, Floa
 
 
 def _leaders(state: RealArray) -> BoolArray:
-    """Of the states (3, S, B) of each sample the first of all that have met, unless it makes no sense; (S B,)."""
+    """Select the first of the states (3, S, B) of each sample that have met, unless it is impossible; (S B,)."""
     leads: BoolArray = np.abs(state).max(axis=0) < _MAX_TILT_TANGENT
     for later in range(1, state.shape[1]):
         distance = np.abs(state[:, :later] - state[:, later, None]).max(axis=0)

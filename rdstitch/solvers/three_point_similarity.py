@@ -56,15 +56,15 @@ def three_point_similarity(
     rotations = TiltRotations.from_tilt(tilt, np.shape(x1)[0] if np.ndim(x1) else 0)
 
     def solve(points: FloatArray, samples: IndexArray) -> Solutions:
-        own = rotations.take(samples)
-        opposite, depth = Lines.opposite(points), depths(points, own)
+        tilts = rotations.take(samples)
+        opposite, depth = Lines.opposite(points), depths(points, tilts)
         triangles = triangle_determinants(points, opposite)
         usable, low, high = oriented_samples(triangles, *visible_range(points, depth, distortion_range))
-        own = own.take(usable)
-        equation = DistanceRatioEquation.of(differences(opposite.take(usable), own), np.take(depth, usable, axis=-1))
+        tilts = tilts.take(usable)
+        equation = DistanceRatioEquation.of(differences(opposite.take(usable), tilts), np.take(depth, usable, axis=-1))
         index, distortion = real_roots(equation, _DEGREE, low, high)
-        own, index = own.take(index), usable[index]
-        h = motion_homography(np.take(points, index, axis=-1), own, distortion, height_free=True)
+        tilts, index = tilts.take(index), usable[index]
+        h = motion_homography(np.take(points, index, axis=-1), tilts, distortion, height_free=True)
         possible = ~mirrored(np.take(triangles, index, axis=-1), distortion)
         return Solutions(index[possible], h[possible], distortion[possible])
 

@@ -53,13 +53,13 @@ def two_point(
     rotations = TiltRotations.from_tilt(tilt, np.shape(x1)[0] if np.ndim(x1) else 0)
 
     def solve(points: FloatArray, samples: IndexArray) -> Solutions:
-        own = rotations.take(samples)
-        depth = depths(points, own)
+        tilts = rotations.take(samples)
+        depth = depths(points, tilts)
         between = Lines.through(points[:, :, :1], points[:, :, 1:])
-        equation = DistanceEquation.of(differences(between, own), depth)
+        equation = DistanceEquation.of(differences(between, tilts), depth)
         index, distortion = real_roots(equation, _DEGREE, *visible_range(points, depth, distortion_range))
-        found = motion_homography(np.take(points, index, axis=-1), own.take(index), distortion)
-        return Solutions(index, found, distortion)
+        homography = motion_homography(np.take(points, index, axis=-1), tilts.take(index), distortion)
+        return Solutions(index, homography, distortion)
 
     return solve_in_blocks(solve, x1, x2, 2)
 

@@ -37,7 +37,7 @@ _LENS_STD = 0.5
 
 @dataclass(frozen=True)
 class LinkedPoints:
-    """What all pairs show, block by block.
+    """Matches of all pairs, block by block.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class LinkedPoints:
 
 @dataclass(frozen=True)
 class StageModel:
-    """What is off of the stage.
+    """Errors of the stage.
 
     Attributes
     ----------
@@ -224,9 +224,9 @@ class _Problem:
         tile_std, row_std, column_std = np.sqrt(variances)
         # Places against the model of the stage.
         axis = np.arange(2)
-        own = np.arange(places)
-        rows = base + own
-        blocks.append((np.full(places, 1.0 / tile_std), rows, own))
+        coordinate = np.arange(places)
+        rows = base + coordinate
+        blocks.append((np.full(places, 1.0 / tile_std), rows, coordinate))
         for start, line in ((self.at_rows, self.rows), (self.at_columns, self.columns)):
             blocks.append((np.full(places, -1.0 / tile_std), rows, (start + 2 * line[:, None] + axis).ravel()))
         for k in range(2):
@@ -249,7 +249,7 @@ class _Problem:
         return sparse.csr_matrix((data, (row, column)), shape=(base, self.size)), np.concatenate(right)
 
     def _off_stage(self, state: FloatArray) -> FloatArray:
-        """What places differ from the model of the stage, (N, 2)."""
+        """Compute the differences of places from the model of the stage, (N, 2)."""
         places = state[: 2 * len(self.grid)].reshape(-1, 2)
         matrix = state[self.at_matrix : self.at_lens].reshape(2, 2)
         rows, columns = self._lines(state)
@@ -274,10 +274,10 @@ class _Problem:
         """
         held = np.zeros(len(self.grid), dtype=np.bool_)
         held[self.first[weights > 0.25]] = held[self.second[weights > 0.25]] = True
-        found = [self._off_stage(state)[held]]
+        deviations = [self._off_stage(state)[held]]
         for lines, number in zip(self._lines(state), (self.rows, self.columns), strict=True):
-            found.append(lines[np.unique(number[held])])
-        return np.array([(0.5 * (v**2).sum() + _USUAL_COUNT * usual) / (len(v) + _USUAL_COUNT) for v in found])
+            deviations.append(lines[np.unique(number[held])])
+        return np.array([(0.5 * (v**2).sum() + _USUAL_COUNT * usual) / (len(v) + _USUAL_COUNT) for v in deviations])
 
     def result(
         self,
@@ -289,7 +289,7 @@ class _Problem:
         *,
         given: bool,
     ) -> Adjustment:
-        """What was found, with the standard deviation of λ."""
+        """Build the result, with the standard deviation of λ."""
         deviation = 0.0 if given else math.inf
         if self.free_lens:
             matrix, _ = self._equations(state, weights, noise, variances)

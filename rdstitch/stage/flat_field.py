@@ -26,7 +26,7 @@ _SIDE = 512
 """Pixels of the longer side that are enough."""
 
 _DEGREE = 4
-"""Of the polynomial that the logarithm of the illumination is."""
+"""Degree of the polynomial that the logarithm of the illumination is."""
 
 _TRUNCATED = 0.9113
 """Variance of a standard normal number within 2.5 of its mean."""

@@ -1,4 +1,4 @@
-"""Where the stage was told to bring each tile: nominal places, rows and columns."""
+"""Nominal places of the tiles, their rows and columns."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""How tiles are put together."""
+"""Options of putting tiles together."""
 
 import math
 from dataclasses import dataclass, field

@@ -28,7 +28,7 @@ _HOW = (
 
 @dataclass(frozen=True)
 class StagePosition:
-    """Where one tile is.
+    """The place of one tile.
 
     Attributes
     ----------
@@ -68,10 +68,10 @@ def grid_from_names(names: Sequence[str], pattern: str, overlap: float, size: tu
     wanted = re.compile(expression.replace(r"\*", ".*"))
     cells = []
     for name in names:
-        found = wanted.search(name)
-        if found is None:
+        fitting = wanted.search(name)
+        if fitting is None:
             raise ArgumentError(f"{name}: does not fit the grid '{pattern}'")
-        cells.append((int(found["col"]), int(found["row"])))
+        cells.append((int(fitting["col"]), int(fitting["row"])))
     if len(set(cells)) < len(cells):
         twice = next(cell for cell in cells if cells.count(cell) > 1)
         raise ArgumentError(f"several tiles are row {twice[1]}, column {twice[0]}; name those of one channel only")
@@ -122,7 +122,7 @@ def grid_from_files(files: Sequence[Path], size: tuple[int, int], pixel_size: fl
         When a file says nothing.
     """
     beside: dict[Path, dict[str, StagePosition]] = {}
-    found = []
+    positions = []
     for file in files:
         position = position_of(file)
         if position is None:
@@ -132,12 +132,12 @@ def grid_from_files(files: Sequence[Path], size: tuple[int, int], pixel_size: fl
             position = beside[folder].get(canonical_name(file.name))
         if position is None:
             raise InputError(f"{file}: does not say where it was taken; {_HOW}")
-        found.append(position)
-    return _grid(found, size, pixel_size, "the files' metadata")
+        positions.append(position)
+    return _grid(positions, size, pixel_size, "the files' metadata")
 
 
 def position_of(file: Path) -> StagePosition | None:
-    """Where a TIFF file says that it was taken; None where it says nothing."""
+    """Read where a TIFF file was taken; None where it does not say."""
     with decoding(file):
         with open_regular(file) as stream:
             if stream.read(4) not in TIFF_MAGIC:
@@ -157,13 +157,13 @@ def _micro_manager_file(file: Path) -> dict[str, StagePosition]:
         content = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    found = {}
+    positions = {}
     for key, entry in content.items() if isinstance(content, dict) else ():
         position = _micro_manager_position(entry) if isinstance(entry, dict) else None
         if position is not None:
             name = entry.get("FileName") or key.removeprefix("Metadata-")
-            found[canonical_text(Path(str(name)).name)] = position
-    return found
+            positions[canonical_text(Path(str(name)).name)] = position
+    return positions
 
 
 def _micro_manager_position(entry: Any) -> StagePosition | None:
@@ -176,11 +176,11 @@ def _micro_manager_position(entry: Any) -> StagePosition | None:
     return StagePosition(x, y, 1.0, size or None)
 
 
-def _grid(found: Sequence[StagePosition], size: tuple[int, int], pixel_size: float | None, source: str) -> TileGrid:
+def _grid(positions: Sequence[StagePosition], size: tuple[int, int], pixel_size: float | None, source: str) -> TileGrid:
     """Places in pixels, whatever they were given in."""
-    pixel_size = pixel_size or next((item.pixel_size for item in found if item.pixel_size), None)
-    places = np.array([(item.x, item.y) for item in found], dtype=np.float64)
-    unit = found[0].unit
+    pixel_size = pixel_size or next((item.pixel_size for item in positions if item.pixel_size), None)
+    places = np.array([(item.x, item.y) for item in positions], dtype=np.float64)
+    unit = positions[0].unit
     if unit is not None:
         if pixel_size is None:
             raise InputError(f"{source}: gives micrometres, but no file says how large a pixel is; add --pixel-size UM")
@@ -198,11 +198,11 @@ ORIENTATIONS: tuple[tuple[tuple[int, int], tuple[int, int]], ...] = (
     ((0, -1), (1, 0)),
     ((0, -1), (-1, 0)),
 )
-"""How the axes of a stage may lie in the image: rows are what x and y of the image are of the stage's."""
+"""Orientations of a stage's axes in the image: rows are x and y of the image in axes of the stage."""
 
 
 _CLEARLY = 1.2
-"""How many times the evidence other axes must have: of two where one is right, the pairs along it agree in both."""
+"""Factor of evidence that other axes must have: of two where one is right, the pairs along it agree in both."""
 
 
 def oriented(grid: TileGrid, evidence: Callable[[TileGrid], float]) -> TileGrid:

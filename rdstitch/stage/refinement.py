@@ -32,7 +32,7 @@ Transfer = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class BlockMatches:
-    """What blocks of overlaps show.
+    """Matches of the blocks of overlaps.
 
     Attributes
     ----------
@@ -66,10 +66,10 @@ def refine(
     tolerance : float
         By how much that may be wrong, pixels.
     """
-    found = [match for block in blocks if (match := _refined(first, second, block, transfer, tolerance)) is not None]
-    if not found:
+    matches = [match for block in blocks if (match := _refined(first, second, block, transfer, tolerance)) is not None]
+    if not matches:
         return BlockMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2, 2)))
-    points1, points2, information = (np.array(values) for values in zip(*found, strict=True))
+    points1, points2, information = (np.array(values) for values in zip(*matches, strict=True))
     return BlockMatches(points1, points2, information)
 
 

@@ -30,7 +30,7 @@ _SEARCH = 0.05
 """Displacement from the nominal place that is searched where the user does not say, share of the longer side."""
 
 _LENS_REACH = 0.02
-"""What the lens may displace the blocks of an overlap against each other besides, share of the longer side."""
+"""Largest displacement of an overlap's blocks against each other that the lens may add, share of the longer side."""
 
 _LENSES = np.linspace(-0.04, 0.04, 21)
 """Values of λ that are tried before it is estimated."""
@@ -56,7 +56,7 @@ _LEAST_BLOCK = 0.02
 
 @dataclass(frozen=True)
 class TileRegistration:
-    """Where all tiles are, and what shows it.
+    """The places of all tiles, and the matches that show them.
 
     Attributes
     ----------
@@ -128,8 +128,8 @@ def register_tiles(
         _peaks(s, o, lens.shifts(o, known), radius, ((near[p[1]] - near[p[0]]) / factor - o.offset, window)) + others
         for s, o, p, others in zip(surfaces, overlaps, pairs, peaks, strict=True)
     ]
-    peaks = [list({tuple(peak): peak for peak in own}.values()) for own in peaks]
-    shown = [k for k, own in enumerate(peaks) if own]
+    peaks = [list({tuple(peak): peak for peak in of_pair}.values()) for of_pair in peaks]
+    shown = [k for k, of_pair in enumerate(peaks) if of_pair]
     if not shown:
         return _result(grid, pairs, [], rough)
     matches: dict[int, BlockMatches] = {}
@@ -142,9 +142,9 @@ def register_tiles(
         overlap = expected(pair, _moved(grid.places, pair, offset), 1)
         for cells in (overlap.cells(grid.size), overlap.whole):
             cut = replace(overlap, blocks=cells)
-            found = refine(one, two, cells, exact.transfer(cut, offset, known), factor + 1.5)
-            if len(found):
-                matches[shown[number]] = found
+            refined = refine(one, two, cells, exact.transfer(cut, offset, known), factor + 1.5)
+            if len(refined):
+                matches[shown[number]] = refined
                 break
         progress("refining", number + 1, len(shown))
     if not matches:
@@ -162,7 +162,7 @@ def register_tiles(
 
 
 def evidence(grid: TileGrid, *, read: Reader, search: float | None = None) -> float:
-    """How clearly some neighbours correlate where the grid has them, in heights of peaks above noise."""
+    """Measure how clearly some neighbours correlate where the grid has them, in heights of peaks above noise."""
     side = max(grid.size)
     search = _SEARCH * side if search is None else search
     pairs = grid.neighbours(search)
@@ -200,7 +200,7 @@ def _in_pairs(read: Reader, pairs: IntArray) -> Iterator[tuple[NDArray[Any], NDA
 
 
 class _Lens:
-    """What a lens displaces blocks by."""
+    """Displacements of blocks by a lens."""
 
     def __init__(self, grid: TileGrid, factor: int) -> None:
         self.size = grid.size
@@ -217,7 +217,7 @@ class _Lens:
         return np.asarray(shifts - shifts.mean(axis=0))
 
     def transfer(self, overlap: Overlap, offset: FloatArray, distortion: float) -> Transfer:
-        """Where points of the first tile are in the second, whose blocks are off by an offset in the mean."""
+        """Map points of the first tile to the second, whose blocks are off by an offset in the mean."""
         if distortion == 0.0:
             return lambda points: points - offset
         camera = Camera(self.size, distortion)
@@ -288,9 +288,9 @@ def _adjusted(
 ) -> Adjustment:
     """Places by the highest peaks alone."""
     matches = {}
-    for number, own in enumerate(peaks):
-        if own:
-            offset = own[0] * factor
+    for number, highest in enumerate(peaks):
+        if highest:
+            offset = highest[0] * factor
             middle = (np.array(grid.size) - 1.0 + offset) / 2.0
             information = np.eye(2)[None] / (factor / 2.0) ** 2
             matches[number] = BlockMatches(middle[None], (middle - offset)[None], information)
@@ -298,18 +298,18 @@ def _adjusted(
 
 
 def _links(pairs: IntArray, matches: dict[int, BlockMatches]) -> LinkedPoints:
-    """What pairs show, as one."""
-    found = list(matches.values())
-    if not found:
+    """Concatenate the matches of all pairs."""
+    blocks = list(matches.values())
+    if not blocks:
         return LinkedPoints(
             np.empty(0, np.intp), np.empty((0, 2), np.intp), np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2, 2))
         )
     return LinkedPoints(
-        np.repeat(np.arange(len(found)), [len(match) for match in found]),
+        np.repeat(np.arange(len(blocks)), [len(match) for match in blocks]),
         pairs[list(matches)],
-        np.concatenate([match.points1 for match in found]),
-        np.concatenate([match.points2 for match in found]),
-        np.concatenate([match.information for match in found]),
+        np.concatenate([match.points1 for match in blocks]),
+        np.concatenate([match.points2 for match in blocks]),
+        np.concatenate([match.information for match in blocks]),
     )
 
 

@@ -34,7 +34,7 @@ class SyntheticMatches:
 
     @property
     def inliers(self) -> NDArray[np.bool_]:
-        """Which matches are right, shape (N,)."""
+        """True for right matches, shape (N,)."""
         return self.truth.inliers
 
 

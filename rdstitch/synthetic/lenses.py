@@ -26,7 +26,7 @@ _FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatAr
 
 
 class Lens(Protocol):
-    """What rendering needs of a lens; :class:`Camera` with a focal length fulfils it."""
+    """A lens as rendering needs it; :class:`Camera` with a focal length is one."""
 
     @property
     def image_size(self) -> tuple[int, int]:

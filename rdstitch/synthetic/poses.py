@@ -1,4 +1,4 @@
-"""Where the camera of a sequence is in each image.
+"""Poses of the camera of a sequence, one an image.
 
 The plane's coordinates are the pixels of its texture ("texels"): X to the right, Y down, the centre of the top-left
 texel at (0, 0), as in an image. The camera looks down on it: with the tilt ``R``, the yaw φ, the foot of the camera

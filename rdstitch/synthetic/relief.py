@@ -88,8 +88,8 @@ class Relief:
         def in_ground(level: NDArray[np.float32]) -> NDArray[np.bool_]:
             places = start + along * (np.float32(1.0) - level / np.float32(height))[..., None]
             places[np.isnan(places)] = _NOWHERE
-            found = _interpolate(self.height, places[..., 0], places[..., 1], bottom)
-            return np.asarray(found >= level)
+            ground = _interpolate(self.height, places[..., 0], places[..., 1], bottom)
+            return np.asarray(ground >= level)
 
         above = np.full(flat.shape[:2], top, dtype=np.float32)
         below = np.full(flat.shape[:2], bottom, dtype=np.float32)
@@ -177,10 +177,10 @@ RELIEFS: dict[str, Callable[..., Relief]] = {"bumps": hills, "buildings": boxes,
 
 def _interpolate(values: HeightMap, x: NDArray[np.float32], y: NDArray[np.float32], outside: float) -> HeightMap:
     """Values between texels, linearly."""
-    found = cv2.remap(
+    between = cv2.remap(
         values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(outside, 0.0, 0.0, 0.0)
     )
-    return np.asarray(found, dtype=np.float32)
+    return np.asarray(between, dtype=np.float32)
 
 
 def _scaled(ground: HeightMap, height: float) -> HeightMap:

@@ -33,7 +33,7 @@ _APRON = 3
 
 @dataclass(frozen=True)
 class Photometry:
-    """How light becomes an image.
+    """The way from light to an image.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ class Sequence:
         return paths
 
     def reachable(self, scale: float = 1.0) -> NDArray[np.bool_]:
-        """Which texels any image shows.
+        """Mark the texels that any image shows.
 
         Parameters
         ----------

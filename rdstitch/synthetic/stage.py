@@ -89,12 +89,12 @@ class StageGrid:
 
     @property
     def nominal(self) -> FloatArray:
-        """Where the stage was told to go, pixels (N, 2)."""
+        """Nominal places of the tiles, pixels (N, 2)."""
         return np.asarray(self.cells[:, ::-1] * (self.tile * (1.0 - self.overlap)), dtype=np.float64)
 
     @cached_property
     def places(self) -> FloatArray:
-        """Where the tiles are, undistorted pixels (N, 2)."""
+        """True places of the tiles, undistorted pixels (N, 2)."""
         rng = np.random.default_rng([self.seed, 1])
         c, s = np.cos(self.turn), np.sin(self.turn)
         places = self.nominal @ np.array([[c, s], [-s, c]])
@@ -108,7 +108,7 @@ class StageGrid:
 
     @cached_property
     def flat_field(self) -> FloatArray:
-        """What each pixel gets of the light, mean 1, (tile, tile, C)."""
+        """Illumination of each pixel, mean 1, (tile, tile, C)."""
         v, u = np.mgrid[: self.tile, : self.tile] / (self.tile - 1.0) - 0.5
         planes = []
         for channel in range(self.channels):
@@ -149,7 +149,7 @@ class StageGrid:
         return files
 
     def _coordinates(self, index: int) -> FloatArray:
-        """Where every pixel of a tile lies on the ground, (h, w, 2)."""
+        """Map every pixel of a tile to the ground, (h, w, 2)."""
         side = np.arange(self.tile, dtype=np.float64)
         points = np.stack(np.meshgrid(side, side), axis=-1)
         return np.asarray(self.camera.undistort(points.reshape(-1, 2)).reshape(points.shape) + self.places[index])

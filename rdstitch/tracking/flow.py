@@ -32,13 +32,13 @@ class CornerFlow:
         self._last, self._count = keyframe, 0
         if keyframe is None:
             return
-        found = cv2.goodFeaturesToTrack(keyframe.grey, _CORNERS, _QUALITY, _SPACING * max(keyframe.grey.shape))
-        corners = np.empty((0, 1, 2), dtype=np.float32) if found is None else found
+        detected = cv2.goodFeaturesToTrack(keyframe.grey, _CORNERS, _QUALITY, _SPACING * max(keyframe.grey.shape))
+        corners = np.empty((0, 1, 2), dtype=np.float32) if detected is None else detected
         self._from = self._at = corners[_usable(keyframe, corners)]
         self._count = len(self._from)
 
     def follow(self, frame: PreparedImage) -> tuple[FloatArray, FloatArray] | None:
-        """Where corners of the keyframe were, and where they are in the next frame, (N, 2) each, pixels of ``grey``.
+        """Follow the corners of the keyframe: their places before and now, (N, 2) each, pixels of ``grey``.
 
         None where too few of them can be followed.
         """
@@ -50,20 +50,22 @@ class CornerFlow:
         self._last, self._from, self._at = frame, self._from[kept], at[kept]
         if len(self._at) < _MIN_SHARE * self._count:
             return None
-        there, here = self._from[:, 0].astype(np.float64), self._at[:, 0].astype(np.float64)
-        moved = np.linalg.norm(here - there, axis=1)
+        before, now = self._from[:, 0].astype(np.float64), self._at[:, 0].astype(np.float64)
+        moved = np.linalg.norm(now - before, axis=1)
         ground = moved > (_STILL if (moved > _MOVED).sum() >= _SEEN_TO_MOVE else -1.0)
-        return there[ground], here[ground]
+        return before[ground], now[ground]
 
 
-def fitted_affine(there: FloatArray, here: FloatArray, threshold: float) -> tuple[FloatArray | None, BoolArray]:
-    """The affine motion (2, 3) that brings most points (N, 2) to others, and which of them it brings there (N,)."""
-    known = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
-    inliers = np.zeros(len(here), dtype=np.bool_)
+def fitted_affine(target: FloatArray, source: FloatArray, threshold: float) -> tuple[FloatArray | None, BoolArray]:
+    """Fit the affine motion (2, 3) that brings most points (N, 2) to others, and mark those (N,)."""
+    known = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
+    inliers = np.zeros(len(source), dtype=np.bool_)
     if known.sum() < 3:
         return None, inliers
-    found: Any = cv2.estimateAffine2D(here[known], there[known], method=cv2.RANSAC, ransacReprojThreshold=threshold)
-    motion, agree = found
+    estimate: Any = cv2.estimateAffine2D(
+        source[known], target[known], method=cv2.RANSAC, ransacReprojThreshold=threshold
+    )
+    motion, agree = estimate
     if motion is None:
         return None, inliers
     inliers[known] = agree[:, 0] > 0
@@ -71,7 +73,7 @@ def fitted_affine(there: FloatArray, here: FloatArray, threshold: float) -> tupl
 
 
 def _moved(before: PreparedImage, after: PreparedImage, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where corners (N, 1, 2) of one frame are in another, and whether they were found there (N,)."""
+    """Track corners (N, 1, 2) of one frame into another; where they are, and which were found (N,)."""
     at, status, _ = cv2.calcOpticalFlowPyrLK(
         before.grey, after.grey, corners, np.empty_like(corners), winSize=_WINDOW, maxLevel=_LEVELS
     )
@@ -79,7 +81,7 @@ def _moved(before: PreparedImage, after: PreparedImage, corners: np.ndarray) -> 
 
 
 def _usable(frame: PreparedImage, corners: np.ndarray) -> np.ndarray:
-    """Which corners (N, 1, 2) lie in the frame and clear of its mask."""
+    """Select the corners (N, 1, 2) that lie in the frame and clear of its mask."""
     points = corners[:, 0].astype(np.float64)
     inside = (points >= 0.0).all(axis=1) & (points <= np.array(frame.grey.shape[::-1]) - 1.0).all(axis=1)
     return np.asarray(inside & frame.covers(points, np.full(len(points), _MASK_MARGIN)))

@@ -1,4 +1,4 @@
-"""Where one image lies on the plane of the map, and similarities between the planes of two alignments."""
+"""The place of an image on the plane of the map, and similarities between the planes of two alignments."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ _SAMPLES = 5  # points of an image's outline, a side, by which two planes are br
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Where the camera was.
+    """The place and heading of the camera.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Placement:
     focal: float | None
 
     def to_plane(self, points: FloatArray) -> FloatArray:
-        """Where points (N, 2) of the image, pixels, lie on the plane."""
+        """Map points (N, 2) of the image, pixels, to the plane."""
         return to_plane(self.camera, self.homography, points)
 
     @property
@@ -102,12 +102,12 @@ class PlaneSimilarity:
     @classmethod
     def between(cls, before: Sequence[Placement], after: Sequence[Placement]) -> Self:
         """The one that brings the plane of some placements to that of other placements of the same images."""
-        here, there = (
+        source, target = (
             np.concatenate([placed.to_plane(placed.camera.outline(_SAMPLES)) for placed in side])
             for side in (before, after)
         )
-        seen = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
-        return cls.fitted(here[seen], there[seen])
+        seen = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
+        return cls.fitted(source[seen], target[seen])
 
     @property
     def matrix(self) -> FloatArray:

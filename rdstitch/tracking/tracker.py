@@ -41,7 +41,7 @@ _FLOW_AGREEING = 0.5  # share of the corners that must agree on it
 
 @dataclass(frozen=True)
 class TrackingOptions:
-    """What is decided or known beforehand.
+    """Choices and knowledge of a tracker.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class TrackingOptions:
 
 @dataclass(frozen=True)
 class Tracked:
-    """What became of one frame.
+    """The result of one frame.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class Tracked:
 
     @property
     def pose(self) -> CameraPose | None:
-        """Of the camera, where its place is known and the model has poses."""
+        """Pose of the camera, where its place is known and the model has poses."""
         return None if self.placement is None else self.placement.pose
 
 
@@ -118,12 +118,12 @@ class Tracker:
 
     @property
     def distortion_known(self) -> bool:
-        """Whether λ was given, or is known well enough to be kept."""
+        """True where λ was given, or is known well enough to be kept."""
         return self._options.pair.distortion is not None
 
     @property
     def waits(self) -> bool:
-        """Whether there are too few keyframes for a map."""
+        """True while there are too few keyframes for a map."""
         return self._planar_model is None
 
     @property
@@ -171,13 +171,13 @@ class Tracker:
         elif last.placement is not None and self._planar_model in _SAME_TILT:
             coefficients = last.placement.camera.coefficients
             stay = replace(last.placement, camera=camera.with_coefficients(*coefficients))
-            there, here = last.placement.to_plane(matched[0]), stay.to_plane(matched[1])
-            pixel = float(np.std(there)) / max(float(np.std(matched[0])), 1e-9)
-            _, inliers = fitted_affine(there, here, _FLOW_ERROR * pixel)
+            target, source = last.placement.to_plane(matched[0]), stay.to_plane(matched[1])
+            pixel = float(np.std(target)) / max(float(np.std(matched[0])), 1e-9)
+            _, inliers = fitted_affine(target, source, _FLOW_ERROR * pixel)
             if inliers.sum() < _MIN_INLIERS:
                 return None
             rigid = self._planar_model == "rigid"
-            frame.placement = PlaneSimilarity.fitted(here[inliers], there[inliers], keep_size=rigid).applied(stay)
+            frame.placement = PlaneSimilarity.fitted(source[inliers], target[inliers], keep_size=rigid).applied(stay)
             ground = frame.placement.to_plane(self._grid(camera))
             seen = from_plane(last.placement.camera, last.placement.homography, ground)
         else:
@@ -225,8 +225,8 @@ class Tracker:
     def _links(self, frame: _Keyframe) -> list[Link]:
         """The frame with the last keyframes, as far as they can be registered; of a lost one, with more of them."""
         recent = self._keyframes[::-1]
-        found = self._registered(frame, recent[:_PARTNERS])
-        return found or self._registered(frame, recent[_PARTNERS:_SEARCHED])
+        links = self._registered(frame, recent[:_PARTNERS])
+        return links or self._registered(frame, recent[_PARTNERS:_SEARCHED])
 
     def _registered(self, frame: _Keyframe, others: Sequence[_Keyframe]) -> list[Link]:
         """Links of other frames with the frame, by the numbers of all."""
@@ -235,14 +235,14 @@ class Tracker:
         matched = [self._match(other.features, frame.features) for other in others]
         pairs = [
             PairMatches(
-                found.points1, found.points2, other.camera.with_focal(), frame.camera.with_focal(), -found.ratio
+                matches.points1, matches.points2, other.camera.with_focal(), frame.camera.with_focal(), -matches.ratio
             )
-            for other, found in zip(others, matched, strict=True)
+            for other, matches in zip(others, matched, strict=True)
         ]
         relations = estimate_radial_homographies(pairs, self._options.pair.estimation)
         return [
-            Link(other.number, frame.number, found.points1[fit.inliers], found.points2[fit.inliers], fit)
-            for other, found, fit in zip(others, matched, relations, strict=True)
+            Link(other.number, frame.number, matches.points1[fit.inliers], matches.points2[fit.inliers], fit)
+            for other, matches, fit in zip(others, matched, relations, strict=True)
             if fit and fit.inliers.sum() >= _MIN_INLIERS
         ]
 
@@ -260,16 +260,16 @@ class Tracker:
             return Placement(camera, nearest.homography @ inverse, nearest.focal)
         # Where the camera of that keyframe would see the matches, and where they are: one motion of the plane.
         stay = Placement(camera, nearest.homography, nearest.focal)
-        here = np.concatenate([stay.to_plane(link.points2) for _, link in placed])
-        there = np.concatenate([placement.to_plane(link.points1) for placement, link in placed])
-        seen = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
-        return PlaneSimilarity.fitted(here[seen], there[seen], keep_size=self._planar_model == "rigid").applied(stay)
+        source = np.concatenate([stay.to_plane(link.points2) for _, link in placed])
+        target = np.concatenate([placement.to_plane(link.points1) for placement, link in placed])
+        seen = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
+        return PlaneSimilarity.fitted(source[seen], target[seen], keep_size=self._planar_model == "rigid").applied(stay)
 
     def _shown_by_last(self, frame: _Keyframe, links: Sequence[Link]) -> float:
         """Share of the frame that the newest of its partners shows."""
         last = max(links, key=lambda link: link.image1)
-        there = last.relation.transfer(self._grid(frame.camera))  # the camera moved by about as much either way
-        return self._share_inside(there, frame.camera)
+        transferred = last.relation.transfer(self._grid(frame.camera))  # the camera moved by about as much either way
+        return self._share_inside(transferred, frame.camera)
 
     @staticmethod
     def _grid(camera: Camera) -> FloatArray:
@@ -297,8 +297,8 @@ class Tracker:
         self._next_alignment += min(steps, _ALIGNMENT_INTERVAL)
         without = [keyframe for keyframe in self._keyframes[:-1] if keyframe.placement is None]
         self._align_window()
-        found = [keyframe for keyframe in without if keyframe.placement is not None]
-        return [replace(self._tracked(keyframe, keyframe=True, inliers=0), revised=True) for keyframe in found]
+        placed = [keyframe for keyframe in without if keyframe.placement is not None]
+        return [replace(self._tracked(keyframe, keyframe=True, inliers=0), revised=True) for keyframe in placed]
 
     def _vote(self) -> None:
         """λ by the pairs alone, until there is an alignment."""
@@ -317,9 +317,10 @@ class Tracker:
             cameras = [camera.with_coefficients(known) for camera in cameras]
         if self._focal is not None:
             # Another focal length would give other heights: those of one map must not depend on the window.
-            own = (camera.half_diagonal for camera in cameras)
+            half_diagonals = (camera.half_diagonal for camera in cameras)
             cameras = [
-                camera.with_focal(self._focal * size, "option") for camera, size in zip(cameras, own, strict=True)
+                camera.with_focal(self._focal * size, "option")
+                for camera, size in zip(cameras, half_diagonals, strict=True)
             ]
         options = replace(
             self._options.alignment,

@@ -16,7 +16,7 @@ from tests.sampled import sampled
     ("distortion", "seed"), sampled([(-0.25, 1), (-0.25, 2), (-0.12, 1), (-0.12, 2), (-0.4, 1), (-0.4, 2)])
 )
 def test_pair(distortion: float, seed: int, tmp_path: Path) -> None:
-    lens = Camera((800, 600), distortion, focal=700.0)
+    lens = Camera((480, 360), distortion, focal=420.0)
     poses = pair_poses(lens, 0.3, yaw=0.1 * seed, direction=0.4 * seed, tilt=(0.03, -0.02))
     light = Photometry(gain=np.array([1.0, 1.1]), noise=0.005)
     sequence = sequence_over(lambda size: ground(size, seed), lens, poses, photometry=light, seed=seed)

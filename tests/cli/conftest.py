@@ -38,15 +38,26 @@ def place(tmp_path: Path, frames: list[Path]) -> Path:
 
 @pytest.fixture
 def rdstitch(capsys: pytest.CaptureFixture[str]) -> Run:
-    """``rdstitch(*arguments)``: run the command line in this process."""
+    """``rdstitch(*arguments)``: run the command line in this process, and check the exit status.
 
-    def call(*arguments: str | Path) -> Outcome:
+    ``told`` stands in the one line of a refusal, or in the messages of a success; ``out`` and ``err`` are all that is
+    written. None is not checked.
+    """
+
+    def call(
+        *arguments: object, status: int | None = 0, told: str = "", out: str | None = None, err: str | None = None
+    ) -> Outcome:
         capsys.readouterr()
-        status = run([str(argument) for argument in arguments])
+        ended = run([str(argument) for argument in arguments])
         captured = capsys.readouterr()
         assert "Traceback" not in captured.err
-        if status == 0 and "-o" in arguments:
+        assert status in (None, ended), captured.err
+        if ended == 0 and "-o" in arguments:
             check_sidecar(Path(f"{arguments[arguments.index('-o') + 1]}.json"))
-        return Outcome.of(status, captured.out, captured.err)
+        done = Outcome.of(ended, captured.out, captured.err)
+        assert told in (done.line if ended and told else done.err)
+        assert out in (None, done.out)
+        assert err in (None, done.err), done.err
+        return done
 
     return call

@@ -73,6 +73,7 @@ class Outcome:
 
 
 Run = Callable[..., Outcome]
+"""The fixture ``rdstitch``."""
 
 
 def flight(seed: int, columns: int, rows: int = 1, distortion: float = DISTORTION, overlap: float = 0.5) -> Sequence:
@@ -113,14 +114,6 @@ def state_of(folder: Path) -> dict[str, bytes | None]:
 def shown(path: Path) -> str:
     """A name as it appears within a line."""
     return str(path).encode("utf-8", "backslashreplace").decode("utf-8").replace("\n", " ")
-
-
-def check_refused(done: Outcome, status: int, named: Path | str) -> None:
-    """Status, and one line that says which file."""
-    assert done.status == status, done.err
-    assert done.out == ""
-    assert done.line.startswith("rdstitch: ")
-    assert shown(Path(named)) in done.line
 
 
 def check_sidecar(file: Path) -> None:

@@ -32,14 +32,13 @@ def _sidecar(image: Path) -> Path:
     return image.with_name(image.name + ".json")
 
 
-def _apply(rdstitch: Run, sidecar: Path, images: Path, output: Path, *options: str) -> Outcome:
-    return rdstitch("apply", sidecar, "--images", images, "-o", output, "-j", "1", *options)
+def _apply(rdstitch: Run, sidecar: Path, images: Path, output: Path, *options: str, **checked: object) -> Outcome:
+    return rdstitch("apply", sidecar, "--images", images, "-o", output, "-j", "1", *options, **checked)
 
 
 def test_same_images_give_the_same_bytes(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     output = tmp_path / "again.tif"
-    done = _apply(rdstitch, _sidecar(stitched), frames[0].parent, output)
-    assert (done.status, done.out, done.err) == (0, "", "")
+    _apply(rdstitch, _sidecar(stitched), frames[0].parent, output, out="", err="")
     assert output.read_bytes() == stitched.read_bytes()
     then, now = (json.loads(_sidecar(image).read_text(encoding="utf-8")) for image in (stitched, output))
     assert now.pop("applied") == {"sidecar": str(_sidecar(stitched)), "matched": "name"}
@@ -47,7 +46,7 @@ def test_same_images_give_the_same_bytes(rdstitch: Run, frames: list[Path], stit
     assert now == {key: value for key, value in then.items() if key != "pairs"} | {"output": now["output"]}
 
     third = tmp_path / "third.tif"
-    assert _apply(rdstitch, _sidecar(output), frames[0].parent, third).status == 0
+    _apply(rdstitch, _sidecar(output), frames[0].parent, third)
     assert third.read_bytes() == stitched.read_bytes()
 
 
@@ -56,29 +55,20 @@ def test_local_alignment_is_applied_again(rdstitch: Run, frames: list[Path], tmp
     made = {}
     for choice in ("auto", "off", "5"):
         made[choice] = tmp_path / f"{choice}.png"
-        done = rdstitch("mosaic", *frames, "-o", made[choice], "--local-alignment", choice, *CACHED)
-        assert done.status == 0
+        rdstitch("mosaic", *frames, "-o", made[choice], "--local-alignment", choice, *CACHED)
     assert made["auto"].read_bytes() == made["off"].read_bytes() != made["5"].read_bytes()
     content = json.loads(_sidecar(made["5"]).read_text(encoding="utf-8"))
     assert content["local_alignment"]["used"]
     assert content["images"][0]["displacement"]["grid"] == [6, 5]
     assert json.loads(_sidecar(made["auto"]).read_text(encoding="utf-8"))["images"][0]["displacement"] is None
     again = tmp_path / "again.png"
-    assert _apply(rdstitch, _sidecar(made["5"]), frames[0].parent, again).status == 0
+    _apply(rdstitch, _sidecar(made["5"]), frames[0].parent, again)
     assert again.read_bytes() == made["5"].read_bytes()
 
     content["images"][0]["displacement"]["px"].pop()
     _sidecar(made["5"]).write_text(json.dumps(content), encoding="utf-8")
-    refused = _apply(rdstitch, _sidecar(made["5"]), frames[0].parent, tmp_path / "no.png")
-    assert refused.status == 3
+    refused = _apply(rdstitch, _sidecar(made["5"]), frames[0].parent, tmp_path / "no.png", status=3)
     assert "images[0].displacement: expected" in refused.err
-
-
-@pytest.mark.parametrize("text", ["1", "101", "much"])
-def test_what_is_no_grid_is_refused(rdstitch: Run, frames: list[Path], tmp_path: Path, text: str) -> None:
-    done = rdstitch("mosaic", *frames, "-o", tmp_path / "x.png", "--local-alignment", text)
-    assert done.status == 2
-    assert "from 2 to 100" in done.err
 
 
 def test_given_options_win_over_those_of_the_sidecar(
@@ -86,8 +76,8 @@ def test_given_options_win_over_those_of_the_sidecar(
 ) -> None:
     changed, direct = tmp_path / "changed.png", tmp_path / "direct.png"
     options = ("--scale", "0.4", "--rotate", "0", "--blend", "feather")
-    assert _apply(rdstitch, _sidecar(stitched), frames[0].parent, changed, *options).status == 0
-    assert rdstitch("mosaic", *frames, "-o", direct, *options, *CACHED).status == 0
+    _apply(rdstitch, _sidecar(stitched), frames[0].parent, changed, *options)
+    rdstitch("mosaic", *frames, "-o", direct, *options, *CACHED)
     assert changed.read_bytes() == direct.read_bytes()
 
 
@@ -106,8 +96,7 @@ def _written(frames: list[Path], folder: Path, names: list[str], factor: float =
 def test_images_of_another_size(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     # The same names before the suffix.
     large = _written(frames, tmp_path / "large", [frame.stem + ".bmp" for frame in frames], factor=2.0)
-    done = _apply(rdstitch, _sidecar(stitched), large, tmp_path / "large.tif")
-    assert (done.status, done.err) == (0, "")
+    _apply(rdstitch, _sidecar(stitched), large, tmp_path / "large.tif", err="")
     small, twice = read_image(stitched), read_image(tmp_path / "large.tif")
     assert np.abs(np.array(twice.pixels.shape[:2]) - 2 * np.array(small.pixels.shape[:2])).max() <= 2
     assert small.alpha is not None
@@ -120,28 +109,22 @@ def test_images_of_another_size(rdstitch: Run, frames: list[Path], stitched: Pat
     assert [image["size"] for image in record["images"]] == [[800, 600]] * 3
     assert record["camera"]["image_size"] == [800, 600]
     assert record["lambda_px"] == pytest.approx(record["lambda"] / 500.0**2)
-    again = _apply(rdstitch, tmp_path / "large.tif.json", frames[0].parent, tmp_path / "small.tif")
-    assert (again.status, again.err) == (0, "")
+    _apply(rdstitch, tmp_path / "large.tif.json", frames[0].parent, tmp_path / "small.tif", err="")
     # Centres are divided by two again; nothing else was rounded.
     assert read_image(tmp_path / "small.tif").pixels.shape == small.pixels.shape
 
 
 def test_another_band_in_order(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     band = _written(frames, tmp_path / "nir", [f"nir{index}.png" for index in (1, 2, 10)], band=1)
-    done = _apply(rdstitch, _sidecar(stitched), band, tmp_path / "nir.tif")
-    assert done.status == 0
-    assert "in order" in done.line
-    quiet = _apply(rdstitch, _sidecar(stitched), band, tmp_path / "q.tif", "--match", "order")
-    assert (quiet.status, quiet.err) == (0, "")
+    _apply(rdstitch, _sidecar(stitched), band, tmp_path / "nir.tif", told="in order")
+    _apply(rdstitch, _sidecar(stitched), band, tmp_path / "q.tif", "--match", "order", err="")
     assert (tmp_path / "q.tif").read_bytes() == (tmp_path / "nir.tif").read_bytes()
     colour = tmp_path / "colour.tif"
-    assert _apply(rdstitch, _sidecar(stitched), frames[0].parent, colour).status == 0
+    _apply(rdstitch, _sidecar(stitched), frames[0].parent, colour)
     grey, green = read_image(tmp_path / "nir.tif").pixels, read_image(colour).pixels[..., 1]
     assert grey.shape == green.shape
     assert np.abs(grey.astype(float) - green).mean() < 3.0
-    refused = _apply(rdstitch, _sidecar(stitched), band, tmp_path / "n.tif", "--match", "name")
-    assert refused.status == 3
-    assert frames[0].name in refused.line
+    _apply(rdstitch, _sidecar(stitched), band, tmp_path / "n.tif", "--match", "name", status=3, told=frames[0].name)
 
 
 def test_a_missing_image_is_named(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
@@ -149,35 +132,29 @@ def test_a_missing_image_is_named(rdstitch: Run, frames: list[Path], stitched: P
     folder.mkdir()
     for frame in frames[:2]:
         shutil.copy(frame, folder)
-    done = _apply(rdstitch, _sidecar(stitched), folder, tmp_path / "some.tif")
-    assert done.status == 0
-    assert frames[2].name in done.line
+    _apply(rdstitch, _sidecar(stitched), folder, tmp_path / "some.tif", told=frames[2].name)
     record = json.loads((tmp_path / "some.tif.json").read_text(encoding="utf-8"))
     assert [image["used"] for image in record["images"]] == [True, True, False]
-    strict = _apply(rdstitch, _sidecar(stitched), folder, tmp_path / "strict.tif", "--strict")
-    assert strict.status == 5
+    _apply(rdstitch, _sidecar(stitched), folder, tmp_path / "strict.tif", "--strict", status=5)
     assert not (tmp_path / "strict.tif").exists()
 
 
 def test_what_does_not_fit_is_refused(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     sidecar = _sidecar(stitched)
     fewer = _written(frames[:2], tmp_path / "fewer", ["x.png", "y.png"])
-    done = _apply(rdstitch, sidecar, fewer, tmp_path / "out.tif")
-    assert (done.status, str(sidecar) in done.line) == (3, True)
-    done = _apply(rdstitch, sidecar, tmp_path / "nowhere", tmp_path / "out.tif")
-    assert (done.status, f"{tmp_path / 'nowhere'}: no such folder" in done.line) == (3, True)
+    _apply(rdstitch, sidecar, fewer, tmp_path / "out.tif", status=3, told=str(sidecar))
+    nowhere = tmp_path / "nowhere"
+    _apply(rdstitch, sidecar, nowhere, tmp_path / "out.tif", status=3, told=f"{nowhere}: no such folder")
     cut = tmp_path / "cut"
     cut.mkdir()
     for frame in frames:
         assert cv2.imwrite(str(cut / frame.name), read_image(frame).pixels[:200])
-    done = _apply(rdstitch, sidecar, cut, tmp_path / "out.tif")
-    assert (done.status, str(cut / frames[0].name) in done.line) == (3, True)
+    _apply(rdstitch, sidecar, cut, tmp_path / "out.tif", status=3, told=str(cut / frames[0].name))
     shutil.copy(frames[0], cut / f"{frames[0].stem}.jpeg")
     for image in cut.glob("*.png"):
         image.rename(image.with_suffix(".bmp"))
-    done = _apply(rdstitch, sidecar, cut, tmp_path / "out.tif")
-    assert (done.status, "several images" in done.line) == (3, True)
-    assert _apply(rdstitch, frames[0], frames[0].parent, tmp_path / "out.tif").status == 3
+    _apply(rdstitch, sidecar, cut, tmp_path / "out.tif", status=3, told="several images")
+    _apply(rdstitch, frames[0], frames[0].parent, tmp_path / "out.tif", status=3)
     assert not (tmp_path / "out.tif").exists()
 
 
@@ -187,11 +164,10 @@ def test_never_writes_over_the_sidecar_that_it_applies(
     for file in (stitched, _sidecar(stitched)):
         shutil.copy(file, tmp_path)
     own = tmp_path / stitched.name
-    done = _apply(rdstitch, _sidecar(own), frames[0].parent, own, "--overwrite")
-    assert (done.status, str(own) in done.line) == (6, True)
+    _apply(rdstitch, _sidecar(own), frames[0].parent, own, "--overwrite", status=6, told=str(own))
     assert _sidecar(own).read_bytes() == _sidecar(stitched).read_bytes()
-    assert _apply(rdstitch, _sidecar(stitched), frames[0].parent, own).status == 6
-    assert _apply(rdstitch, _sidecar(stitched), frames[0].parent, own, "--overwrite").status == 0
+    _apply(rdstitch, _sidecar(stitched), frames[0].parent, own, status=6)
+    _apply(rdstitch, _sidecar(stitched), frames[0].parent, own, "--overwrite")
 
 
 _LATIN = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "latin-1"}

@@ -22,10 +22,7 @@ def environment(tmp_path: Path) -> dict[str, str]:
     folder = tmp_path / "bin"
     folder.mkdir()
     program = folder / "rdstitch"
-    program.write_text(
-        f"#!{sys.executable}\nfrom rdstitch_cli.main import main\nmain()\n",
-        encoding="utf-8",
-    )
+    program.write_text(f"#!{sys.executable}\nfrom rdstitch_cli.main import main\nmain()\n", encoding="utf-8")
     program.chmod(0o755)
     libraries = os.pathsep.join(path for path in sys.path if path)
     return {

@@ -73,7 +73,7 @@ def test_the_camera_file_is_read_to_the_horizon(folder: Path) -> None:
 @pytest.mark.parametrize("view", ["same", "all", "valid"])
 def test_undistorted_images_are_masked(rdstitch: Run, folder: Path, tmp_path: Path, view: str) -> None:
     lens = ("--camera", folder / "fisheye.yml")
-    assert rdstitch("undistort", folder / "0.png", "-o", tmp_path, *lens, "--view", view).status == 0
+    rdstitch("undistort", folder / "0.png", "-o", tmp_path, *lens, "--view", view)
     image = cv2.imread(str(tmp_path / "0.png"), cv2.IMREAD_UNCHANGED)
     assert image is not None
     if view == "all":
@@ -87,7 +87,7 @@ def test_undistorted_images_are_masked(rdstitch: Run, folder: Path, tmp_path: Pa
 def test_a_mosaic_of_what_is_before_the_camera(rdstitch: Run, folder: Path, tmp_path: Path) -> None:
     images = [folder / f"{number}.png" for number in range(3)]
     lens = ("--camera", folder / "fisheye.yml")
-    assert rdstitch("pano", *images, "-o", tmp_path / "a.png", *lens, *CACHED).status == 0
+    rdstitch("pano", *images, "-o", tmp_path / "a.png", *lens, *CACHED)
     image = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     assert image is not None
     assert (image[[0, 0, -1, -1], [0, -1, 0, -1], 3] == 0).all()

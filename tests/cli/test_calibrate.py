@@ -14,7 +14,6 @@ from tests.cli.running import CACHED, DISTORTION, Run
 def test_writes_a_camera_that_pano_takes(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     file = tmp_path / "camera.json"
     done = rdstitch("calibrate", frames[0].parent, "-o", file, *CACHED)
-    assert done.status == 0
     camera = Camera.load(file)
     first, *others = done.err.splitlines()
     assert first == f"rdstitch: λ = {camera.distortion:.6f} ± {camera.distortion_std:.6f}"
@@ -29,26 +28,12 @@ def test_writes_a_camera_that_pano_takes(rdstitch: Run, frames: list[Path], tmp_
     assert (stitched.status, stitched.out) == (0, done.out)
 
 
-def test_keeps_an_existing_camera_file(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    file = tmp_path / "camera.json"
-    file.write_text("mine", encoding="utf-8")
-    done = rdstitch("calibrate", *frames, "-o", file, *CACHED)
-    assert done.status == 6
-    assert str(file) in done.line
-    assert "--overwrite" in done.line
-    assert file.read_text(encoding="utf-8") == "mine"
-    assert rdstitch("calibrate", *frames, "-o", file, "--overwrite", *CACHED).status == 0
-    assert Camera.load(file).image_size == (400, 300)
-
-
 @pytest.mark.parametrize("name", ["camera.yml", "cameras.json", "lens.pto"])
 def test_camera_files_of_others(rdstitch: Run, frames: list[Path], tmp_path: Path, name: str) -> None:
     done = rdstitch("calibrate", *frames[:2], "-o", tmp_path / name, *CACHED)
-    assert done.status == 0
     assert re.search(rf"{name}: its lens model is at most 0\.\d+ pixels from the lens", done.err)
     assert f"{load_camera(tmp_path / name).distortion:.6f}\n" == done.out
-    straight = rdstitch("undistort", frames[0], "--camera", tmp_path / name, "-o", tmp_path / "straight")
-    assert (straight.status, straight.err) == (0, "")
+    rdstitch("undistort", frames[0], "--camera", tmp_path / name, "-o", tmp_path / "straight", err="")
 
 
 def test_the_residual_of_a_foreign_lens_is_reported(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
@@ -57,12 +42,5 @@ def test_the_residual_of_a_foreign_lens_is_reported(rdstitch: Run, frames: list[
     file.write_text(json.dumps({"lens": entry}), encoding="utf-8")
     arguments = ("undistort", frames[0], "--camera", file, "-o", tmp_path / "straight", "--overwrite")
     told = rdstitch(*arguments)
-    assert told.status == 0
     assert re.search(r"OpenDroneMap.* rms \d+\.\d\d pixels", told.line)
-    assert rdstitch(*arguments, "-q").err == ""
-
-
-def test_a_name_that_is_no_camera_file_is_refused_early(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.txt", *CACHED)
-    assert done.status == 6
-    assert ".yml" in done.line
+    rdstitch(*arguments, "-q", err="")

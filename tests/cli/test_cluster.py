@@ -122,12 +122,8 @@ def test_a_cluster_is_started_here_and_ended(rdstitch: Run, frames: list[Path], 
 
 def test_what_a_cluster_lacks_is_said(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     arguments = ("mosaic", *frames, "-o", tmp_path / "out.png", *FAST, "--scheduler", "tcp://127.0.0.1:9")
-    without_cache = rdstitch(*arguments)
-    assert without_cache.status == 2
-    assert "--cache" in without_cache.line
-    nobody = rdstitch(*arguments, "--cache", tmp_path / "cache")
-    assert nobody.status == 2
-    assert "no Dask scheduler" in nobody.line
+    rdstitch(*arguments, status=2, told="--cache")
+    nobody = rdstitch(*arguments, "--cache", tmp_path / "cache", status=2, told="no Dask scheduler")
     assert "tcp://127.0.0.1:9" in nobody.line
     assert not (tmp_path / "out.png").exists()
 

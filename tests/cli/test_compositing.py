@@ -65,16 +65,14 @@ def test_every_way_makes_another_image_of_the_same_place(
 
 def test_crop_leaves_no_hole(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "cropped.png"
-    done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--crop", "--scale", "1")
-    assert (done.status, done.err) == (0, "")
+    rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--crop", "--scale", "1", err="")
     image = read_image(output)
     assert image.alpha is None or (image.alpha == 255).all()
 
 
 def test_background_is_what_no_image_covers(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "white.jpg"
-    done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--background", "255")
-    assert done.status == 0
+    rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--background", "255")
     assert (read_image(output).pixels[0, 0] > 250).all()
 
 
@@ -82,18 +80,10 @@ def test_too_little_memory_is_refused_with_the_reason(
     rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path
 ) -> None:
     output = tmp_path / "none.tif"
-    done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--max-memory", "2M")
-    assert done.status == 7
+    done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--max-memory", "2M", status=7)
     assert "2 MB are too little" in done.line
     assert "--max-memory" in done.line
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("text", ["much", "0", "-3M", "2X"])
-def test_no_amount_of_memory(rdstitch: Run, sidecar: Path, tmp_path: Path, text: str) -> None:
-    done = rdstitch("apply", sidecar, "--images", tmp_path, "-o", tmp_path / "a.tif", "--max-memory", text)
-    assert done.status == 2
-    assert "800M or 2G" in done.line
 
 
 def test_amounts_of_memory() -> None:
@@ -104,15 +94,14 @@ def test_amounts_of_memory() -> None:
 
 
 def test_dry_run_reports_and_writes_nothing(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("mosaic", *frames, "-o", tmp_path / "a.tif", "--dry-run", *CACHED)
-    assert (done.status, done.err) == (0, "")
+    done = rdstitch("mosaic", *frames, "-o", tmp_path / "a.tif", "--dry-run", *CACHED, err="")
     assert not list(tmp_path.iterdir())
     distortion, *plan = done.out.splitlines()
     float(distortion)
     told = dict(line.split(": ") for line in plan)
     assert set(told) == {"images", "canvas", "output", "memory", "time"}
     assert told["images"] == "3"
-    assert rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *CACHED).status == 0
+    rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *CACHED)
     height, width = read_image(tmp_path / "a.png").pixels.shape[:2]
     assert told["canvas"].startswith(f"{width} x {height} pixels")
 
@@ -131,11 +120,11 @@ def test_file_and_memory_hold_the_same_image(frames: list[Path], tmp_path: Path)
 def test_deep_zoom_is_the_same_image(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     output, report = tmp_path / "a.dzi", tmp_path / "report.html"
     command = ("mosaic", *frames, "-o", output, "--report", report, *CACHED)
-    assert rdstitch(*command, "--dry-run").status == 0
+    rdstitch(*command, "--dry-run")
     assert not list(tmp_path.iterdir())
-    assert rdstitch(*command).status == 0
+    rdstitch(*command)
     assert {path.name for path in tmp_path.iterdir()} == {"a.dzi", "a_files", "a.dzi.json", "a.html", "report.html"}
-    assert rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *CACHED).status == 0
+    rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *CACHED)
     whole = read_image(tmp_path / "a.png")
     assert whole.alpha is not None
     height, width = whole.alpha.shape
@@ -148,14 +137,12 @@ def test_deep_zoom_is_replaced_only_on_request(
     rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path
 ) -> None:
     command = ("apply", sidecar, "--images", frames[0].parent, "-o", tmp_path / "a.dzi", "--scale", "0.3")
-    assert rdstitch(*command).status == 0
+    rdstitch(*command)
     (tmp_path / "a.dzi").unlink()
     (tmp_path / "a.dzi.json").unlink()
     (tmp_path / "a.html").unlink()
-    done = rdstitch(*command)
-    assert done.status == 6
-    assert "a_files: exists already" in done.line
-    assert rdstitch(*command, "--overwrite").status == 0
+    rdstitch(*command, status=6, told="a_files: exists already")
+    rdstitch(*command, "--overwrite")
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
@@ -172,8 +159,7 @@ def test_profile_and_exif_are_kept_and_the_image_is_upright(
         turned.save(folder / frame.name, exif=exif, icc_profile=profile)
     folders = {"upright": frames[0].parent, "turned": folder}
     for name, images in folders.items():
-        done = rdstitch("apply", sidecar, "--images", images, "-o", tmp_path / f"{name}.{suffix}", "--scale", "0.3")
-        assert done.status == 0
+        rdstitch("apply", sidecar, "--images", images, "-o", tmp_path / f"{name}.{suffix}", "--scale", "0.3")
     upright, turned_output = (read_image(tmp_path / f"{name}.{suffix}") for name in folders)
     np.testing.assert_array_equal(turned_output.pixels, upright.pixels)
     assert (upright.metadata.icc_profile, upright.metadata.make) == (b"", "")

@@ -24,7 +24,6 @@ def stitched(rdstitch: Run, folder: Path, kind: str) -> dict[str, Any]:
     """The sidecar of the bundled pair."""
     output = folder / f"{kind}.jpg"
     done = rdstitch("pano", *PAIR, "-o", output, "--features", kind, "--reference", PAIR[0].name, *SMALL)
-    assert done.status == 0
     assert all("[few-images]" in line for line in done.err.splitlines())
     record: dict[str, Any] = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
     return record

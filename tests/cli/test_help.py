@@ -24,7 +24,6 @@ def _options(command: click.Command) -> list[click.Option]:
 def test_help_has_examples_exit_statuses_and_every_option(rdstitch: Run, name: str) -> None:
     brief = rdstitch(name, "--help")
     shown = rdstitch(name, "--help-all") if "--help-all" in brief.out else brief
-    assert (brief.status, shown.status) == (0, 0)
     assert sum(line.startswith("  -") for line in brief.out.splitlines()) <= 25
     assert "RANGE" not in shown.out
     assert f"rdstitch {name} " in shown.out
@@ -61,20 +60,13 @@ def test_every_status_of_the_error_tree_is_documented() -> None:
 
 
 def test_the_bare_command_shows_all_of_its_help(rdstitch: Run) -> None:
-    assert rdstitch().err == rdstitch("-h").out
+    assert rdstitch(status=2).err == rdstitch("-h").out
     assert "..." not in rdstitch("-h").out.partition("Examples:")[0].partition("[ARGS]...")[2]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_topic_of_a_bag_can_be_given_wherever_a_bag_is_read(name: str) -> None:
     assert any(option.name == "topic" for option in _options(cli.commands[name]))
-
-
-@pytest.mark.parametrize("given", [("--max-size", "2000x1000"), ("--scale", "large"), ("--quality", "101")])
-def test_what_is_no_number_is_told_what_was_expected(rdstitch: Run, given: tuple[str, str]) -> None:
-    done = rdstitch("pano", "a.jpg", "b.jpg", "-o", "c.jpg", *given)
-    assert done.status == 2
-    assert re.search(rf"'{given[0]}': expected one (whole )?number.*, not '{given[1]}'", done.line)
 
 
 @pytest.mark.parametrize("name", ["pano", "mosaic", "calibrate", "trajectory"])
@@ -103,10 +95,3 @@ def test_help_loads_neither_opencv_nor_scipy(arguments: list[str]) -> None:
 def test_version(rdstitch: Run) -> None:
     shown = rdstitch("--version")
     assert re.fullmatch(r"rdstitch, version \d+\.\d+\.\d+\n", shown.out)
-
-
-@pytest.mark.parametrize("arguments", [(), ("stitch",), ("pano",), ("pano", "a.jpg", "--colour"), ("mosaic", "a")])
-def test_wrong_usage_is_status_2(rdstitch: Run, arguments: tuple[str, ...]) -> None:
-    done = rdstitch(*arguments)
-    assert done.status == 2
-    assert done.err

@@ -6,7 +6,6 @@ import random
 import signal
 import time
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,9 +13,8 @@ import pytest
 from rdstitch_cli.main import run
 
 from rdstitch.io import read_image
-from rdstitch.pipeline import recipes
 from rdstitch.synthetic import ground
-from tests.cli.running import FAST, Outcome, Run, finished, start, state_of
+from tests.cli.running import FAST, Outcome, finished, start, state_of
 from tests.sampled import sampled
 
 _IMAGES = 64  # enough for worker processes
@@ -62,21 +60,6 @@ def test_an_interrupted_run_ends_its_workers_and_can_be_continued(strip: Path, t
     if continued:
         assert finished(start(*arguments)).status == 0
         assert {path: path.stat().st_mtime_ns for path in kept} == kept
-
-
-@pytest.mark.parametrize(
-    ("raised", "status"), [(KeyboardInterrupt(), 130), (MemoryError(), 7), (ZeroDivisionError("x\ny"), 1)]
-)
-def test_bad_luck_in_the_middle(
-    rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch, raised: BaseException, status: int
-) -> None:
-    def fail(*arguments: Any, **options: Any) -> None:
-        raise raised
-
-    monkeypatch.setattr(recipes, "sidecar", fail)
-    done = rdstitch("pano", place / "a.png", place / "b.png", "-o", place / "out.png", *FAST)
-    assert done.status == status
-    assert done.line
 
 
 def test_debug_shows_where(capsys: pytest.CaptureFixture[str], place: Path) -> None:

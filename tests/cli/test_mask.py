@@ -54,8 +54,7 @@ def test_a_leg_is_neither_matched_nor_shown(
             shutil.copy(mask, tmp_path / "masks" / path.name)
         mask = tmp_path / "masks"
     output = tmp_path / "out.png"
-    done = rdstitch(command, *sorted(legs.iterdir()), "-o", output, "--mask", mask, *CACHED)
-    assert (done.status, done.err) == (0, "")
+    done = rdstitch(command, *sorted(legs.iterdir()), "-o", output, "--mask", mask, *CACHED, err="")
     assert abs(float(done.out) - DISTORTION) < 0.01
     assert leg_pixels(output) == 0
     record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
@@ -64,11 +63,11 @@ def test_a_leg_is_neither_matched_nor_shown(
 
 def test_without_a_mask_the_leg_is_seen_and_apply_takes_masks_too(rdstitch: Run, legs: Path, tmp_path: Path) -> None:
     output, again = tmp_path / "out.png", tmp_path / "again.png"
-    assert rdstitch("mosaic", legs, "-o", output, "--mask", tmp_path / "mask.png", *CACHED).status == 0
+    rdstitch("mosaic", legs, "-o", output, "--mask", tmp_path / "mask.png", *CACHED)
     arguments = ("apply", f"{output}.json", "--images", legs, "-o", again, "--overwrite", "-j", "1")
-    assert rdstitch(*arguments).status == 0
+    rdstitch(*arguments)
     assert leg_pixels(again) > 1000
-    assert rdstitch(*arguments, "--mask", tmp_path / "mask.png").status == 0
+    rdstitch(*arguments, "--mask", tmp_path / "mask.png")
     np.testing.assert_array_equal(read_image(again).pixels, read_image(output).pixels)
 
 
@@ -77,7 +76,6 @@ def test_masks_help_where_nothing_is_composited(
     rdstitch: Run, legs: Path, tmp_path: Path, command: str, suffix: str
 ) -> None:
     done = rdstitch(command, legs, "-o", tmp_path / f"out.{suffix}", "--mask", tmp_path / "mask.png", *CACHED)
-    assert done.status == 0
     assert abs(float(done.out) - DISTORTION) < 0.01
 
 
@@ -85,22 +83,7 @@ def test_images_without_a_mask_are_reported(rdstitch: Run, frames: list[Path], t
     (tmp_path / "masks").mkdir()
     assert cv2.imwrite(str(tmp_path / "masks" / f"{frames[0].stem}.bmp"), np.full((30, 40), 255, np.uint8))
     done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--mask", tmp_path / "masks", *CACHED)
-    assert done.status == 0
     assert done.line.endswith(f"2 of 3 images have no mask: {frames[1].name}, {frames[2].name}")
-
-
-def test_a_mask_that_does_not_fit_is_named(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    mask = tmp_path / "mask.png"
-    arguments = ("mosaic", frames[0].parent, "-o", tmp_path / "out.png", "--mask", mask, *CACHED)
-    done = rdstitch(*arguments)
-    assert done.status == 3
-    assert str(mask) in done.line
-    assert cv2.imwrite(str(mask), np.full((40, 30), 255, np.uint8))
-    done = rdstitch(*arguments)
-    assert done.status == 3
-    assert f"{mask}: a mask of 30 x 40 pixels does not fit" in done.line
-    mask.write_bytes(b"no image")
-    assert rdstitch(*arguments).status == 3
 
 
 def test_a_black_border_in_all_images_is_masked(rdstitch: Run, tmp_path: Path) -> None:
@@ -108,12 +91,11 @@ def test_a_black_border_in_all_images_is_masked(rdstitch: Run, tmp_path: Path) -
     images.mkdir()
     adverse_set("round border", 2).write(images)
     done = rdstitch("mosaic", images, "-o", tmp_path / "out.png", "-v", *CACHED)
-    assert done.status == 0
     assert "of every image is black, or stays where it is" in done.err
     found = read_image(tmp_path / "out.png")
     assert found.alpha is not None
     light = found.pixels.max(axis=2)
     assert (light[found.alpha > 0] < 8).mean() < 0.02
     again = ("apply", tmp_path / "out.png.json", "--images", images, "-o", tmp_path / "again.png")
-    assert rdstitch(*again).status == 0
+    rdstitch(*again)
     assert (tmp_path / "again.png").read_bytes() == (tmp_path / "out.png").read_bytes()

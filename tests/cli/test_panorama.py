@@ -41,8 +41,7 @@ def around(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def test_a_full_turn_becomes_a_sphere_that_viewers_turn(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "sphere.jpg"
     report = tmp_path / "report.html"
-    done = rdstitch("pano", *around, "-o", output, "--report", report, *CACHE)
-    assert done.status == 0
+    rdstitch("pano", *around, "-o", output, "--report", report, *CACHE)
     record = json.loads((tmp_path / "sphere.jpg.json").read_text(encoding="utf-8"))
     assert record["model"] == "rotation"
     assert all(image["used"] for image in record["images"])
@@ -58,7 +57,7 @@ def test_a_full_turn_becomes_a_sphere_that_viewers_turn(rdstitch: Run, around: l
     assert f'GPano:FullPanoWidthPixels="{width}"' in xmp
     assert f'GPano:CroppedAreaImageHeightPixels="{height}"' in xmp
     again = tmp_path / "again.jpg"
-    assert rdstitch("apply", f"{output}.json", "--images", around[0].parent, "-o", again).status == 0
+    rdstitch("apply", f"{output}.json", "--images", around[0].parent, "-o", again)
     assert again.read_bytes() == output.read_bytes()
     page = report.read_text(encoding="utf-8")
     assert "<h2>Directions</h2>" in page
@@ -101,8 +100,7 @@ def test_outlines_are_where_the_images_are_at_both_ends_of_a_full_turn(around: l
 
 def test_the_projection_is_the_users(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "few.tif"
-    done = rdstitch("pano", *around[:3], "-o", output, "--projection", "mercator", *CACHE)
-    assert done.status == 0
+    rdstitch("pano", *around[:3], "-o", output, "--projection", "mercator", *CACHE)
     record = json.loads((tmp_path / "few.tif.json").read_text(encoding="utf-8"))
     assert record["output"]["projection"] == "mercator"
     assert not record["output"]["wraps_around"]
@@ -112,11 +110,11 @@ def test_the_view_is_turned_and_turned_again(rdstitch: Run, around: list[Path], 
     """What is 40 degrees to the right comes to the middle; apply gives the same bytes, and turns from there."""
     first, second, third = (tmp_path / f"{k}.png" for k in range(3))
     how = ("--projection", "sphere", "--seam", "voronoi", "--exposure", "none")
-    assert rdstitch("pano", *around, "-o", first, *how, "--yaw", "40", "--pitch", "-10", *CACHE).status == 0
+    rdstitch("pano", *around, "-o", first, *how, "--yaw", "40", "--pitch", "-10", *CACHE)
     images = ("--images", around[0].parent)
-    assert rdstitch("apply", f"{first}.json", *images, "-o", second).status == 0
+    rdstitch("apply", f"{first}.json", *images, "-o", second)
     assert first.read_bytes() == second.read_bytes()
-    assert rdstitch("apply", f"{first}.json", *images, "-o", third, "--pitch", "0", "--yaw", "0").status == 0
+    rdstitch("apply", f"{first}.json", *images, "-o", third, "--pitch", "0", "--yaw", "0")
     turned, plain = (json.loads(Path(f"{file}.json").read_text("utf-8")) for file in (first, third))
     assert plain["output"]["orientation"] is None
     ahead, base = (np.array(record["images"][0]["to_plane"])[:, 2] for record in (turned, plain))
@@ -125,28 +123,21 @@ def test_the_view_is_turned_and_turned_again(rdstitch: Run, around: list[Path], 
     np.testing.assert_allclose(np.array(turned["output"]["orientation"]) @ base, ahead, atol=1e-12)
 
 
-def test_images_of_a_plane_have_no_other_projection(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--projection", "sphere", *CACHE)
-    assert done.status == 2
-    assert "--projection" in done.err
-    done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--yaw", "10", *CACHE)
-    assert done.status == 2
-    assert "turning on the spot" in done.err
+def test_a_view_of_a_plane_cannot_be_turned(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    how = ("-o", tmp_path / "out.png", "--yaw", "10", *CACHE)
+    rdstitch("pano", *frames, *how, status=2, told="turning on the spot")
 
 
 def test_a_lens_is_calibrated_by_turning(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
     camera = tmp_path / "camera.json"
-    done = rdstitch("calibrate", around[0].parent, "-o", camera, *CACHE)
-    assert done.status == 0
+    rdstitch("calibrate", around[0].parent, "-o", camera, *CACHE)
     found = Camera.load(camera)
     assert found.distortion == pytest.approx(-0.2, abs=0.005)
     assert found.focal == pytest.approx(260.0, rel=0.003)
 
 
 def test_a_turning_camera_has_no_path(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("trajectory", around[0].parent, "-o", tmp_path / "path.csv", *CACHE)
-    assert done.status == 2
-    assert "turned on the spot" in done.err
+    rdstitch("trajectory", around[0].parent, "-o", tmp_path / "path.csv", *CACHE, status=2, told="turned on the spot")
 
 
 # Three images through a camera that is held askew and points upwards: they alone do not tell what is level.
@@ -195,9 +186,9 @@ def test_orientation_in_exif_says_what_is_down(tmp_path: Path) -> None:
 
 def test_deep_zoom_of_a_full_turn_is_joined_at_the_edge(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
     plain, tiles = tmp_path / "around.png", tmp_path / "around.dzi"
-    assert rdstitch("pano", *around, "-o", plain, *CACHE).status == 0
+    rdstitch("pano", *around, "-o", plain, *CACHE)
     arguments = ("--images", around[0].parent, "-o", tiles, "--max-memory", "200M")
-    assert rdstitch("apply", f"{plain}.json", *arguments).status == 0
+    rdstitch("apply", f"{plain}.json", *arguments)
     with Image.open(plain) as image:
         whole = np.asarray(image.convert("RGB")).astype(float)
     height, width = whole.shape[:2]

@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from rdstitch.camera import Camera
-from rdstitch.camera_files import save_camera
 from rdstitch.io import read_image
 from tests.cli.running import CACHED, FAST, Run, finished, start
 from tests.faults import OPERATIONS, Operation, failing_disk
@@ -47,10 +45,10 @@ def _check_all_failures(
         arguments = (*arguments, "--overwrite")
     before: dict[str, bytes] = {}
     if overwrite:
-        assert rdstitch(*arguments, "--rotate", "90").status == 0
+        rdstitch(*arguments, "--rotate", "90")
         before = _outputs(folder)
     with failing_disk(operation) as disk:
-        assert rdstitch(*arguments).status == 0
+        rdstitch(*arguments)
     after = _outputs(folder)
     assert len(after) >= 2
     assert disk.count > 0
@@ -61,7 +59,7 @@ def _check_all_failures(
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             (folder / path).write_bytes(content)
         with failing_disk(operation, failing):
-            done = rdstitch(*arguments)
+            done = rdstitch(*arguments, status=None)
         left = _outputs(folder)
         if done.status == 0 and operation == "rename" and not overwrite:
             # Where a link fails, a renaming does.
@@ -72,7 +70,7 @@ def _check_all_failures(
         assert left == before or operation == "rename"
         assert not overwrite or {name, f"{name}.json"} <= set(left)
         assert all(content in (before.get(path), after.get(path)) for path, content in left.items())
-    assert rdstitch(*arguments, "--overwrite").status == 0
+    rdstitch(*arguments, "--overwrite")
     assert _outputs(folder) == after
 
 
@@ -81,19 +79,9 @@ def _check_all_failures(
 def test_whatever_fails(
     rdstitch: Run, located: Path, tmp_path: Path, operation: Operation, overwrite: bool, name: str
 ) -> None:
-    # The writes of tiles and strips are many, and alike; all of them are in the slow test.
+    # The writes of tiles and strips are many, and alike.
     step = 5 if operation == "write" else 3
     _check_all_failures(rdstitch, located, tmp_path, operation, name, overwrite, step)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("operation", OPERATIONS)
-@pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize("name", ["out.jpg", "out.png", "out.webp", "out.tif", "out.dzi"])
-def test_whatever_fails_every_single_time(
-    rdstitch: Run, located: Path, tmp_path: Path, operation: Operation, overwrite: bool, name: str
-) -> None:
-    _check_all_failures(rdstitch, located, tmp_path, operation, name, overwrite, 1)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +95,7 @@ def test_the_report_is_published_with_the_image(
     arguments = (*arguments, "--scale", "0.3", "--blend", "none", "--seam", "none", "--cache", cache, *FAST)
     out.mkdir()
     # Also so that the cache has everything, whose own renames do not count.
-    assert rdstitch(*arguments, "--rotate", "90").status == 0
+    rdstitch(*arguments, "--rotate", "90")
     before = _outputs(out)
     assert {name, f"{name}.json", "why.html"} <= set(before)
     if overwrite:
@@ -117,7 +105,7 @@ def test_the_report_is_published_with_the_image(
         shutil.rmtree(out)
         out.mkdir()
     with failing_disk("rename") as disk:
-        assert rdstitch(*arguments).status == 0
+        rdstitch(*arguments)
     assert disk.count >= 3
     assert "<h2>Mosaic</h2>" in (out / "why.html").read_text(encoding="utf-8")
     assert "No image was written" not in (out / "why.html").read_text(encoding="utf-8")
@@ -128,12 +116,12 @@ def test_the_report_is_published_with_the_image(
             (out / path).parent.mkdir(parents=True, exist_ok=True)
             (out / path).write_bytes(content)
         with failing_disk("rename", failing):
-            done = rdstitch(*arguments)
+            done = rdstitch(*arguments, status=None)
         assert done.status == 6 or not overwrite, (failing, done.err)
         left = _outputs(out)
         assert not overwrite or {name, f"{name}.json", "why.html"} <= set(left)
         assert not [path for path in left if ".part" in path]
-    assert rdstitch(*arguments, "--overwrite").status == 0
+    rdstitch(*arguments, "--overwrite")
 
 
 _KILLED_WHILE_PUBLISHING = """
@@ -161,7 +149,7 @@ def test_a_run_that_was_killed_while_it_published_can_be_run_again(
     assert killed.status == -9
     assert (output.exists(), report.exists()) == (published > 0, published > 1)
     assert not (tmp_path / "out.png.json").exists()
-    assert rdstitch(*arguments).status == 0
+    rdstitch(*arguments)
     record = json.loads((tmp_path / "out.png.json").read_text(encoding="utf-8"))
     assert [image["name"] for image in record["images"]] == [frame.name for frame in frames]
     assert {path.name for path in tmp_path.iterdir()} == {"out.png", "out.png.json", "why.html"}
@@ -194,13 +182,8 @@ def test_the_sidecar_names_what_it_belongs_to(rdstitch: Run, located: Path, tmp_
     arguments = ("apply", sidecar, "--images", located / "flight", "--scale", "0.3", "-j", "1", "-o")
     assert "warning" not in rdstitch(*arguments, tmp_path / "same.jpg", "--strict").err
     image.write_bytes(image.read_bytes()[:-1] + b"x")
-    done = rdstitch(*arguments, tmp_path / "other.jpg")
-    assert (done.status, f"{image}: is not the image that field.tif.json was written with" in done.err) == (
-        0,
-        True,
-    )
-    done = rdstitch(*arguments, tmp_path / "strict.jpg", "--strict")
-    assert (done.status, str(image) in done.line) == (3, True)
+    rdstitch(*arguments, tmp_path / "other.jpg", told=f"{image}: is not the image that field.tif.json was written with")
+    rdstitch(*arguments, tmp_path / "strict.jpg", "--strict", status=3, told=str(image))
     image.unlink()
     assert "warning" not in rdstitch(*arguments, tmp_path / "alone.jpg", "--strict").err
 
@@ -216,25 +199,22 @@ def test_an_image_beside_any_sidecar_does_not_vanish(rdstitch: Run, located: Pat
     # What rdstitch wrote itself is no input of the next run, and that is said.
     for name in ("field.tif", "field.tif.json"):
         shutil.copy(located / name, flight)
-    done = rdstitch("mosaic", flight, "-o", tmp_path / "again.tif", *CACHED)
-    assert done.status == 0
-    assert "rdstitch wrote them: field.tif" in done.err
+    rdstitch("mosaic", flight, "-o", tmp_path / "again.tif", *CACHED, told="rdstitch wrote them: field.tif")
     assert read_image(tmp_path / "again.tif").pixels.shape == read_image(tmp_path / "out.tif").pixels.shape
     only = tmp_path / "only"
     only.mkdir()
     for name in ("field.tif", "field.tif.json"):
         shutil.copy(located / name, only)
-    assert "no images but those that rdstitch wrote" in rdstitch("mosaic", only, "-o", tmp_path / "x.tif").line
+    told = "no images but those that rdstitch wrote"
+    rdstitch("mosaic", only, "-o", tmp_path / "x.tif", status=3, told=told)
 
 
 def test_a_link_as_output(rdstitch: Run, located: Path, tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
     (tmp_path / "out.jpg").symlink_to("disk/image.jpg")
     arguments = ("apply", located / "field.tif.json", "--images", located / "flight", "--scale", "0.3", "-j", "1")
-    done = rdstitch(*arguments, "-o", tmp_path / "out.jpg", "--overwrite")
-    assert (done.status, "link to nothing" in done.line) == (6, True)
     (tmp_path / "disk" / "image.jpg").write_bytes(b"old")
-    assert rdstitch(*arguments, "-o", tmp_path / "out.jpg", "--overwrite").status == 0
+    rdstitch(*arguments, "-o", tmp_path / "out.jpg", "--overwrite")
     assert (tmp_path / "out.jpg").is_symlink()
     assert read_image(tmp_path / "disk" / "image.jpg").pixels.size > 0
 
@@ -246,45 +226,11 @@ def test_an_image_of_the_folder_is_never_replaced(rdstitch: Run, located: Path, 
     shutil.copytree(located / "flight", flight)
     first = sorted(flight.iterdir())[1]
     before, output = first.read_bytes(), flight / name.replace("frame_0001.jpg", first.name)
-    done = rdstitch("mosaic", flight, "-o", output, "--overwrite", *CACHED)
-    assert (done.status, "is read as input" in done.line) == (6, True)
+    rdstitch("mosaic", flight, "-o", output, "--overwrite", *CACHED, status=6, told="is read as input")
     assert first.read_bytes() == before
     # What rdstitch wrote there is replaced.
-    assert rdstitch("mosaic", flight, "-o", flight / "out.jpg", *CACHED).status == 0
-    assert rdstitch("mosaic", flight, "-o", flight / "out.jpg", "--overwrite", *CACHED).status == 0
-
-
-def test_a_list_of_images_and_of_times_is_never_replaced(rdstitch: Run, located: Path, tmp_path: Path) -> None:
-    images = sorted((located / "flight").iterdir())
-    names, times = tmp_path / "names.txt", tmp_path / "times.csv"
-    names.write_text("\n".join(map(str, images)))
-    times.write_text("".join(f"{image.name},{k}\n" for k, image in enumerate(images)))
-    for output in (names, times):
-        before = output.read_bytes()
-        arguments = ("trajectory", f"@{names}", "--timestamps", times, "-o", output, "--overwrite", *CACHED)
-        assert rdstitch(*arguments).status == 6
-        assert output.read_bytes() == before
-
-
-def test_what_an_option_names_to_be_read_is_never_replaced(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    masks, table = tmp_path / "masks", tmp_path / "attitudes.csv"
-    camera, configuration = tmp_path / "camera.json", tmp_path / "options.toml"
-    save_camera(Camera((400, 300), -0.2), camera)
-    configuration.write_text("[common]\nseed = 1\n", encoding="utf-8")
-    masks.mkdir()
-    shutil.copy(frames[0], masks / frames[0].name)
-    table.write_text("name,psi,theta\n" + "".join(f"{frame.name},0,0\n" for frame in frames), encoding="utf-8")
-    for command, file, given in (
-        ("mosaic", masks / frames[0].name, ("--mask", masks)),
-        ("pano", masks / frames[0].name, ("--mask", masks / frames[0].name)),
-        ("trajectory", table, ("--attitude", table)),
-        ("trajectory", camera, ("--camera", camera)),
-        ("trajectory", configuration, ("--config", configuration)),
-    ):
-        before = file.read_bytes()
-        done = rdstitch(command, *frames[:2], "-o", file, "--overwrite", *given)
-        assert (done.status, f"{file.name}: is read as input" in done.line) == (6, True)
-        assert file.read_bytes() == before
+    rdstitch("mosaic", flight, "-o", flight / "out.jpg", *CACHED)
+    rdstitch("mosaic", flight, "-o", flight / "out.jpg", "--overwrite", *CACHED)
 
 
 @pytest.mark.parametrize(
@@ -304,12 +250,11 @@ def test_what_belongs_beside_an_image_never_costs_the_image(
 
     monkeypatch.setattr(made_by, fail)
     output = tmp_path / ("field.jpg" if name.endswith(".jgw") else "field.dzi")
-    done = rdstitch(
+    rdstitch(
         *("mosaic", located / "flight", "-o", output, *FAST, "--report", tmp_path / "report.html"),
         *("--save-camera", tmp_path / "camera.json"),
+        told=f"{name}: not written, all else is: ValueError: drawn wrongly",
     )
-    assert done.status == 0
-    assert f"{name}: not written, all else is: ValueError: drawn wrongly" in done.err
     expected = {"report.html", "camera.json", output.name, f"{output.name}.json"}
     expected |= {"field.html", "field_files"} if output.suffix == ".dzi" else set()
     assert {file.name for file in tmp_path.iterdir()} == expected - {name}
@@ -320,6 +265,6 @@ def test_a_page_of_an_earlier_run_is_called_older(
     rdstitch: Run, located: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arguments = ("mosaic", located / "flight", "-o", tmp_path / "field.dzi", *FAST, "--overwrite")
-    assert rdstitch(*arguments).status == 0
+    rdstitch(*arguments)
     monkeypatch.setattr("rdstitch.pipeline.compose.viewer_page", lambda *_: 1 // 0)
     assert "the file of this name is older" in rdstitch(*arguments).err

@@ -134,15 +134,9 @@ def test_the_numbers_are_those_of_the_result(frames: list[Path]) -> None:
 
 def test_calibrate_has_no_mosaic(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     report = tmp_path / "lens.html"
-    done = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", "--report", report, *CACHED)
-    assert done.status == 0
+    rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", "--report", report, *CACHED)
     headings = [heading for heading in _SECTIONS if heading not in _OF_IMAGES]
     assert _checked(report.read_text(encoding="utf-8")).headings == headings
-    again = rdstitch("calibrate", *frames, "-o", tmp_path / "b.json", "--report", report, *CACHED)
-    assert (again.status, str(report) in again.line) == (6, True)
-    wrong = rdstitch("calibrate", *frames, "-o", tmp_path / "b.json", "--report", tmp_path / "report.pdf", *CACHED)
-    assert (wrong.status, ".html" in wrong.line) == (6, True)
-    assert not (tmp_path / "b.json").exists()
 
 
 @pytest.mark.parametrize(
@@ -156,13 +150,13 @@ def test_what_is_refused_is_shown(
     monkeypatch.setattr(accept, "messages_of", lambda *arguments: said)
     report = tmp_path / "report.html"
     arguments = (command, *frames[:2], "-o", tmp_path / output, "--report", report, *CACHED)
-    assert rdstitch(*arguments).status == 4
+    rdstitch(*arguments, status=4)
     assert not (tmp_path / output).exists()
     refused = _checked(report.read_text(encoding="utf-8"))
     assert refused.headings == [heading for heading in _SECTIONS if heading not in _OF_IMAGES]
     assert "Not to be relied on: the images <disagree>" in refused.text
     assert "look at that seam" in refused.text
-    assert rdstitch(*arguments, "--force", "--overwrite").status == 0
+    rdstitch(*arguments, "--force", "--overwrite")
     forced = _checked(report.read_text(encoding="utf-8"))
     assert ("Mosaic" in forced.headings) == (command != "calibrate")
     assert "the images <disagree>" in forced.text

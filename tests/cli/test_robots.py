@@ -14,7 +14,7 @@ from PIL import ExifTags, Image
 import rdstitch
 from rdstitch.alignment.trajectory import compare_trajectories
 from rdstitch.camera import Camera
-from rdstitch.synthetic import Photometry, Sequence, ground, parking_poses, sequence_over
+from rdstitch.synthetic import Photometry, ground, parking_poses, sequence_over
 from tests.cli.running import CACHED, DISTORTION, Run
 from tests.floor_drives import read_path, true_path
 
@@ -42,7 +42,7 @@ def video(frames: list[Path], tmp_path: Path) -> Path:
 
 def test_frames_of_a_video_keep_their_numbers_and_times(rdstitch: Run, video: Path, tmp_path: Path) -> None:
     output = tmp_path / "path.csv"
-    assert rdstitch("trajectory", video, "--every", "2", "-o", output, "--focal", "380", *CACHED).status == 0
+    rdstitch("trajectory", video, "--every", "2", "-o", output, "--focal", "380", *CACHED)
     rows = _rows(output)
     assert [row["source_frame"] for row in rows] == ["0", "2", "4"]
     assert [row["frame"] for row in rows] == ["0", "1", "2"]
@@ -51,7 +51,7 @@ def test_frames_of_a_video_keep_their_numbers_and_times(rdstitch: Run, video: Pa
 
     (tmp_path / "times.txt").write_text("".join(f"{100 + k}\n" for k in range(6)), encoding="utf-8")
     arguments = ("--every", "2", "--timestamps", tmp_path / "times.txt", "--format", "tum", "--focal", "380")
-    assert rdstitch("trajectory", video, *arguments, "-o", tmp_path / "path.tum", *CACHED).err == ""
+    rdstitch("trajectory", video, *arguments, "-o", tmp_path / "path.tum", *CACHED, err="")
     assert np.loadtxt(tmp_path / "path.tum")[:, 0].tolist() == [100.0, 102.0, 104.0]
 
 
@@ -67,8 +67,7 @@ def test_exif_tells_the_time(rdstitch: Run, frames: list[Path], tmp_path: Path) 
         with Image.open(frame) as image:
             image.save(folder / f"{number}.jpg", exif=exif, quality=97)
     output = tmp_path / "path.tum"
-    done = rdstitch("trajectory", folder, "-o", output, "--format", "tum", "--focal", "380", *CACHED)
-    assert (done.status, done.err) == (0, "")
+    rdstitch("trajectory", folder, "-o", output, "--format", "tum", "--focal", "380", *CACHED, err="")
     # date -d '2024-05-01 12:00:00 +02:00' +%s
     np.testing.assert_allclose(np.loadtxt(output)[:, 0], 1714557600.25 + np.arange(3), atol=1e-5)
 
@@ -82,12 +81,10 @@ def test_lists_of_time_stamps(rdstitch: Run, frames: list[Path], tmp_path: Path,
     ]
     times.write_text(header + "".join(lines), encoding="utf-8")
     known = ("--timestamps", times, "--focal", "380", *CACHED)
-    assert rdstitch("trajectory", *frames, "-o", tmp_path / "path.csv", *known).status == 0
+    rdstitch("trajectory", *frames, "-o", tmp_path / "path.csv", *known)
     assert [row["timestamp"] for row in _rows(tmp_path / "path.csv")] == ["10.500000", "11.500000", "12.500000"]
     times.write_text(header + lines[0], encoding="utf-8")
-    lacking = rdstitch("trajectory", *frames, "-o", tmp_path / "lacking.csv", *known)
-    assert lacking.status == 3
-    assert frames[1].name in lacking.line
+    rdstitch("trajectory", *frames, "-o", tmp_path / "lacking.csv", *known, status=3, told=frames[1].name)
 
 
 def test_without_times_numbers_stand_for_them_and_that_is_said(
@@ -101,8 +98,8 @@ def test_without_times_numbers_stand_for_them_and_that_is_said(
 
 def test_kitti_is_the_same_path(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     known = ("--focal", "380", *CACHED)
-    assert rdstitch("trajectory", *frames, "-o", tmp_path / "a.txt", "--format", "kitti", *known).status == 0
-    assert rdstitch("trajectory", *frames, "-o", tmp_path / "b.csv", "--frame", "camera", *known).status == 0
+    rdstitch("trajectory", *frames, "-o", tmp_path / "a.txt", "--format", "kitti", *known)
+    rdstitch("trajectory", *frames, "-o", tmp_path / "b.csv", "--frame", "camera", *known)
     poses = np.loadtxt(tmp_path / "a.txt").reshape(-1, 3, 4)
     rows = _rows(tmp_path / "b.csv")
     np.testing.assert_allclose(poses[:, :2, 3], [[float(r["x"]), float(r["y"])] for r in rows], atol=1e-8)
@@ -111,30 +108,6 @@ def test_kitti_is_the_same_path(rdstitch: Run, frames: list[Path], tmp_path: Pat
     )
     turn = np.arctan2(poses[:, 0, 1], poses[:, 0, 0])
     np.testing.assert_allclose(np.degrees(turn), [float(r["yaw_deg"]) for r in rows], atol=1e-6)
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_evo_reads_it_and_agrees_with_the_truth(
-    rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path
-) -> None:
-    file_interface = pytest.importorskip("evo.tools.file_interface")
-    metrics, sync = pytest.importorskip("evo.core.metrics"), pytest.importorskip("evo.core.sync")
-    times = tmp_path / "times.txt"
-    times.write_text("".join(f"{0.5 * k}\n" for k in range(3)), encoding="utf-8")
-    known = ("--focal", str(sequence.lens.focal), "--timestamps", times, "--format", "tum")
-    assert rdstitch("trajectory", *frames, "-o", tmp_path / "found.tum", *known, *CACHED).status == 0
-    poses = sequence.poses
-    lines = [
-        f"{0.5 * k} {x} {y} {-height} 0 0 {np.sin(-yaw / 2)} {np.cos(-yaw / 2)}"
-        for k, ((x, y), yaw, height) in enumerate(zip(poses.position, poses.yaw, poses.height, strict=True))
-    ]
-    (tmp_path / "true.tum").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    truth, found = (file_interface.read_tum_trajectory_file(str(tmp_path / f"{n}.tum")) for n in ("true", "found"))
-    truth, found = sync.associate_trajectories(truth, found)
-    found.align(truth, correct_scale=True)
-    error = metrics.APE(metrics.PoseRelation.translation_part)
-    error.process_data((truth, found))
-    assert error.get_statistic(metrics.StatisticsType.rmse) < 0.01 * truth.path_length
 
 
 def _write_bag(folder: Path, frames: list[Path], version: int, kind: str) -> Path:
@@ -192,25 +165,20 @@ def test_a_bag_is_as_good_as_its_frames(
 ) -> None:
     bag = _write_bag(tmp_path, frames, version, kind)
     output = tmp_path / "path.csv"
-    done = rdstitch("trajectory", bag, "-o", output, "--focal", "380", *CACHED)
-    assert (done.status, done.err) == (0, "")
+    done = rdstitch("trajectory", bag, "-o", output, "--focal", "380", *CACHED, err="")
     of_files = rdstitch("trajectory", *frames, "-o", tmp_path / "files.csv", "--focal", "380", *CACHED)
     assert done.out == of_files.out
     assert abs(float(done.out) - DISTORTION) < 0.01
     assert [row["timestamp"] for row in _rows(output)] == ["1000.000000", "1000.500000", "1001.000000"]
-    wrong = rdstitch("mosaic", bag, "--topic", "/other", "-o", tmp_path / "out.png", *CACHED)
-    assert wrong.status == 3
-    assert "/camera" in wrong.line
+    rdstitch("mosaic", bag, "--topic", "/other", "-o", tmp_path / "out.png", *CACHED, status=3, told="/camera")
 
 
 def test_what_is_no_bag_is_named(rdstitch: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bag = tmp_path / "broken.bag"
     bag.write_bytes(b"#ROSBAG V2.0\nbroken")
-    done = rdstitch("mosaic", bag, "-o", tmp_path / "out.png", *CACHED)
-    assert done.status == 3
-    assert "broken.bag" in done.line
+    rdstitch("mosaic", bag, "-o", tmp_path / "out.png", *CACHED, status=3, told="broken.bag")
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
-    assert "rdstitch[ros]" in rdstitch("mosaic", bag, "-o", tmp_path / "out.png", *CACHED).line
+    assert "rdstitch[ros]" in rdstitch("mosaic", bag, "-o", tmp_path / "out.png", *CACHED, status=3).line
 
 
 def test_a_calibrated_focal_length_is_as_sure_as_it_was(rdstitch: Run, tmp_path: Path) -> None:
@@ -221,7 +189,6 @@ def test_a_calibrated_focal_length_is_as_sure_as_it_was(rdstitch: Run, tmp_path:
     drive.write(folder)
     file = tmp_path / "camera.json"
     done = rdstitch("calibrate", folder, "-o", file, *CACHED)
-    assert done.status == 0
     camera = Camera.load(file)
     focal, psi, theta = (
         re.search(rf"{name}([-.\d]+) ± ([.\d]+)", done.err) for name in ("focal length ", "ψ = ", "θ = ")

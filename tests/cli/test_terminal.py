@@ -58,8 +58,7 @@ def test_the_bar_is_gone_before_lambda(monkeypatch: pytest.MonkeyPatch, capfd: p
 
 
 def test_preview_is_small_and_leaves_what_is_given(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("pano", *frames, "-o", tmp_path / "small.png", "--preview", "--max-size", "200", "-j", "1")
-    assert done.status == 0
+    rdstitch("pano", *frames, "-o", tmp_path / "small.png", "--preview", "--max-size", "200", "-j", "1")
     assert 190 <= max(read_image(tmp_path / "small.png").pixels.shape[:2]) <= 200
 
 
@@ -67,16 +66,15 @@ def test_quality_makes_files_smaller(rdstitch: Run, frames: list[Path], tmp_path
     sizes = []
     for quality in ("95", "40"):
         file = tmp_path / f"q{quality}.jpg"
-        assert rdstitch("pano", *frames, "-o", file, "--quality", quality, *CACHED).status == 0
+        rdstitch("pano", *frames, "-o", file, "--quality", quality, *CACHED)
         sizes.append(file.stat().st_size)
     assert sizes[1] < 0.5 * sizes[0]
-    assert rdstitch("pano", *frames, "-o", tmp_path / "q.jpg", "--quality", "0", *CACHED).status == 2
 
 
 def test_help_is_a_command_too(rdstitch: Run) -> None:
     assert rdstitch("help").out == rdstitch("--help").out
     assert rdstitch("help", "pano").out == rdstitch("pano", "--help").out
-    assert rdstitch("help", "stitch").status == 2
+    rdstitch("help", "stitch", status=2)
     assert rdstitch("help", "no-overlap").out == rdstitch("help", "[no-overlap]").out
     assert "`rdstitch help left-out`" in rdstitch("help", "not-reliable").out
     assert rdstitch("-V").out == rdstitch("--version").out
@@ -116,7 +114,7 @@ def test_tilde_is_the_home_folder_where_no_shell_saw_it(
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("USERPROFILE", str(tmp_path))
-    assert rdstitch("pano", *frames, "--output=~/pano.png", *CACHED).status == 0
+    rdstitch("pano", *frames, "--output=~/pano.png", *CACHED)
     assert (tmp_path / "pano.png").exists()
     assert UserPath().convert("~no-such-user/x", None, None) == Path("~no-such-user/x")
 
@@ -125,5 +123,5 @@ def test_patterns_are_expanded_where_the_shell_leaves_them(rdstitch: Run, frames
     pattern = str(frames[0].parent / "*.png")
     done = rdstitch("pano", pattern, "-o", tmp_path / "pano.png", *CACHED)
     assert "3 of 3 images" in done.made
-    assert rdstitch("undistort", pattern, "-o", tmp_path / "straight", "--lambda", "-0.2").status == 0
+    rdstitch("undistort", pattern, "-o", tmp_path / "straight", "--lambda", "-0.2")
     assert len(list((tmp_path / "straight").iterdir())) == 3

@@ -15,8 +15,7 @@ from tests.cli.running import DISTORTION, FAST, Run
 def test_undistorted_pixels_are_where_the_model_says(
     rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path
 ) -> None:
-    done = rdstitch("undistort", *frames, "--lambda", str(DISTORTION), "-o", tmp_path / "new" / "folder")
-    assert (done.status, done.out, done.err) == (0, "", "")
+    rdstitch("undistort", *frames, "--lambda", str(DISTORTION), "-o", tmp_path / "new" / "folder", out="", err="")
     written = sorted((tmp_path / "new" / "folder").iterdir())
     assert [path.name for path in written] == [path.name for path in frames]
     straight, bent = read_image(written[0]).pixels, read_image(frames[0]).pixels
@@ -36,8 +35,7 @@ def test_undistorted_pixels_are_where_the_model_says(
 def test_views(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     shown = {}
     for view in ("same", "valid", "all"):
-        done = rdstitch("undistort", frames[0], "--lambda", "-0.2", "-o", tmp_path / view, "--view", view)
-        assert done.status == 0
+        rdstitch("undistort", frames[0], "--lambda", "-0.2", "-o", tmp_path / view, "--view", view)
         shown[view] = read_image(tmp_path / view / frames[0].name)
     sizes = {view: np.array(image.pixels.shape[:2]) for view, image in shown.items()}
     assert sizes["same"].tolist() == [300, 400]
@@ -46,23 +44,6 @@ def test_views(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     assert (sizes["valid"] < sizes["all"]).all()
     assert shown["valid"].alpha is None
     assert shown["all"].alpha is not None
-
-
-def test_refuses_no_lens_and_two_lenses(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    assert rdstitch("undistort", frames[0], "-o", tmp_path / "new").status == 2
-    Camera((400, 300), distortion=-0.1).save(tmp_path / "camera.json")
-    both = ("--lambda", "-0.1", "--camera", tmp_path / "camera.json")
-    assert rdstitch("undistort", frames[0], "-o", tmp_path / "new", *both).status == 2
-    assert not (tmp_path / "new").exists()
-
-
-def test_refuses_to_write_over_its_input(rdstitch: Run, tmp_path: Path, frames: list[Path]) -> None:
-    own = tmp_path / "own.png"
-    own.write_bytes(frames[0].read_bytes())
-    done = rdstitch("undistort", own, "--lambda", "-0.1", "-o", tmp_path, "--overwrite")
-    assert done.status == 6
-    assert str(own) in done.line
-    assert own.read_bytes() == frames[0].read_bytes()
 
 
 def test_own_outputs_and_damaged_images_are_named(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
@@ -74,10 +55,8 @@ def test_own_outputs_and_damaged_images_are_named(rdstitch: Run, frames: list[Pa
     data = bytearray((images / "damaged.jpg").read_bytes())
     data[len(data) // 2 : len(data) // 2 + 40] = bytes(range(100, 140))
     (images / "damaged.jpg").write_bytes(bytes(data))
-    assert rdstitch("pano", *frames[:2], "-o", images / "mosaic.png", *FAST).status == 0
-    done = rdstitch("undistort", images, "--lambda", "-0.1", "-o", tmp_path / "straight")
-    assert done.status == 0
-    assert "mosaic.png" in done.err
+    rdstitch("pano", *frames[:2], "-o", images / "mosaic.png", *FAST)
+    done = rdstitch("undistort", images, "--lambda", "-0.1", "-o", tmp_path / "straight", told="mosaic.png")
     assert "damaged.jpg: is damaged" in done.err
     assert sorted(path.name for path in (tmp_path / "straight").iterdir()) == ["damaged.jpg", "good.jpg"]
 
@@ -105,7 +84,7 @@ def test_focal_lengths_in_what_is_written_are_true(rdstitch: Run, tmp_path: Path
             image.save(path, exif=exif, quality=95)
     before = read_metadata(path)
     assert before.focal_px is not None
-    assert rdstitch("undistort", path, "--lambda", "-0.3", "-o", tmp_path / view, "--view", view).status == 0
+    rdstitch("undistort", path, "--lambda", "-0.3", "-o", tmp_path / view, "--view", view)
     after = read_metadata(tmp_path / view / "a.jpg")
     assert after.gps is not None
     # The scale at the centre stays, and the focal length with it.
@@ -122,7 +101,7 @@ def test_a_mosaic_has_no_lens_and_no_place_of_one_image(rdstitch: Run, frames: l
     for frame in frames:
         paths.append(tmp_path / f"{frame.stem}.jpg")
         Image.open(frame).convert("RGB").save(paths[-1], exif=exif, quality=95)
-    assert rdstitch("pano", *paths, "-o", tmp_path / "out.jpg", *FAST).status == 0
+    rdstitch("pano", *paths, "-o", tmp_path / "out.jpg", *FAST)
     found = read_metadata(tmp_path / "out.jpg")
     assert (found.focal_px, found.gps, found.exposure) == (None, None, None)
     assert (found.make, found.timestamp) == ("Maker", read_metadata(paths[0]).timestamp)
@@ -135,11 +114,10 @@ def test_formats_that_cannot_be_written_become_png(rdstitch: Run, frames: list[P
     for suffix in suffixes:
         Image.open(frames[0]).convert("RGB").save(tmp_path / f"{suffix}.{suffix}")
     images = [tmp_path / f"{suffix}.{suffix}" for suffix in suffixes]
-    assert rdstitch("undistort", *images, "--lambda", "-0.1", "-o", tmp_path / "out").status == 0
+    rdstitch("undistort", *images, "--lambda", "-0.1", "-o", tmp_path / "out")
     expected = ["JPEG.JPEG", *sorted(f"{suffix}.png" for suffix in suffixes[:-1])]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == expected
-    done = rdstitch("undistort", *images, "--lambda", "-0.1", "-o", tmp_path / "tif", "--format", "tif")
-    assert done.status == 0
+    rdstitch("undistort", *images, "--lambda", "-0.1", "-o", tmp_path / "tif", "--format", "tif")
     assert {path.suffix for path in (tmp_path / "tif").iterdir()} == {".tif"}
 
 
@@ -151,8 +129,7 @@ def test_what_fails_leaves_no_folder(rdstitch: Run, frames: list[Path], tmp_path
     twice.mkdir()
     (twice / broken.name).write_bytes(b"x")
     for inputs in ([broken], [frames[0], twice / broken.name]):
-        done = rdstitch("undistort", *inputs, "--lambda", "-0.1", "-o", tmp_path / "a" / "b")
-        assert done.status == 3
+        rdstitch("undistort", *inputs, "--lambda", "-0.1", "-o", tmp_path / "a" / "b", status=3)
         assert not (tmp_path / "a").exists()
 
 
@@ -164,9 +141,7 @@ def test_a_camera_file_without_a_size_takes_it_from_the_images(
     values = "distortion_coefficients:\n   rows: 1\n   cols: 5\n   data: [-0.2, 0.05, 0., 0., 0.]\n"
     camera.write_text("%YAML:1.0\n---\n" + matrix + values)
     done = rdstitch("undistort", frames[0], "--camera", camera, "-o", tmp_path / "out")
-    assert done.status == 0
     assert "focal lengths along x and y differ by 5.7%" in done.err
     (tmp_path / "list").write_text(str(tmp_path / "absent.png"))
-    done = rdstitch("undistort", f"@{tmp_path / 'list'}", "--camera", camera, "-o", tmp_path / "none")
-    assert done.status == 3
+    done = rdstitch("undistort", f"@{tmp_path / 'list'}", "--camera", camera, "-o", tmp_path / "none", status=3)
     assert "has no image size; add image_width and image_height" in done.line

@@ -1,6 +1,8 @@
-"""Images that are unusual, yet images: stitched like any other."""
+"""Images and names that are unusual, yet usable: stitched like any other."""
 
 import json
+import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from PIL import Image
 
 from rdstitch.io import read_image
 from tests.cli.faulty import Make
-from tests.cli.running import CACHED, DISTORTION, Run, check_refused
+from tests.cli.running import CACHED, DISTORTION, Run, finished, start
 
 
 def _saved(good: Path, file: Path, change: Callable[[Image.Image], Image.Image], **options: Any) -> Path:
@@ -77,17 +79,45 @@ def _hostile_exif(good: Path, folder: Path) -> Path:
 )
 def test_unusual_images_are_stitched(rdstitch: Run, place: Path, make: Make) -> None:
     odd = make(place / "b.png", place)
-    done = rdstitch("pano", place / "a.png", odd, "-o", place / "out.tif", *CACHED)
-    assert (done.status, done.err) == (0, "")
+    done = rdstitch("pano", place / "a.png", odd, "-o", place / "out.tif", *CACHED, err="")
     assert abs(float(done.out) - DISTORTION) < 0.02
     record = json.loads((place / "out.tif.json").read_text(encoding="utf-8"))
     assert all(image["used"] for image in record["images"])
     assert [image["size"] for image in record["images"]] == [[400, 300]] * 2
 
 
-def test_samples_of_two_kinds_arecheck_refused(rdstitch: Run, place: Path) -> None:
-    deep = place / "deep.png"
-    assert cv2.imwrite(str(deep), read_image(place / "b.png").pixels.astype(np.uint16) * 257)
-    done = rdstitch("pano", place / "a.png", deep, "-o", place / "out.png", *CACHED)
-    check_refused(done, 3, deep)
-    assert not (place / "out.png").exists()
+@pytest.mark.parametrize(
+    "name",
+    [
+        "two\nlines.png",
+        os.fsdecode(b"caf\xe9.png"),
+        "-o.png",
+        "[1]*.png",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("a b.png", "it's.png", 'say "x".png', "π.png")),
+    ],
+)
+def test_odd_names_work(place: Path, name: str) -> None:
+    image, output = place / name, place / f"out {name}"
+    (place / "b.png").rename(image)
+    done = finished(start("pano", place / "a.png", image, "-o", output, *CACHED))
+    assert (done.status, done.err) == (0, "")
+    assert output.exists()
+    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    assert len(record["images"]) == 2
+
+
+def test_images_that_nobody_here_can_read_are_named(
+    rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for package in ("pillow_heif", "rawpy"):
+        monkeypatch.setitem(sys.modules, package, None)
+    for name in ("new.HEIC", "other.dng", "a.dng"):
+        (place / name).write_bytes(b"raw")
+    # One that is no sidecar lies beside an image, too.
+    (place / "a.png.json").write_text("[" * 100_000, encoding="utf-8")
+    monkeypatch.chdir(place.parent)
+    lines = sorted(rdstitch("mosaic", place.name, "-o", place / "out.tif", *CACHED).err.splitlines())
+    # That of a raw file that has its JPEG beside it goes without saying.
+    assert [line.split(":")[2].strip().rpartition("/")[2] for line in lines] == ["new.HEIC", "other.dng"]
+    assert all("convert it to JPEG or TIFF" in line for line in lines)
+    rdstitch("pano", place / "a.png", place / "other.dng", "-o", place / "new.png", *CACHED, status=3)

@@ -39,8 +39,7 @@ def _source(url: str) -> Source:
 
 
 @pytest.mark.parametrize(
-    "url",
-    ["s3://bucket/a/b.jpg", "https://host.org/b.jpg", "file:///tmp/b.jpg", "simplecache::s3://bucket/b.jpg"],
+    "url", ["s3://bucket/a/b.jpg", "https://host.org/b.jpg", "file:///tmp/b.jpg", "simplecache::s3://bucket/b.jpg"]
 )
 def test_a_url_survives_as_a_path(url: str) -> None:
     assert is_url(url)

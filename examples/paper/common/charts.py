@@ -78,14 +78,8 @@ def undistorted(camera: Camera, points: FloatArray) -> FloatArray:
 def before_and_after(file: Path, camera: Camera, to_grid: FloatArray, size: tuple[float, float], px: float) -> Pixels:
     """An image beside itself, undistorted and rectified.
 
-    Parameters
-    ----------
-    camera : Camera
-        With the λ that undistorts it.
-    to_grid : ndarray of shape (3, 3)
-        Undistorted half diagonals to grid coordinates, of which the square from (0, 0) to ``size`` is drawn.
-    px : float
-        Size of a square.
+    ``camera``: with the λ that undistorts it. ``to_grid``: undistorted half diagonals to grid coordinates, of which the
+    square from (0, 0) to ``size`` is drawn; shape (3, 3). ``px``: size of a square.
     """
     width, height = (round(px * extent) for extent in size)
     frame = np.array([(0.0, 0.0), (width - 1.0, 0.0), (width - 1.0, height - 1.0), (0.0, height - 1.0)])

@@ -22,18 +22,12 @@ HOMLIB: tuple[tuple[str, str, tuple[bool, ...]], ...] = (
 class Contender:
     """A minimal solver.
 
-    Attributes
-    ----------
-    name : str
-    points : int
-        Correspondences that it needs.
-    solve : callable
-        Takes the points of the instances (B, points, 2), both images, and their true tilts (B, 2), which only
-        solvers for a known tilt look at.
+    ``solve``: takes the points of the instances (B, points, 2), both images, and their true tilts (B, 2), which only
+    solvers for a known tilt look at.
     """
 
     name: str
-    points: int
+    points: int  # correspondences that it needs
     solve: Callable[[FloatArray, FloatArray, FloatArray], Solutions]
 
     def __call__(self, instances: PlanarInstances) -> Solutions:

@@ -34,24 +34,12 @@ class FramePair:
 
 @dataclass(frozen=True)
 class Drive:
-    """A robot's drive.
+    """A robot's drive."""
 
-    Attributes
-    ----------
-    camera : Camera
-        The true one.
-    tilt : (float, float)
-        (ψ, θ), radians.
-    poses : Poses
-        True ones.
-    pairs : tuple of FramePair
-        Consecutive frames and frames two and four apart.
-    """
-
-    camera: Camera
-    tilt: tuple[float, float]
-    poses: Poses
-    pairs: tuple[FramePair, ...]
+    camera: Camera  # the true one
+    tilt: tuple[float, float]  # (ψ, θ), radians
+    poses: Poses  # true ones
+    pairs: tuple[FramePair, ...]  # consecutive frames and frames two and four apart
 
     @property
     def truth(self) -> Trajectory:
@@ -70,14 +58,7 @@ class Drive:
 def drive(path: str, frames: int, *, seed: int, noise: float = 0.5) -> Drive:
     """One of :data:`PATHS`, seen by a tilted camera with strong barrel distortion.
 
-    Parameters
-    ----------
-    path : str
-    frames : int
-    seed : int
-        Of the matches.
-    noise : float
-        Standard deviation of the noise of the points, px.
+    ``seed``: of the matches. ``noise``: standard deviation of the noise of the points, px.
     """
     camera = Camera((640, 480), -0.3, focal=520.0, focal_source="option")
     tilt = (np.radians(4.0), np.radians(-3.0))
@@ -96,13 +77,8 @@ def drive(path: str, frames: int, *, seed: int, noise: float = 0.5) -> Drive:
 def estimated_links(pairs: Iterable[FramePair], camera: Camera, solver: SolverName = "auto") -> list[Link]:
     """What rdstitch makes of each pair, for the adjustment; pairs for which it finds nothing are left out.
 
-    Parameters
-    ----------
-    pairs : iterable of FramePair
-    camera : Camera
-        Of all frames, as far as it is known before.
-    solver : str
-        See :func:`rdstitch.estimate_radial_homography`.
+    ``camera``: of all frames, as far as it is known before. ``solver``: see
+    :func:`rdstitch.estimate_radial_homography`.
     """
     links = []
     for pair in pairs:

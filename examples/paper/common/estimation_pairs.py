@@ -28,22 +28,14 @@ _RATIO = 0.9  # loose, so that the estimators have something to do
 class JudgedPair:
     """Matches of two images of a plane through one lens, and where points truly go.
 
-    Attributes
-    ----------
-    points1, points2 : ndarray of shape (N, 2)
-        Matches, px.
-    image_size : (int, int)
-        Of both images.
-    distortion : float
-        True λ.
-    grid1, grid2 : ndarray of shape (M, 2)
-        Places all over what both images show, px in either.
+    ``points1``, ``points2``: matches, px; shape (N, 2). ``grid1``, ``grid2``: places all over what both images show, px
+    in either; shape (M, 2).
     """
 
     points1: FloatArray
     points2: FloatArray
-    image_size: tuple[int, int]
-    distortion: float
+    image_size: tuple[int, int]  # of both images
+    distortion: float  # true λ
     grid1: FloatArray
     grid2: FloatArray
 
@@ -51,10 +43,7 @@ class JudgedPair:
 def rendered_pairs(count: int, distortion: float, *, free: bool, seed: int) -> Iterator[JudgedPair]:
     """Pairs of a floor; λ is uniform from ``distortion`` to 0. Those that show nothing in common are left out.
 
-    Parameters
-    ----------
-    free : bool
-        The camera moves freely; a planar motion with one tilt otherwise.
+    ``free``: the camera moves freely; a planar motion with one tilt otherwise.
     """
     for number in range(count):
         rng = np.random.default_rng((seed, number))

@@ -38,11 +38,7 @@ class Estimate:
 class Estimator:
     """A way to estimate.
 
-    Attributes
-    ----------
-    name : str
-    run : callable
-        Takes matches, px (N, 2), and the size of the images.
+    ``run``: takes matches, px (N, 2), and the size of the images.
     """
 
     name: str
@@ -51,20 +47,11 @@ class Estimator:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What became of one pair.
+    """What became of one pair."""
 
-    Attributes
-    ----------
-    error : float
-        Mean distance from the truth over what both images show, px of image 2; inf without an estimate.
-    distortion_error : float
-    seconds : float
-        Of processor time.
-    """
-
-    error: float
+    error: float  # mean distance from the truth over what both images show, px of image 2; inf without an estimate
     distortion_error: float
-    seconds: float
+    seconds: float  # of processor time
 
 
 def installed_estimators() -> tuple[list[Estimator], tuple[str, ...]]:

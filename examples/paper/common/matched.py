@@ -20,25 +20,15 @@ Tilt = tuple[float, float]
 class MatchedPair:
     """Matches of two images.
 
-    Attributes
-    ----------
-    name : str
-    points1, points2 : ndarray of shape (N, 2)
-        Measured px.
-    quality : ndarray of shape (N,)
-        The higher, the more distinctive.
-    camera : Camera
-        Size and focal length; its λ is 0.
-    tilt : (float, float)
-        True tilt (ψ, θ), radians; where it is not known, that of a levelled camera.
+    ``points1``, ``points2``: measured px; shape (N, 2).
     """
 
     name: str
     points1: FloatArray
     points2: FloatArray
-    quality: FloatArray
-    camera: Camera
-    tilt: Tilt = (0.0, 0.0)
+    quality: FloatArray  # the higher, the more distinctive; shape (N,)
+    camera: Camera  # size and focal length; its λ is 0
+    tilt: Tilt = (0.0, 0.0)  # true tilt (ψ, θ), radians; where it is not known, that of a levelled camera
 
 
 def rendered_pair(

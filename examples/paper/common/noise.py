@@ -26,21 +26,11 @@ WITNESSES = 20
 
 @dataclass(frozen=True)
 class NoiseSweep:
-    """Median errors of several solvers; each array has shape (noise levels,).
+    """Median errors of several solvers; each array has shape (noise levels,)."""
 
-    Attributes
-    ----------
-    nearest : dict of str to ndarray
-        ``|λ - λ_true|`` of the solution nearest to the truth.
-    chosen : dict of str to ndarray
-        The same of the solution that the witnesses choose.
-    homography : dict of str to ndarray
-        Distance of the nearest solution's H.
-    """
-
-    nearest: dict[str, FloatArray]
-    chosen: dict[str, FloatArray]
-    homography: dict[str, FloatArray]
+    nearest: dict[str, FloatArray]  # ``|λ - λ_true|`` of the solution nearest to the truth
+    chosen: dict[str, FloatArray]  # the same of the solution that the witnesses choose
+    homography: dict[str, FloatArray]  # distance of the nearest solution's H
 
     def table(self, title: str, what: str) -> Table:
         """One of the three as a table with a column a noise level."""
@@ -60,11 +50,7 @@ class NoiseSweep:
 def sweep(contenders: Sequence[Contender], draw: Callable[[float, int], PlanarInstances]) -> NoiseSweep:
     """Solve instances at every noise level.
 
-    Parameters
-    ----------
-    contenders : sequence of Contender
-    draw : callable
-        Gives instances of 5 + ``WITNESSES`` points for a noise, focal lengths, and a seed.
+    ``draw``: gives instances of 5 + ``WITNESSES`` points for a noise, focal lengths, and a seed.
     """
     result = NoiseSweep({}, {}, {})
     for level, sigma in enumerate(SIGMAS):

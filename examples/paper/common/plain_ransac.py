@@ -26,12 +26,7 @@ _SOLUTIONS_AT_ONCE = 100
 def all_solvers(camera: Camera, tilt: tuple[float, float]) -> list[MinimalSolver]:
     """All minimal solvers, ours and, where it is installed, homlib's, in the half-diagonal frame.
 
-    Parameters
-    ----------
-    camera : Camera
-        With a focal length.
-    tilt : (float, float)
-        (ψ, θ), radians, for the solvers that are told it.
+    ``camera``: with a focal length. ``tilt``: (ψ, θ), radians, for the solvers that are told it.
     """
     assert camera.focal is not None
     given = partial(minimal_solvers, camera.focal / camera.half_diagonal, 0.01)

@@ -19,18 +19,10 @@ _WARP = 0.25  # of the sides, by which corners of made scenes are moved
 
 @dataclass(frozen=True)
 class PlanarScene:
-    """Images of one plane, taken without distortion.
+    """Images of one plane, taken without distortion."""
 
-    Attributes
-    ----------
-    images : sequence of callables
-        Each gives one.
-    homographies : sequence of ndarray of shape (3, 3)
-        From the first image to each, px; the first is the identity.
-    """
-
-    images: Sequence[Callable[[], Pixels]]
-    homographies: Sequence[FloatArray]
+    images: Sequence[Callable[[], Pixels]]  # each gives one
+    homographies: Sequence[FloatArray]  # from the first image to each, px; the first is the identity; shape (3, 3)
 
 
 def read_scenes(folder: Path) -> list[PlanarScene]:

@@ -16,20 +16,11 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Table:
-    """Measured numbers.
-
-    Attributes
-    ----------
-    title : str
-    header : tuple of str
-        Names of the columns, with their units.
-    rows : tuple of tuple
-        Text and numbers; a number is printed with three digits, None as a dash.
-    """
+    """Measured numbers."""
 
     title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[object, ...], ...]
+    header: tuple[str, ...]  # names of the columns, with their units
+    rows: tuple[tuple[object, ...], ...]  # text and numbers; a number is printed with three digits, None as a dash
 
     def column(self, name: str) -> list[Any]:
         """Values of one column."""
@@ -54,21 +45,13 @@ class Table:
 class Report:
     """Result of one figure.
 
-    Attributes
-    ----------
-    tables : tuple of Table
-    draw : callable, optional
-        Draws the plot on an empty matplotlib Figure.
-    images : mapping of str to ndarray of shape (h, w) or (h, w, 3)
-        Images to be saved, by file name.
-    notes : tuple of str
-        What was left out, and why: one line each.
+    ``images``: images to be saved, by file name; shape (h, w) or (h, w, 3).
     """
 
     tables: tuple[Table, ...]
-    draw: Draw | None = None
+    draw: Draw | None = None  # draws the plot on an empty matplotlib Figure
     images: Mapping[str, Pixels] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what was left out, and why: one line each
 
     def __str__(self) -> str:
         """All tables, then the notes."""

@@ -19,21 +19,14 @@ class Effort(enum.Enum):
 class Settings:
     """What every figure is given.
 
-    Attributes
-    ----------
-    effort : Effort
-    images : Path
-        Folder of the real sequences (``garfield_red``, ``copr``); figures do without those that are absent.
-    peer_python : str, optional
-        Python that has the package stitching, which brings an OpenCV of its own; the one that runs if not given.
-    hpatches : Path, optional
-        Folder of HPatches' sequences.
+    ``peer_python``: Python that has the package stitching, which brings an OpenCV of its own; the one that runs if not
+    given.
     """
 
     effort: Effort
-    images: Path
+    images: Path  # folder of the real sequences (``garfield_red``, ``copr``); figures do without those that are absent
     peer_python: str | None = None
-    hpatches: Path | None = None
+    hpatches: Path | None = None  # folder of HPatches' sequences
 
     def count(self, tiny: int, small: int, full: int) -> int:
         """The one of three counts that the effort allows."""

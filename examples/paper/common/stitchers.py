@@ -25,12 +25,8 @@ _HUGIN = (
 class Stitcher:
     """A program that makes a mosaic of images.
 
-    Attributes
-    ----------
-    name : str
-    commands : callable
-        Takes the images, the file to write, and the horizontal field of view in degrees, which only the
-        hand-written recipe looks at; gives the commands.
+    ``commands``: takes the images, the file to write, and the horizontal field of view in degrees, which only the
+    hand-written recipe looks at; gives the commands.
     """
 
     name: str
@@ -40,10 +36,7 @@ class Stitcher:
 def installed_stitchers(peer_python: str | None) -> tuple[list[Stitcher], tuple[str, ...]]:
     """The stitchers that are here, and a note for each that is not.
 
-    Parameters
-    ----------
-    peer_python : str, optional
-        Python that has the package stitching; this one if not given.
+    ``peer_python``: Python that has the package stitching; this one if not given.
     """
     found = [
         Stitcher("rdstitch mosaic", _worker(sys.executable, "rdstitch")),

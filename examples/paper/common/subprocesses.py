@@ -15,27 +15,13 @@ _SAID = 120  # characters of a program's last line that are kept
 
 @dataclass(frozen=True)
 class Run:
-    """What became of one or several programs run one after the other.
+    """What became of one or several programs run one after the other."""
 
-    Attributes
-    ----------
-    status : int or None
-        Exit status of the last one that ran; negative for a signal, None when the time was up.
-    seconds : float
-        Wall time.
-    processor_seconds : float
-        Processor time of all of them; of one that was ended, without what its own children used.
-    megabytes : float
-        Largest resident memory of any of them, 10⁶ bytes.
-    said : str
-        Last line on standard error.
-    """
-
-    status: int | None
-    seconds: float
-    processor_seconds: float
-    megabytes: float
-    said: str
+    status: int | None  # exit status of the last one that ran; negative for a signal, None when the time was up
+    seconds: float  # wall time
+    processor_seconds: float  # processor time of all of them; of one that was ended, without what its own children used
+    megabytes: float  # largest resident memory of any of them, 10⁶ bytes
+    said: str  # last line on standard error
 
     @property
     def ok(self) -> bool:
@@ -46,13 +32,7 @@ class Run:
 def run_all(commands: Sequence[Sequence[str]], folder: Path, timeout: float) -> Run:
     """Run commands one after the other until one fails or the time is up.
 
-    Parameters
-    ----------
-    commands : sequence of sequence of str
-    folder : path
-        Working directory.
-    timeout : float
-        Seconds for all of them.
+    ``folder``: working directory. ``timeout``: seconds for all of them.
     """
     begun = time.perf_counter()
     status: int | None = 0

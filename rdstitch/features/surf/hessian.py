@@ -47,7 +47,7 @@ def from_level(points: FloatArray, level: int) -> FloatArray:
 
 
 def vertex(values: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Where the quadric through each neighbourhood is largest (Brown and Lowe, BMVC 2002).
+    """Locate the maximum of the quadric through each neighbourhood (Brown and Lowe, BMVC 2002).
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def _maxima(
     determinant: NDArray[np.float32], threshold: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """Layer, row and column of the values above the threshold that exceed all 26 neighbours."""
-    found = []
+    maxima = []
     kernel = np.ones((3, 3), np.uint8)
     for layer in range(1, len(determinant) - 1):
         values = determinant[layer]
@@ -225,8 +225,8 @@ def _maxima(
         row, column = row[inside], column[inside]
         around = _neighbourhoods(determinant, np.full(len(row), layer), row, column).reshape(-1, 27)
         unique = (around >= around[:, 13:14]).sum(axis=1) == 1
-        found.append((np.full(int(unique.sum()), layer), row[unique], column[unique]))
-    layers, rows, columns = (np.concatenate(part) for part in zip(*found, strict=True))
+        maxima.append((np.full(int(unique.sum()), layer), row[unique], column[unique]))
+    layers, rows, columns = (np.concatenate(part) for part in zip(*maxima, strict=True))
     return layers, rows, columns
 
 

@@ -151,11 +151,7 @@ def _numbers(values: list[Any]) -> list[float]:
 def _camera_info(text: str) -> Parsed:
     record = parse_yaml(text, "camera_info.yaml")
     fx, _, cx, _, fy, cy = _numbers(record["camera_matrix"]["data"])[:6]
-    return (
-        [fx, fy, cx, cy],
-        _numbers(record["distortion_coefficients"]["data"]),
-        record["distortion_model"],
-    )
+    return ([fx, fy, cx, cy], _numbers(record["distortion_coefficients"]["data"]), record["distortion_model"])
 
 
 def _camera_chain(text: str) -> Parsed:

@@ -348,8 +348,7 @@ def test_memory_limit_is_checked_before_the_work() -> None:
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{"blend": "soft"}, {"seam": ""}, {"tile_size": 300}, {"bands": 0}, {"scale": -1.0}, {"background": 300}],
+    "options", [{"blend": "soft"}, {"seam": ""}, {"tile_size": 300}, {"bands": 0}, {"scale": -1.0}, {"background": 300}]
 )
 def test_wrong_options(options: dict[str, Any]) -> None:
     with pytest.raises(ArgumentError):

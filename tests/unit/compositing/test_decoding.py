@@ -50,8 +50,8 @@ def _counted(scene: Scene, decoded: Counter[int], *, masked: bool) -> list[Place
     ids=str,
 )
 def test_whatever_the_memory(options: dict[str, Any], masked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = render(3, 3, size=(240, 180), rotate=37.0, scale=options.pop("scale", 1.5))
-    chosen = CompositeOptions(tile_size=256, bands=4, **({"workers": 1} | options))
+    scene = render(3, 2, size=(240, 180), rotate=37.0, scale=options.get("scale", 1.2))
+    chosen = CompositeOptions(tile_size=256, bands=4, **({"workers": 1} | options | {"scale": 1.0}))
     # Exposure and seams are decided on small images, which are not read smaller from images as small as these.
     most = 1 if options.get("exposure") == "none" else 2
     decoded: Counter[int] = Counter()

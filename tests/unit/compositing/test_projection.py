@@ -41,9 +41,7 @@ def _composed(
 ) -> Composite:
     frames = sequence.frames()
     return compose(
-        place_images([partial(as_image, frame) for frame in frames], [LENS] * len(frames), directions),
-        canvas,
-        options,
+        place_images([partial(as_image, frame) for frame in frames], [LENS] * len(frames), directions), canvas, options
     )
 
 

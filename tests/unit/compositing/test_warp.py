@@ -21,9 +21,7 @@ def test_identity_gives_the_image_back() -> None:
     frame = np.random.default_rng(0).integers(0, 256, (150, 200, 3), dtype=np.uint8)
     lens = Camera((200, 150))
     result = compose(
-        place_images([lambda: as_image(frame)], [lens], np.eye(3)[None]),
-        plan_canvas([lens], np.eye(3)[None]),
-        PLAIN,
+        place_images([lambda: as_image(frame)], [lens], np.eye(3)[None]), plan_canvas([lens], np.eye(3)[None]), PLAIN
     )
     np.testing.assert_array_equal(result.pixels, frame)
     assert (result.alpha == 255).all()

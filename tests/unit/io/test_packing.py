@@ -24,9 +24,7 @@ _PLAIN = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text
 _VALUES = st.recursive(
     _PLAIN,
     lambda inner: st.one_of(
-        st.lists(inner, max_size=3),
-        st.tuples(inner, inner),
-        st.dictionaries(st.text(max_size=3), inner, max_size=3),
+        st.lists(inner, max_size=3), st.tuples(inner, inner), st.dictionaries(st.text(max_size=3), inner, max_size=3)
     ),
     max_leaves=8,
 )

@@ -48,3 +48,28 @@ def test_two_votes_have_no_scatter_and_equal_ones_a_histogram() -> None:
     same = vote([-0.2, -0.2, -0.2], [0.01] * 3)
     assert same.scatter == pytest.approx(0.0, abs=1e-6)
     assert same.edges[0] < -0.2 < same.edges[-1]
+
+
+def test_votes_count_by_their_precision() -> None:
+    found = vote([-0.2, -0.1], [0.001, 0.04])
+    assert found.distortion == pytest.approx(-0.199937539, abs=1e-9)  # weights 1,000,000 and 625
+    assert found.std == pytest.approx(0.000999688, abs=1e-9)
+    assert (found.agreeing, found.votes) == (2, 2)
+    assert vote([0.3, -0.2], [0.1, 0.001]).distortion == pytest.approx(-0.2)  # half a unit is five of the larger
+
+
+@pytest.mark.parametrize(("offset", "agreeing", "distortion"), [(0.029, 2, -0.1855), (0.031, 1, -0.2)])
+def test_votes_agree_within_three_standard_deviations(offset: float, agreeing: int, distortion: float) -> None:
+    found = vote([-0.2, -0.2 + offset], [0.01, 0.01])
+    assert found.agreeing == agreeing
+    assert found.distortion == pytest.approx(distortion)
+
+
+def test_the_middle_of_votes_that_do_not_agree_is_their_median() -> None:
+    assert vote([-0.5, -0.2, 0.1], [0.001] * 3).distortion == pytest.approx(-0.2, abs=0.01)
+    assert vote([0.1, -0.6, -0.2, -0.5, 0.2], [0.001] * 5).distortion == pytest.approx(-0.2, abs=0.01)
+
+
+def test_without_votes_there_is_nothing() -> None:
+    none = vote([np.nan], [0.01])
+    assert (none.scatter, none.agreeing, none.votes, len(none.histogram), len(none.edges)) == (0.0, 0, 0, 0, 0)

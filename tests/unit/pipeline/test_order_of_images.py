@@ -11,8 +11,8 @@ import rdstitch
 from rdstitch.io import write_image
 from tests.compositing_scenes import render
 
-SCENE = render(4, 1, size=(300, 220), overlap=0.5, distortion=-0.15, seed=3)
-ORDERS = [(0, 1, 2, 3), (3, 2, 1, 0), (1, 3, 0, 2), (2, 0, 3, 1)]
+SCENE = render(4, 1, size=(240, 180), overlap=0.5, distortion=-0.15, seed=3)
+ORDERS = [(0, 1, 2, 3), (3, 2, 1, 0), (2, 0, 3, 1)]
 
 
 @pytest.mark.parametrize("make", [rdstitch.pano, rdstitch.mosaic])
@@ -28,7 +28,8 @@ def test_of_files_the_result_is_the_same(make: Callable[..., Any], tmp_path: Pat
 
 
 def test_of_arrays_the_reference_is_the_same() -> None:
-    results = [rdstitch.mosaic([SCENE.frames[k] for k in order]) for order in ORDERS]
+    options = rdstitch.StitchOptions(dry_run=True)
+    results = [rdstitch.mosaic([SCENE.frames[k] for k in order], options=options) for order in ORDERS]
     references = {order[r.registration.alignment.reference] for order, r in zip(ORDERS, results, strict=True)}
     assert len(references) == 1
     sizes = np.array([result.canvas.size for result in results])

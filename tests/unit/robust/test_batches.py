@@ -5,12 +5,7 @@ import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.robust import (
-    EstimationOptions,
-    PairMatches,
-    estimate_radial_homographies,
-    estimate_radial_homography,
-)
+from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
 from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
 from rdstitch.robust.measurements import Measurements, padded_length
 from rdstitch.synthetic import correspondences

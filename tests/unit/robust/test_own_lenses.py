@@ -50,12 +50,7 @@ def test_two_lenses_are_seen_for_what_they_are(other: float, motion: str) -> Non
 
 
 @pytest.mark.parametrize(
-    "other",
-    [
-        None,
-        Camera((1000, 800), -0.25, center=(525.0, 385.0)),
-        Camera((1000, 800), -0.25, distortion2=0.05),
-    ],
+    "other", [None, Camera((1000, 800), -0.25, center=(525.0, 385.0)), Camera((1000, 800), -0.25, distortion2=0.05)]
 )
 def test_one_lens_is_one_wherever_its_centre_is(other: Camera | None) -> None:
     for seed in range(6):

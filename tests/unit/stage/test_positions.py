@@ -23,8 +23,7 @@ def test_names_give_rows_and_columns() -> None:
 
 
 @pytest.mark.parametrize(
-    ("pattern", "names"),
-    [("r{row}", ["r1"]), ("r{row}c{col}", ["r1c1", "x"]), ("r{row}c{col}", ["r1c1_a", "r1c1_b"])],
+    ("pattern", "names"), [("r{row}", ["r1"]), ("r{row}c{col}", ["r1c1", "x"]), ("r{row}c{col}", ["r1c1_a", "r1c1_b"])]
 )
 def test_a_pattern_that_does_not_tell_tiles_apart_is_refused(pattern: str, names: list[str]) -> None:
     with pytest.raises(ArgumentError):

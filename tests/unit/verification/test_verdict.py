@@ -151,14 +151,7 @@ def _checked_by(monkeypatch: pytest.MonkeyPatch, good: Registration, *checked: C
 
 @pytest.mark.parametrize(
     ("cells", "confirming", "severity"),
-    [
-        (100, 9, "failure"),
-        (100, 10, "warning"),
-        (100, 14, "warning"),
-        (100, 15, None),
-        (7, 0, None),
-        (8, 0, "failure"),
-    ],
+    [(100, 9, "failure"), (100, 10, "warning"), (100, 14, "warning"), (100, 15, None), (7, 0, None), (8, 0, "failure")],
 )
 def test_a_tenth_of_an_overlap_must_look_alike(
     good: Registration, monkeypatch: pytest.MonkeyPatch, cells: int, confirming: int, severity: str | None

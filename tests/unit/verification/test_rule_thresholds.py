@@ -1,0 +1,91 @@
+"""Where each rule begins: values just below and just above its limit."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment.result import LinkFit
+from rdstitch.camera import Camera
+from rdstitch.verification import rules
+from rdstitch.verification.overlap_check import CheckedLink
+from rdstitch.verification.photometric_agreement import Agreement
+from rdstitch.verification.self_similarity import Ambiguity
+
+LARGEST = 0.02 * 500.0  # pixels that relief explains, of images with a diagonal of 500
+
+
+def _kinds(findings: Any) -> list[str]:
+    return [finding.kind for finding in findings]
+
+
+@pytest.mark.parametrize(
+    ("rms", "alike", "relief", "kind"),
+    [
+        (2.99, 0.0, None, None),
+        (3.0, 0.0, None, None),  # the definition of an inlier, 3 pixels here
+        (3.01, 0.24, None, "errors"),
+        (3.01, 0.25, None, "rough"),
+        (9.0, 0.25, None, "rough"),  # three thresholds
+        (9.01, 0.9, None, "errors"),
+        (9.01, 0.5, 9.0, "rough"),  # what neighbours have in common left out, it is a plane
+        (9.01, 0.49, 9.0, "errors"),
+        (9.5, 0.9, 9.02, "rough"),  # 9.5² - 9.02² = 8.9
+        (9.5, 0.9, 9.01, "errors"),  # 9.07: more than 3²
+        (LARGEST, 0.9, 9.9, "rough"),
+        (LARGEST + 0.01, 0.9, 9.9, "errors"),
+    ],
+)
+def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kind: str | None) -> None:
+    ground = SimpleNamespace(found=relief is not None, size=relief or 0.0)
+    alignment = SimpleNamespace(rms=rms, relief=ground, cameras=[Camera((400, 300)), Camera((40, 30))])
+    found: Any = SimpleNamespace(alignment=alignment, threshold=3.0, alike=alike)
+    findings = list(rules._errors(found))
+    assert _kinds(findings) == ([] if kind is None else [kind])
+    for finding in findings:
+        assert finding.severity == ("warning" if kind == "rough" else "failure")
+        assert finding.values == {"rms": rms, "threshold": 3.0}
+
+
+def _checked(cells: int, share: float, pair: tuple[int, int] = (0, 1), *, unique: bool = False) -> Any:
+    link = CheckedLink(LinkFit(*pair, 9, 9, 0.5, True), Agreement(cells, round(cells * share)), Ambiguity(1, 0, 0))
+    return SimpleNamespace(agreement=link.agreement, pair=link.pair, unique=unique)
+
+
+@pytest.mark.parametrize(("cells", "share", "said"), [(1000, 0.149, 1), (1000, 0.15, 0), (1000, 0.5, 0), (2, 0.0, 0)])
+def test_overlaps_that_look_little_alike(cells: int, share: float, said: int) -> None:
+    found: Any = SimpleNamespace(seen=[_checked(cells, share)])
+    assert _kinds(rules._little_alike(found)) == ["little alike"] * said
+
+
+@pytest.mark.parametrize(("ambiguous", "checked", "kinds"), [(2, 5, []), (3, 5, ["pattern"]), (1, 2, ["pattern"])])
+def test_a_pattern_over_many_pairs(ambiguous: int, checked: int, kinds: list[str]) -> None:
+    shifted = SimpleNamespace(ambiguity=SimpleNamespace(shift=7.0))
+    found: Any = SimpleNamespace(
+        ambiguous={(k, k + 1): shifted for k in range(ambiguous)}, checked=[None] * checked, seen=[_checked(9, 1.0)]
+    )
+    assert _kinds(rules._pattern(found)) == kinds
+    (first, *_) = rules._ambiguous(found)
+    assert (first.kind, first.images, first.values) == ("ambiguous", (0, 1), {"shift": 7.0})
+
+
+def test_of_pairs_that_unique_places_decided_the_least_alike_is_named() -> None:
+    seen = [_checked(100, 0.5, unique=True), _checked(100, 0.3, (1, 2), unique=True), _checked(100, 0.1, (2, 3))]
+    (finding,) = rules._pattern(SimpleNamespace(ambiguous={}, checked=seen, seen=seen))  # type: ignore[arg-type]
+    assert (finding.kind, finding.images) == ("settled pattern", (1, 2))
+
+
+@pytest.mark.parametrize(("used", "mixed", "said"), [(1, True, 0), (2, True, 1), (3, True, 0), (2, False, 0)])
+def test_two_images_left_of_one_lens(used: int, mixed: bool, said: int) -> None:
+    registration = SimpleNamespace(mixed=SimpleNamespace() if mixed else None)
+    found: Any = SimpleNamespace(alignment=SimpleNamespace(used=np.arange(4) < used), registration=registration)
+    assert [finding.images for finding in rules._two_left(found)] == [(0, 1)] * said
+
+
+@pytest.mark.parametrize("certain", [True, False])
+def test_images_of_two_lenses_that_were_not_separated(certain: bool) -> None:
+    mixed = SimpleNamespace(certain=certain, second=[False, True, False], distortion=(-0.1, -0.4))
+    findings = list(rules._mixed_lenses(SimpleNamespace(registration=SimpleNamespace(mixed=mixed))))  # type: ignore[arg-type]
+    values = {"own": [1], "others": [0, 2], "here": -0.4, "there": -0.1}
+    assert [finding.values for finding in findings] == ([] if certain else [values])
