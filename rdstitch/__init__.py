@@ -18,28 +18,21 @@ if TYPE_CHECKING:
     from rdstitch.errors import RdstitchError
     from rdstitch.features import FeatureOptions
     from rdstitch.messages import Message
-    from rdstitch.pipeline import (
-        Composer,
-        Recomposition,
-        Registration,
-        StitchOptions,
-        StitchResult,
-        apply,
-        calibrate,
-        mosaic,
-        mosaic_blocks,
-        pano,
-        place_tiles,
-        tiles,
-        trajectory,
-        undistort,
-        write_layers,
-    )
+    from rdstitch.options import StitchOptions
+    from rdstitch.pipeline.apply_sidecar import apply
+    from rdstitch.pipeline.composer import Composer
     from rdstitch.pipeline.follow import FollowedPoses, Pose, Tracker
+    from rdstitch.pipeline.layers import write_layers
+    from rdstitch.pipeline.recipes import calibrate, mosaic, mosaic_blocks, pano, trajectory
+    from rdstitch.pipeline.recomposition import Recomposition
+    from rdstitch.pipeline.stage_tiles import place_tiles, tiles
+    from rdstitch.pipeline.undistort_images import undistort
     from rdstitch.radial_homography import RadialHomography
+    from rdstitch.registration import Registration
     from rdstitch.report import write_report
     from rdstitch.robust import estimate_radial_homography
     from rdstitch.stage import TileOptions
+    from rdstitch.stitch_result import StitchResult
 
     __version__: str
 

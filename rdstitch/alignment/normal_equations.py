@@ -14,7 +14,7 @@ from rdstitch.alignment.motion_models import ModelMatrices, inverses
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.arrays import FloatArray
-from rdstitch.scipy_parts import sparse, sparse_linalg
+from rdstitch.late_imports import sparse, sparse_linalg
 
 _LEAST_DAMPING = 1e-12
 """Relative to the diagonal: what makes poses solvable that nothing holds."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.scipy_parts import sparse
+from rdstitch.late_imports import sparse
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from rdstitch.compositing.overlap_cells import Cells, compare_overlaps
 from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale, no_exposure, squared_radius
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.survey import Survey
-from rdstitch.scipy_parts import sparse, sparse_linalg
+from rdstitch.late_imports import sparse, sparse_linalg
 
 _SRGB_OFFSET = 0.055
 # How well the gains of two images can explain their overlap, and how far gains stray (log units): keeps long chains

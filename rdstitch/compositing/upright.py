@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
-from rdstitch.scipy_parts import linalg, special
+from rdstitch.late_imports import linalg, special
 
 Segment = tuple[float, float, float, float]
 Corners = tuple[float, float, float, float, float, float, float, float]

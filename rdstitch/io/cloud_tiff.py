@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-import tifffile
-
 _OFFSETS = (324, 273)  # of tiles and strips
 _ENTRY = "HH"  # of a directory, before count and value
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.scipy_parts import special
+from rdstitch.late_imports import special
 
 _CELLS_PER_DIAGONAL = 32
 _CELL_STRIDE = 2.0**20

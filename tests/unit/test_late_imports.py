@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from scipy import sparse as real_sparse
 
-from rdstitch.scipy_parts import sparse, spatial
+from rdstitch.late_imports import sparse, spatial
 from tests.cli.running import flight
 
 _UP_TO_THE_FIRST_IMAGE = """
