@@ -11,7 +11,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -20,6 +19,7 @@ from typing import Any, Self, TypeVar
 
 from rdstitch.errors import InputError, OutputError
 from rdstitch.file_access import is_url, open_regular, remote_status
+from rdstitch.frozen import dataclass
 from rdstitch.io.packing import digest, pack
 from rdstitch.stored import Stored, TemporaryFolder, entry_name, read_entry
 

@@ -9,7 +9,7 @@ The lens is the division model of :mod:`rdstitch.division_model`, with λ alone 
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -30,6 +30,7 @@ from rdstitch.division_model import (
 )
 from rdstitch.errors import ArgumentError, ImpossibleCameraError
 from rdstitch.file_access import read_text
+from rdstitch.frozen import dataclass
 from rdstitch.orientation import SIDEWAYS, turned_size, turning_matrix
 from rdstitch.outputs import check_output, json_bytes, write_bytes_atomic
 from rdstitch.planar_motion import turned_tilt

@@ -2,7 +2,6 @@
 
 import math
 import re
-from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
 
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 _AXIS, _FLATTENING, _SCALE = 6378137.0, 1 / 298.257223563, 0.9996
 _FALSE_EASTING, _FALSE_NORTHING = 500_000.0, 10_000_000.0

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import cv2
@@ -11,6 +11,7 @@ import numpy as np
 from rdstitch.compositing import CompositePlan
 from rdstitch.errors import InputError, RegistrationError
 from rdstitch.features import FeatureOptions
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs
 from rdstitch.inputs.source import Source, read_sources

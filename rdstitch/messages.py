@@ -1,9 +1,11 @@
 """What a user should know of a result, as one type: what it is, which images it concerns, and how grave it is."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
+
+from rdstitch.frozen import dataclass
 
 Severity = Literal["detail", "note", "warning", "left out", "failure"]
 

@@ -2,7 +2,7 @@
 
 import math
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Literal, Self
 
@@ -12,6 +12,7 @@ from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.executors import LOCAL, open_executor
 from rdstitch.features import FeatureOptions
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.local_alignment import MAX_CELLS, LocalAlignmentMode
 from rdstitch.machine import processor_count

@@ -15,13 +15,13 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from rdstitch.errors import OutputError, RdstitchError
 from rdstitch.file_access import local_file
+from rdstitch.frozen import dataclass
 from rdstitch.messages import Message
 
 # On Windows nothing proves a process dead, and its leftovers stay.

@@ -6,7 +6,7 @@ adjustment are both built on.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Self
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
 from rdstitch.division_model import distort, divisor, divisor_slope
+from rdstitch.frozen import dataclass
 from rdstitch.planar_motion import PlanarMotion
 
 

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Self
 
 from rdstitch.alignment import Alignment
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.source import Source
 from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.matching.two_view import PairRegistration

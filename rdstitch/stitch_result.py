@@ -1,6 +1,6 @@
 """What stitching gives: the image, in memory or in a file, and everything that was estimated for it."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rdstitch.compositing import Canvas, Composite, CompositePlan
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.frame import ChannelOrder, in_order
 from rdstitch.io.preview import encode_preview, read_preview
 from rdstitch.io.read import read_image

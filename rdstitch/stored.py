@@ -5,13 +5,14 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from threading import Lock
 from typing import Any, Generic, TypeVar, cast
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import read_limited
+from rdstitch.frozen import dataclass
 from rdstitch.io.packing import unpack
 from rdstitch.outputs import StagingFolder
 

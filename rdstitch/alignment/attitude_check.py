@@ -6,7 +6,7 @@ all, each with the scatter that makes it most likely.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -16,6 +16,7 @@ from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA, PlanarMod
 from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.select import select_model
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.frozen import dataclass
 from rdstitch.messages import Message
 
 _MAX_IMAGES = 60

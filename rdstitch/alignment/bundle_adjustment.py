@@ -4,7 +4,7 @@ Levenberg-Marquardt on a robust loss of the transfer errors in measured pixels, 
 of the loss follows the scatter of the errors, from wide to narrow, so that good links are not lost to a rough start.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Self
 
@@ -18,6 +18,7 @@ from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.alignment.priors import Prior, costs, curvatures, slopes
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS
+from rdstitch.frozen import dataclass
 from rdstitch.robust.levenberg_marquardt import FIRST_DAMPING, MAX_DAMPING, MIN_GAIN, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
 

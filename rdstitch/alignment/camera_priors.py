@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
 from rdstitch.alignment.priors import LENS, TILT, exact, focal_prior
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 
 
 @dataclass(frozen=True)

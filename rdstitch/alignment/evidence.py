@@ -12,7 +12,6 @@ Up to constants, with ``m_c`` the mean error of a cell of ``n_c`` matches, ``v_c
 ``-2 log L = Σ_c 2 log v_c + |m_c|²/v_c + Σ_b 2 log(1 + W_b τ₁²) - τ₁² W_b² |M_b|² / (1 + W_b τ₁²)``.
 """
 
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -23,6 +22,7 @@ from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.frozen import dataclass
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _SIDE = 4

@@ -9,7 +9,7 @@ bends each differently.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -24,6 +24,7 @@ from rdstitch.alignment.planarity import Coherence, coherence
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS
 from rdstitch.division_model import distort, undistort
+from rdstitch.frozen import dataclass
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 LENSES: dict[str, tuple[str, ...]] = {

@@ -6,7 +6,7 @@ as good for finding the minimum; for how far the minimum moves, it is too large 
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Self
 
@@ -16,6 +16,7 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmen
 from rdstitch.alignment.link_equations import LinearizedErrors, linearized_errors
 from rdstitch.alignment.normal_equations import SparseNormalEquations, link_derivatives
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, loss_ratio, robust_weight
 
 Fields = Callable[[LinearizedErrors], FloatArray]

@@ -8,7 +8,6 @@ products of the coordinates of p, are all that is summed: no Jacobian is formed.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.division_model import is_one_to_one
+from rdstitch.frozen import dataclass
 from rdstitch.radial_homography import TransferJacobian, measurement_whitening, transfer_jacobian, whiten
 from rdstitch.robust.loss import robust_weight
 

@@ -7,12 +7,12 @@ unknowns, so all of them are tried on a grid, from which the adjustment finds th
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y, inverses
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
 
 _MAX_TILT = math.radians(75.0)

@@ -5,7 +5,6 @@ is exact to better than about a tenth of a pixel, which therefore counts as nois
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 EXACTNESS = 0.1

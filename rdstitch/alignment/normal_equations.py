@@ -4,7 +4,7 @@ The model's derivatives turn the Gram matrix of each link into the blocks of its
 parameters.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -14,6 +14,7 @@ from rdstitch.alignment.motion_models import ModelMatrices, inverses
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import sparse, sparse_linalg
 
 _LEAST_DAMPING = 1e-12

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Self
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.matching.links import Link
 from rdstitch.matching.thinning import spread_choice
 

@@ -1,7 +1,6 @@
 """What the caller of the alignment decides, and what is given of the camera and the images."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +10,7 @@ from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 
 @dataclass(frozen=True)

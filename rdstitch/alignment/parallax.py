@@ -1,6 +1,5 @@
 """By how much measured points move with the height of the ground: away from below the camera, in every image."""
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +9,7 @@ from rdstitch.alignment.link_equations import LinearizedErrors, split_lens
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y, inverses
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import distort, undistort
+from rdstitch.frozen import dataclass
 from rdstitch.radial_homography import project
 
 _STEP = 1e-4

@@ -5,13 +5,12 @@ come from something that the model does not describe: relief, a lens of another 
 correlation gives the number of independent observations, which is smaller than that of correspondences.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import spatial
 
 _CELLS = (2, 3, 4)

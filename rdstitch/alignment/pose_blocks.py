@@ -1,12 +1,12 @@
 """Which poses the links couple: the pattern of the sparse normal matrix, the same at every step of an adjustment."""
 
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import sparse
 
 

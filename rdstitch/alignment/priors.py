@@ -22,12 +22,12 @@ tilt of a plane         0 ± 20°; 0 ± 45° (0.2)       what is laid flat is lo
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import LENS_STD
+from rdstitch.frozen import dataclass
 
 _EXACT_STD = 1e-6
 

@@ -9,7 +9,6 @@ Mandelbrot 1975).
 """
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
@@ -20,6 +19,7 @@ from rdstitch.alignment.link_equations import LinearizedErrors
 from rdstitch.alignment.parallax import Parallax
 from rdstitch.alignment.planarity import apart, neighbours
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.frozen import dataclass
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _SHORTEST, _LONGEST = 0.5, 6.0

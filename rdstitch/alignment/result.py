@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Self
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.messages import Message
 from rdstitch.radial_homography import from_plane, to_plane
 

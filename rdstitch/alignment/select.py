@@ -12,7 +12,7 @@ translation. Of the planar models the least free one is taken that the images al
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -24,6 +24,7 @@ from rdstitch.alignment.lens_selection import shows_center
 from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.frozen import dataclass
 
 _MIN_RATIO = 3.0
 """Times by which the errors of one camera must exceed those of free homographies, one an image: these fit relief better

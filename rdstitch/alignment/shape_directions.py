@@ -6,7 +6,7 @@ The ways are the parameters that all images share, and effects that are not mode
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -22,6 +22,7 @@ from rdstitch.alignment.unmodelled import Effect, mapped
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.division_model import distort, undistort
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import linalg
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 

@@ -17,7 +17,7 @@ curved wall by a strong tilt and a focal length that next to no lens has: then t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -29,6 +29,7 @@ from rdstitch.alignment.shape_directions import Directions, places
 from rdstitch.alignment.unmodelled import CROPPED, USUAL_FOCAL, Effect, cropping_effects, unmodelled_effects
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 
 _LARGE = 0.004
 """Of an image's diagonal: an image may be off by less; sets wrong by three pixels of 500 have 0.005 and more."""

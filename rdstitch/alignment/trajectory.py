@@ -7,7 +7,7 @@ the direction ``Rz(φ) (X - t)``.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 
 @dataclass(frozen=True, repr=False)

@@ -6,7 +6,6 @@ moved a little.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from rdstitch.alignment.lens_selection import CENTER
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y, inverses
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import distort, undistort
+from rdstitch.frozen import dataclass
 from rdstitch.radial_homography import project
 
 Correction = Callable[[FloatArray, IntArray, float], FloatArray]

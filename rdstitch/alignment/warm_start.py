@@ -1,7 +1,6 @@
 """Where an alignment starts that follows another of the same images: at the cameras and poses of that one."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -11,6 +10,7 @@ from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, PSI, THETA, Pla
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ the undistorted radius is that of an equidistant one.
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -20,6 +19,7 @@ from rdstitch.camera_files.lens_fit import CameraFile, fitted_camera
 from rdstitch.camera_files.lens_models import CLOSE, LensFit, LensSamples
 from rdstitch.camera_files.writing import comments
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.records import Side, convert
 
 _RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE = 0, 2, 3

@@ -1,7 +1,6 @@
 """The division model that is nearest to a lens model of others: λ alone where that is enough, else with μ, and ν."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,6 +8,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.camera_files.lens_models import LensFit, LensModel, least_squares
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 Forward = Callable[[FloatArray], FloatArray]
 

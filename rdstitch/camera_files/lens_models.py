@@ -5,13 +5,13 @@ least squares over the image, and what that costs in pixels is stated.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera, points_over
+from rdstitch.frozen import dataclass
 
 _GRID = 65  # points along each side of the image that models are fitted at
 _RATIONAL_STEPS = 12

@@ -6,12 +6,12 @@ store that both see, so that neither they nor the images travel with tasks and r
 
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.cache import Cache
 from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
+from rdstitch.frozen import dataclass
 from rdstitch.opencv_state import one_opencv_thread
 from rdstitch.stored import Stored
 

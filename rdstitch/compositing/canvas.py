@@ -7,7 +7,7 @@ on the spot, G maps them to directions, and the canvas is what a projection make
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +18,7 @@ from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.near_part import NearPart, near_parts
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.errors import ArgumentError, LimitError
+from rdstitch.frozen import dataclass
 from rdstitch.radial_homography import to_directions, to_plane
 
 # Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 pixels on 4000 pixels.

@@ -11,7 +11,7 @@ With "balanced", fields tend to the brightness of each region's own images inste
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -23,6 +23,7 @@ from rdstitch.compositing.overlap_cells import Cells, compare_overlaps
 from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale, no_exposure, squared_radius
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.survey import Survey
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import sparse, sparse_linalg
 
 _SRGB_OFFSET = 0.055

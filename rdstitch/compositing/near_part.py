@@ -7,13 +7,14 @@ drawn. What the lens itself stretches, towards the corners of a wide-angle image
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera, points_over
+from rdstitch.frozen import dataclass
 from rdstitch.io.read import DecodedImage
 
 _PROBES = 33  # points of a grid over the image, and along its outline, a side, at which the stretch is measured

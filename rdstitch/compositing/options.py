@@ -1,12 +1,13 @@
 """How images are put together."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Literal, get_args, get_origin, get_type_hints
 
 from rdstitch.compositing.projection import ProjectionName
 from rdstitch.compositing.upright import UprightOptions
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 ExposureMethod = Literal["none", "gain", "blocks", "balanced"]
 Seam = Literal["none", "voronoi", "graphcut"]

@@ -1,7 +1,6 @@
 """What overlapping images say of their light: means of the cells that two of them show."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.compositing.boxes import cut
 from rdstitch.compositing.photometric import full_scale
 from rdstitch.compositing.survey import Survey
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import sparse
 
 # Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.

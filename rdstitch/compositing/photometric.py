@@ -10,7 +10,7 @@ the distortion centre, and a smooth field ``f_i`` per image.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import cv2
@@ -21,6 +21,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Float32Array
 from rdstitch.compositing.warp import LATTICE_STEPS, Geometry, interpolated
+from rdstitch.frozen import dataclass
 from rdstitch.local_alignment.field import nodes_around
 
 # The correction is smooth: it is computed at this spacing, canvas pixels, and interpolated.

@@ -1,7 +1,6 @@
 """One registered image, as the compositor takes it."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,6 +8,7 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.io.read import DecodedImage
 
 ImageLoader = Callable[[], DecodedImage]

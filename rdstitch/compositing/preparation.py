@@ -2,7 +2,7 @@
 
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 from rdstitch.compositing.blender import margin
@@ -23,6 +23,7 @@ from rdstitch.compositing.survey import survey_factor, survey_images
 from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
 from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.messages import Message
 from rdstitch.process_memory import return_freed_memory
 

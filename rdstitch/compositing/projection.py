@@ -6,12 +6,12 @@ Directions have x to the right, y down, z ahead. Longitude ``atan2(x, z)`` grows
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 
 ProjectionName = Literal["auto", "plane", "cylinder", "sphere", "mercator", "panini", "stereographic"]
 

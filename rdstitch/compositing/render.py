@@ -1,7 +1,7 @@
 """One tile of the output: which images contribute where, and their samples blended."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
@@ -17,6 +17,7 @@ from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
 from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
 from rdstitch.compositing.warp import Geometry, Warp, locate
+from rdstitch.frozen import dataclass
 
 
 @dataclass(frozen=True)

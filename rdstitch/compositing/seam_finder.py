@@ -7,7 +7,7 @@ other, so that memory is that of one label per pixel of the reduced canvas.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -18,6 +18,7 @@ from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import locate
+from rdstitch.frozen import dataclass
 from rdstitch.io.reduction import block_mean
 
 NO_OWNER = -1

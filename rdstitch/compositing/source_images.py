@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rdstitch.compositing.masked_pixels import OPACITY_BYTES, filled, opacity
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.errors import InputError
+from rdstitch.frozen import dataclass
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import block_mean, fitting_reduction, reduced_size
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -15,6 +14,7 @@ from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
 from rdstitch.compositing.source_images import ImageReader
 from rdstitch.compositing.warp import Geometry, Warp, locate, plan_warps
+from rdstitch.frozen import dataclass
 
 _MAX_IMAGE = 600_000
 _MAX_TOTAL = 16_000_000

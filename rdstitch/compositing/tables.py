@@ -5,7 +5,7 @@ image, one product and one sum.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Self
 
 import cv2
@@ -22,6 +22,7 @@ from rdstitch.compositing.render import Layer
 from rdstitch.compositing.sampling import INTERPOLATION, remap, sample_places
 from rdstitch.compositing.source_images import LoadedImage, smoothed
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.render import Renderer
+from rdstitch.frozen import dataclass
 from rdstitch.io.layout import STRIP_ROWS
 from rdstitch.opencv_state import one_opencv_thread
 

@@ -9,7 +9,7 @@ length in half diagonals, ``diag(1, 1, f) x`` is the direction in those axes. Li
 """
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Literal, Self
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import linalg, special
 
 Segment = tuple[float, float, float, float]

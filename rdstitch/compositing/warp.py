@@ -5,7 +5,7 @@ Coordinates are computed on a lattice of the canvas, and interpolated linearly b
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -18,6 +18,7 @@ from rdstitch.compositing.boxes import Box, Float32Array, encloses, grown, inter
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.placed_image import Displacement, PlacedImage
 from rdstitch.compositing.projection import PLANE, Projection
+from rdstitch.frozen import dataclass
 from rdstitch.radial_homography import to_plane
 
 LATTICE_STEPS = (32, 16, 8, 4, 2, 1)

@@ -7,7 +7,7 @@ images.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from rdstitch.alignment.position_priors import POSITION_STD
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.crs import WGS84, Crs
+from rdstitch.frozen import dataclass
 from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.radial_homography import to_plane

@@ -1,7 +1,7 @@
 """What detection and matching hand on: keypoints and descriptors of an image, and points of two that show the same."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 Descriptors = NDArray[np.float32] | NDArray[np.uint8]
 

@@ -7,7 +7,6 @@ OpenCV's own tests use: ALIKED takes ``image`` and gives ``keypoints``, ``descri
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Self
@@ -20,6 +19,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.features.options import FeatureOptions
+from rdstitch.frozen import dataclass
 from rdstitch.opencv_state import silent_opencv
 
 

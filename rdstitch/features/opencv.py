@@ -1,7 +1,7 @@
 """The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Self, cast
 
 import cv2
@@ -12,6 +12,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Descriptors, Features
 from rdstitch.features.options import FeatureOptions
+from rdstitch.frozen import dataclass
 from rdstitch.process_memory import scratch_memory
 
 Grey = NDArray[np.uint8]

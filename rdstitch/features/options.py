@@ -1,10 +1,11 @@
 """Options of feature detection."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Self
 
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "aliked")
 WORK_MEGAPIXELS = 0.6

@@ -5,7 +5,7 @@ what they would be in the whole; the coarser ones are those of the image at half
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Self
 
@@ -17,6 +17,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Features
 from rdstitch.features.opencv import Grey, OpenCVDetection
 from rdstitch.features.options import FeatureOptions
+from rdstitch.frozen import dataclass
 
 LARGE = 1_250_000
 """Pixels from which on an image is taken in tiles: a whole one takes 230 bytes a pixel."""

@@ -6,12 +6,12 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import MAX_FILE, canonical_name, canonical_text, is_url, read_limited, read_text, remote_names
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.keyframes import wanted_frames
 from rdstitch.inputs.rosbag import extract_images, is_bag

@@ -5,13 +5,13 @@ good enough to say how much two frames share.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.frozen import dataclass
 
 _SIDE = 320  # pixels of the longer side that frames are tracked at
 _CORNERS, _QUALITY, _APART = 120, 0.01, 8.0

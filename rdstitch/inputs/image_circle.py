@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.errors import InputError
 from rdstitch.executors import in_order
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import mean_of_channels

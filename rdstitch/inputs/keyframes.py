@@ -6,12 +6,12 @@ around it.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.frame_tracking import FramePlaces, tracked
 from rdstitch.messages import Message
 

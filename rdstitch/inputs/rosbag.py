@@ -1,7 +1,6 @@
 """Images of a ROS bag, of version 1 or 2, as image files with time stamps; no ROS is needed, only ``rosbags``."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.errors import InputError, OutputError
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.keyframes import Wanted, wanted_frames
 from rdstitch.io.video import write_frame

@@ -1,7 +1,7 @@
 """The input images: which files, what their headers say, and the camera each was taken with."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -15,6 +15,7 @@ from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
 from rdstitch.features.options import WORK_MEGAPIXELS
 from rdstitch.features.prepared_image import View, halving
 from rdstitch.file_access import canonical_name, held_in_memory, is_url
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.input_guard import InputGuard

@@ -1,7 +1,6 @@
 """What every image of a camera gets of the light, pixel by pixel, and taking it out of samples."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.errors import InputError
+from rdstitch.frozen import dataclass
 from rdstitch.io.opening import check_readable, decoding
 from rdstitch.io.reduction import block_mean
 from rdstitch.late_imports import tifffile

@@ -1,7 +1,7 @@
 """What is written: an image that comes in strips, from top to bottom."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import cv2
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.io.metadata import Metadata
 
 # Samples (h, W, C) and alpha (h, W), uint8, or None for opaque.

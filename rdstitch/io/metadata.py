@@ -4,7 +4,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
@@ -13,6 +13,7 @@ from PIL import ExifTags, Image
 
 from rdstitch.camera import is_focal_length
 from rdstitch.file_access import open_regular
+from rdstitch.frozen import dataclass
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
 from rdstitch.io.colour import ink_transform
 from rdstitch.io.ome_xml import read_ome

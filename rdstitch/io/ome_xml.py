@@ -1,7 +1,8 @@
 """What OME-XML says of a file: channels on pages of their own, the size of a pixel, the place on the stage."""
 
-from dataclasses import dataclass
 from xml.etree import ElementTree
+
+from rdstitch.frozen import dataclass
 
 MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
 """What units of length count."""

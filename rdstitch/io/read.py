@@ -4,7 +4,7 @@ import math
 import re
 import struct
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from PIL import Image
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import open_regular
+from rdstitch.frozen import dataclass
 from rdstitch.io.colour import srgb_of_lab, without_inks
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
 from rdstitch.io.ome_xml import read_ome

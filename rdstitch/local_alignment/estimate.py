@@ -1,13 +1,13 @@
 """Whether images are aligned locally, and how: decided by matches that are held out of the fit."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlaneFields, Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnPlane, Match, PlaneMatches, place_matches

@@ -1,7 +1,6 @@
 """A smooth displacement field over one image: a bicubic spline through displacements on a coarse grid."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import ndimage
 
 _DECIMALS = 3  # pixels; what a sidecar stores is what was used

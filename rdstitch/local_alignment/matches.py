@@ -1,7 +1,6 @@
 """Matches of overlapping images on the common plane, and what the alignment leaves over at each of them."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Self
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import spatial
 from rdstitch.radial_homography import from_plane, to_plane
 

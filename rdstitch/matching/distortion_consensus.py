@@ -4,12 +4,11 @@ The paper takes the peak of a histogram of the pairs' λ. Here the votes are wei
 the scatter between pairs is added that the covariances do not explain; the histogram is kept for the report.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 
 _BINS = 50  # of the histogram, for the report alone
 _ROUNDS = 20  # of reweighting; three or four are needed

@@ -1,7 +1,7 @@
 """Features and matches of a whole set, on disk: between stages, processes and machines travel their names."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self, overload
 
 import numpy as np
@@ -11,6 +11,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, PackedFeatures
+from rdstitch.frozen import dataclass
 from rdstitch.stored import Stored
 
 Size = tuple[int, int]

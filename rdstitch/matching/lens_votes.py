@@ -1,13 +1,13 @@
 """What pairs see of λ, each on its own and for each of its two images: the votes on which lens took which image."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import sparse, sparse_linalg
 from rdstitch.matching.thinning import spread_choice
 from rdstitch.matching.two_view import PairRegistration

@@ -1,13 +1,14 @@
 """What the adjustment is given: a link, the correspondences of two images that agree with one relation."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.matching.thinning import spread_choice
 from rdstitch.radial_homography import RadialHomography
 

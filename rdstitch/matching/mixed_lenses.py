@@ -5,12 +5,12 @@ the images into two lenses predicts what every pair sees.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.matching.lens_votes import Votes
 from rdstitch.matching.two_view import PairRegistration
 

@@ -1,9 +1,9 @@
 """How images are matched and pairs are estimated."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.robust import SOLVERS, EstimationOptions, RansacOptions
 
 _SELECT_MODEL_BELOW = 50

@@ -6,7 +6,6 @@ a tree of two levels (Nistér and Stewénius 2006). Two images are alike as far 
 their square, of which 10,000 images take seconds.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.features import Features
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import sparse
 from rdstitch.matching.feature_store import FeatureStore
 

@@ -5,7 +5,7 @@ and matches, which lie in the cache of the run, and give names back.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from threading import Lock
 from typing import TypeVar
@@ -16,6 +16,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, Matcher, match_overlap
+from rdstitch.frozen import dataclass
 from rdstitch.matching.feature_store import StoredFeatures, StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions

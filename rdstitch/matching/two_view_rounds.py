@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.camera import Camera
 from rdstitch.executors import in_order
 from rdstitch.features import Correspondences, Matcher, match_near
+from rdstitch.frozen import dataclass
 from rdstitch.matching.candidate_pairs import pairs_that_matter
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.options import MatchingOptions, PairOptions

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from rdstitch.compositing.tiles import OutputStrip
 from rdstitch.errors import OutputError
 from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, world_file_paths
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space

@@ -7,7 +7,7 @@ a stretch and with local contrast equalized. Where fewer do, or show few for the
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -19,6 +19,7 @@ from rdstitch.executors import in_order
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, detect, detect_view
 from rdstitch.features.options import CLOSER
 from rdstitch.features.prepared_image import Stretch, common_stretch, halving, usual_stretch
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import FeatureStore, StoredFeatures

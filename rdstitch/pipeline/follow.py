@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -14,6 +14,7 @@ from rdstitch.errors import InputError
 from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, prepare
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.frame import Frame, Image, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.selection import is_selected, with_masks

@@ -1,12 +1,12 @@
 """What applying a saved registration gives, and the sidecar of that."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, CompositePlan
 from rdstitch.export.georeference import Georeference
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.inputs.source import Source
 from rdstitch.messages import Message

@@ -6,12 +6,11 @@ With ``z = H p(λ)`` the derivative of the transferred point by H is ``(∂d/∂
 matrix of 3 x 3 times ``p p'``, and nothing of the size of a Jacobian is ever formed.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.division_model import distorted_ratio
+from rdstitch.frozen import dataclass
 from rdstitch.robust.loss import loss_ratio
 from rdstitch.robust.measurements import Measurements
 

@@ -1,7 +1,6 @@
 """The matches of many pairs of images, as robust estimation sees them: one array with the pairs first."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
 
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 _STEPS_PER_OCTAVE = 4
 _MIN_WIDTH = 16

@@ -1,7 +1,6 @@
 """Minimal solvers as RANSAC sees them: a sample size and a function, all in the half-diagonal frame."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -9,6 +8,7 @@ import numpy as np
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.division_model import SEARCHED_DISTORTION
+from rdstitch.frozen import dataclass
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.solvers.solutions import Solutions
 

@@ -1,13 +1,14 @@
 """Which model of the family describes each of many pairs: the least free one that explains the data."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import OBSERVABLE_STD
+from rdstitch.frozen import dataclass
 from rdstitch.robust.covariance import covariances
 from rdstitch.robust.loss import PAIR_WIDTH, RAYLEIGH_MEDIAN
 from rdstitch.robust.measurements import Measurements

@@ -6,7 +6,6 @@ and the distortion centre, which both images share, are free too.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD
 from rdstitch.division_model import MAX_ABS_DISTORTION
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import spatial
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.covariance import covariances

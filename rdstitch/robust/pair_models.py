@@ -8,12 +8,13 @@ The functions of a model take the states of B pairs at once. The state of the pl
 ``(ψ1, θ1, ψ2, θ2, φ, tx, ty, log height, log focal correction)``; of these the free ones are estimated.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Protocol
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.planar_motion import (
     ABOUT_X,
     ABOUT_Y,

@@ -1,12 +1,13 @@
 """Refinement of homography and λ over all matches of many pairs at once."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.division_model import MAX_ABS_DISTORTION
+from rdstitch.frozen import dataclass
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, descend
 from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
 from rdstitch.robust.measurements import Measurements

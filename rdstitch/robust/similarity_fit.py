@@ -1,11 +1,10 @@
 """A similarity of the plane between two sets of points of which some, fewer than half, are wrong."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 
 OUTLYING = 3.0
 """Standard deviations from which on a point is an outlier."""

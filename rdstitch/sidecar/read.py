@@ -1,7 +1,7 @@
 """Reading a sidecar: a registration that was found before, checked field by field."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from rdstitch.crs import Crs
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.georeference import Georeference, Residual
 from rdstitch.file_access import read_text
+from rdstitch.frozen import dataclass
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.outputs import Fingerprint, fingerprint, tiles_folder
 from rdstitch.sidecar.write import VERSION

@@ -4,13 +4,14 @@ Inside a solver the points of both images are one array of shape (2, 2, k, b): c
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.solvers.solutions import Solutions, as_samples
 
 IndexArray = NDArray[np.intp]

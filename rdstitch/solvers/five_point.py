@@ -1,12 +1,11 @@
 """Five points, general homography: λ from the direction of the fifth point."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.division_model import SOLVED_DISTORTION
+from rdstitch.frozen import dataclass
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.homography import Quadrangles
 from rdstitch.solvers.lines import determinants, squared_radii

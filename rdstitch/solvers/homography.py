@@ -10,12 +10,11 @@ and H their orientation, exactly when every ``α_i β_i > 0``, and the sign that
 of all ``α``.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.solvers.batch import SampleArrays
 from rdstitch.solvers.lines import Lines, squared_radii, triangle_determinants
 

@@ -6,11 +6,10 @@ Two coordinates of a lifted point ``p(λ) = (x, y, 1 + λ r²)`` do not depend o
 λ, its third coordinate constant; ``p_i · (p_j × p_k) = det(p_i, p_j, p_k)`` is linear in λ too.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.solvers.batch import SampleArrays
 
 _RING = [1, 2, 0, 1]

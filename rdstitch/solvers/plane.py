@@ -7,7 +7,6 @@ rotation R and the plane normal ``n = R e3``, a lifted point ``p(λ) = (x, y, 1 
 ``n · p`` are linear in λ.
 """
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Self
 
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.solvers.batch import IndexArray, SampleArrays
 from rdstitch.solvers.lines import Lines, squared_radii

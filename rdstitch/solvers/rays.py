@@ -11,11 +11,11 @@ linear in g², and for a known focal length of degree 2 in λ.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.solvers.batch import IndexArray, SampleArrays
 from rdstitch.solvers.lines import squared_radii
 from rdstitch.solvers.solutions import Solutions

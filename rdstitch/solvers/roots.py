@@ -9,12 +9,13 @@ is better conditioned than the polynomial through its values.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Protocol, Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.solvers.batch import IndexArray
 from rdstitch.solvers.polynomials import (
     bernstein_from_values,

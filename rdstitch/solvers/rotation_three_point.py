@@ -1,13 +1,13 @@
 """Three points, rotation about the centre, unknown focal length: λ and the focal length from two angles."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.rays import RayPairs, rotation_of_many, turned_solutions

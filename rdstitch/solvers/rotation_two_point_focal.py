@@ -1,12 +1,11 @@
 """Two points, rotation about the centre, known λ: the focal length from the one angle between them."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.known_distortion import distortions
 from rdstitch.solvers.plane import lens_range

@@ -1,6 +1,5 @@
 """What every minimal solver returns."""
 
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -8,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Three points, tilt unknown: the minimal case, by Newton's method from several starts."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.division_model import SOLVED_DISTORTION
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.lines import Lines, squared_radii, triangle_determinants
 from rdstitch.solvers.orientation import mirrored, oriented_samples

@@ -1,12 +1,11 @@
 """Three points, known tilt, free height: λ from the ratio of two distances."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.division_model import SOLVED_DISTORTION
+from rdstitch.frozen import dataclass
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.lines import Lines, triangle_determinants
 from rdstitch.solvers.orientation import mirrored, oriented_samples

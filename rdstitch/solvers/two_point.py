@@ -1,12 +1,11 @@
 """Two points, known tilt: λ from the one distance between them."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.division_model import SOLVED_DISTORTION
+from rdstitch.frozen import dataclass
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.lines import Lines
 from rdstitch.solvers.plane import TiltRotations, depths, differences, motion_homography, visible_range

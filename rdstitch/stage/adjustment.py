@@ -7,11 +7,11 @@ the model of the stage gives it.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.frozen import dataclass
 from rdstitch.late_imports import sparse, sparse_linalg
 from rdstitch.stage.grid import TileGrid
 

@@ -9,13 +9,13 @@ light, becomes 0 (photon transfer). Samples that are no counts of light, as of J
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.io.flat_field import FlatField
 from rdstitch.io.reduction import block_mean
 

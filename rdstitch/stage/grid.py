@@ -1,12 +1,11 @@
 """Where the stage was told to bring each tile: nominal places, rows and columns."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 _SAME_LINE = 0.25
 """Share of a tile within which places belong to one row or column."""

@@ -1,11 +1,12 @@
 """How tiles are put together."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 
 def measured_samples() -> CompositeOptions:

@@ -1,10 +1,9 @@
 """The expected overlap of two tiles, cut into blocks along its longer side."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.frozen import dataclass
 
 _BLOCKS = 8
 """Blocks along a side of a tile: a lens that bends the overlap hardly bends one of them."""

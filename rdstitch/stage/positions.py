@@ -5,7 +5,6 @@ import json
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import tifffile
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.file_access import canonical_name, canonical_text, open_regular, read_text
+from rdstitch.frozen import dataclass
 from rdstitch.io.ome_xml import read_ome
 from rdstitch.io.opening import TIFF_MAGIC, decoding
 from rdstitch.stage.grid import TileGrid

@@ -1,7 +1,6 @@
 """Displacements of blocks to a fraction of a pixel, by Newton's method on their correlation, with their covariance."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.frozen import dataclass
 
 _SMOOTHING = 1.2
 """Standard deviation of the filter before derivatives are taken, pixels."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.io.reduction import block_mean
 from rdstitch.late_imports import csgraph, sparse
 from rdstitch.progress import Progress, silent

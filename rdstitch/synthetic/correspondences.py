@@ -1,6 +1,5 @@
 """Matches of one pair of images, with noise and outliers and their truth: for tests of robust estimation."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.synthetic.instances import Instances, PlanarInstances, general_instances, planar_instances
 

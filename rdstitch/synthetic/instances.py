@@ -1,7 +1,6 @@
 """Problem instances with known truth, in batches: what the minimal solvers are tested and measured with."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.division_model import distort
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 from rdstitch.radial_homography import lift, project
 from rdstitch.solvers.solutions import Solutions

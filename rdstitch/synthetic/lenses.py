@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from rdstitch.camera import Camera, border_of
 from rdstitch.camera_files.lens_fit import fit_lens
 from rdstitch.camera_files.lens_models import LensModel
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 _FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]] = {
     "equidistant": (lambda angle: angle, lambda r: r),

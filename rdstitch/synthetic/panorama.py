@@ -4,12 +4,13 @@ The scene has x to the right, y down and z ahead, like a camera that looks strai
 longitude, which grows to the right, and latitude, which grows downwards, both in equal steps.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.synthetic.lenses import Lens, focal_length
 from rdstitch.synthetic.poses import Poses
 from rdstitch.synthetic.rendering import Photometry, Sequence

@@ -5,7 +5,7 @@ texel at (0, 0), as in an image. The camera looks down on it: with the tilt ``R`
 ``(cx, cy)`` and its height ``h`` in texels, the ray of a plane point is ``p ~ R Rz(φ) (X - cx, Y - cy, h)``.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 from rdstitch.radial_homography import project
 from rdstitch.synthetic.lenses import Lens, focal_length

@@ -1,7 +1,6 @@
 """Ground that is not flat: hills, buildings and ridges of a given height, seen with true visibility."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 HeightMap = NDArray[np.float32]
 

@@ -5,7 +5,7 @@ interpolated in the texture: as an ideal sensor does it, and without aliasing.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, OutputError
+from rdstitch.frozen import dataclass
 from rdstitch.synthetic.lenses import Lens
 from rdstitch.synthetic.poses import Poses, fit_to_plane, pixels_of_texels, plane_outline, texels_of_pixels
 from rdstitch.synthetic.relief import Relief

@@ -1,6 +1,5 @@
 """Tiles that a microscope's motorised stage brings before the camera, with their true places, lens and illumination."""
 
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 Specimen = Literal["fluorescence", "brightfield"]
 

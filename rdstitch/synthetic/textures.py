@@ -4,7 +4,6 @@ A texture answers for any rectangle of itself, so that a plane of a gigapixel ne
 levels or RGB in [0, 1].
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.frozen import dataclass
 
 LinearPixels = NDArray[np.float32]
 

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.radial_homography import to_plane
 
 _SAMPLES = 5  # points of an image's outline, a side, by which two planes are brought together

@@ -1,13 +1,13 @@
 """What speaks for and against a registration: its matches, its pixels, and motions that it does not explain."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.cache import NO_CACHE, Cache
+from rdstitch.frozen import dataclass
 from rdstitch.matching.two_view import Pair
 from rdstitch.registration import Registration
 from rdstitch.verification.limits import limit

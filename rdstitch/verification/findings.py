@@ -1,8 +1,9 @@
 """What the rules find: data that repairs and messages are made from."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
+from rdstitch.frozen import dataclass
 from rdstitch.messages import Severity
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from itertools import chain
 
@@ -13,6 +13,7 @@ from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.registration import Registration

@@ -6,7 +6,6 @@ right nearly all cells find it there; elsewhere they find it anywhere.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Self
 
@@ -18,6 +17,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.warp import Lattice
+from rdstitch.frozen import dataclass
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.radial_homography import from_plane, to_plane

@@ -11,13 +11,14 @@ is not seen there.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.matching.two_view import Pair, PairRegistration, estimation_batches
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration import Registration

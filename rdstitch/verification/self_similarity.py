@@ -4,13 +4,14 @@ Both images are drawn on the plane, and correlated at every shift at once (maske
 Padfield 2012). Where the plane is metric a shift by a period of the pattern is as good as the right one.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.radial_homography import to_plane
 from rdstitch.verification.limits import limit
 from rdstitch.verification.photometric_agreement import ComparedImage, Grey

@@ -7,12 +7,13 @@ fits. At the right one, those in the overlap are at the same places in both; at 
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.frozen import dataclass
 from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.verification.limits import limit
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE, ComparedImage, Grey

@@ -4,7 +4,6 @@ import base64
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -16,6 +15,7 @@ from PIL import Image
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.seam_finder import SeamMap
+from rdstitch.frozen import dataclass
 from rdstitch.io.deepzoom import OVERLAP, TILE
 from rdstitch.outputs import tiles_folder
 

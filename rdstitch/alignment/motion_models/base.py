@@ -1,12 +1,12 @@
 """What the adjustment uses of a motion model."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.frozen import dataclass
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,12 @@
 """Any motion of any camera: one homography per image."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.alignment.motion_models.base import ModelMatrices
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.frozen import dataclass
 
 _TRACELESS = np.zeros((8, 3, 3))
 _TRACELESS[[0, 1, 2, 3, 4, 5], [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0

@@ -6,12 +6,12 @@ those; otherwise it would have to follow a curved valley, and a prior on small t
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.alignment.motion_models.base import ModelMatrices
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.frozen import dataclass
 from rdstitch.planar_motion import ABOUT_X, ABOUT_Y, nearest_in_plane, rigid_in_plane, rotation_from_tilt
 
 YAW, X, Y, LOG_HEIGHT, PSI, THETA = range(6)

@@ -6,12 +6,12 @@ no horizon, so that a full circle closes. A step turns the camera in its own fra
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.alignment.motion_models.base import ModelMatrices
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.frozen import dataclass
 
 _FOCAL_STARTS = tuple(math.log(focal) for focal in (0.6, 0.9, 1.4, 2.2, 3.6, 6.0))
 """Logarithms of focal lengths in half diagonals: from fisheyes to long lenses, near enough to each other that the

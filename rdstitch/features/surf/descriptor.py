@@ -6,7 +6,6 @@ wavelets, which are not isotropic; and the window has a smooth edge, so that a g
 just in or out. The descriptor holds sums of Haar responses in 4 x 4 cells of a patch that is turned by it.
 """
 
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -17,6 +16,7 @@ from rdstitch.features.keypoints import Features
 from rdstitch.features.options import FeatureOptions
 from rdstitch.features.surf.hessian import Blobs, Grey, find_blobs, pyramid
 from rdstitch.features.surf.refinement import apply_kernels, integer_kernels, refine, sample_patches
+from rdstitch.frozen import dataclass
 
 _RADIUS = 6  # of the disc of gradients, units of s
 _GRADIENT_SIGMA = 1.5  # of the derivatives, units of s; about as wide as the paper's wavelets of 4s

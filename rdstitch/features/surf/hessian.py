@@ -5,7 +5,7 @@ So an octave of SURF is the first octave on the next level of a pyramid, and nee
 its own.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Self
 
 import cv2
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.frozen import dataclass
 
 Grey = NDArray[np.uint8]
 # The box filter of 9 pixels stands for a Gaussian of σ = 1.2 pixels; larger ones in proportion (§3.3).
