@@ -49,13 +49,21 @@ _HOMES = {
         "rdstitch.errors": "RdstitchError",
         "rdstitch.features": "FeatureOptions",
         "rdstitch.messages": "Message",
-        "rdstitch.pipeline": "Composer Recomposition Registration StitchOptions StitchResult "
-        "apply calibrate mosaic mosaic_blocks pano place_tiles tiles trajectory undistort write_layers",
+        "rdstitch.options": "StitchOptions",
+        "rdstitch.pipeline.apply_sidecar": "apply",
+        "rdstitch.pipeline.composer": "Composer",
         "rdstitch.pipeline.follow": "FollowedPoses Pose Tracker",
+        "rdstitch.pipeline.layers": "write_layers",
+        "rdstitch.pipeline.recipes": "calibrate mosaic mosaic_blocks pano trajectory",
+        "rdstitch.pipeline.recomposition": "Recomposition",
+        "rdstitch.pipeline.stage_tiles": "place_tiles tiles",
+        "rdstitch.pipeline.undistort_images": "undistort",
         "rdstitch.radial_homography": "RadialHomography",
+        "rdstitch.registration": "Registration",
         "rdstitch.report": "write_report",
         "rdstitch.robust": "estimate_radial_homography",
         "rdstitch.stage": "TileOptions",
+        "rdstitch.stitch_result": "StitchResult",
     }.items()
     for name in names.split()
 }

@@ -5,7 +5,7 @@ Each is a :class:`rdstitch.synthetic.Sequence`, so that the truth is known, and 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.frozen import dataclass
 from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, repeated, sequence_over
 
 ADVERSE = (

@@ -1,7 +1,7 @@
 """Random rendered image sets, solvable and hopeless ones, and whether what was made of them is right."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import permutations
 from pathlib import Path
@@ -14,6 +14,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
 from rdstitch.features import FeatureOptions
+from rdstitch.frozen import dataclass
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.radial_homography import to_plane
