@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.io import write_image
-from rdstitch.pipeline import StitchOptions, mosaic
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.recipes import mosaic
 
 BUNDLED = sorted((Path(__file__).parent / "data" / "garfield_red").glob("*.jpg"))
 CUT = StitchOptions(composite=CompositeOptions(seam="voronoi", blend="none"))

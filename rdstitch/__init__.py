@@ -18,28 +18,21 @@ if TYPE_CHECKING:
     from rdstitch.errors import RdstitchError
     from rdstitch.features import FeatureOptions
     from rdstitch.messages import Message
-    from rdstitch.pipeline import (
-        Composer,
-        Recomposition,
-        Registration,
-        StitchOptions,
-        StitchResult,
-        apply,
-        calibrate,
-        mosaic,
-        mosaic_blocks,
-        pano,
-        place_tiles,
-        tiles,
-        trajectory,
-        undistort,
-        write_layers,
-    )
+    from rdstitch.options import StitchOptions
+    from rdstitch.pipeline.apply_sidecar import apply
+    from rdstitch.pipeline.composer import Composer
     from rdstitch.pipeline.follow import FollowedPoses, Pose, Tracker
+    from rdstitch.pipeline.layers import write_layers
+    from rdstitch.pipeline.recipes import calibrate, mosaic, mosaic_blocks, pano, trajectory
+    from rdstitch.pipeline.recomposition import Recomposition
+    from rdstitch.pipeline.stage_tiles import place_tiles, tiles
+    from rdstitch.pipeline.undistort_images import undistort
     from rdstitch.radial_homography import RadialHomography
+    from rdstitch.registration import Registration
     from rdstitch.report import write_report
     from rdstitch.robust import estimate_radial_homography
     from rdstitch.stage import TileOptions
+    from rdstitch.stitch_result import StitchResult
 
     __version__: str
 
@@ -56,13 +49,21 @@ _HOMES = {
         "rdstitch.errors": "RdstitchError",
         "rdstitch.features": "FeatureOptions",
         "rdstitch.messages": "Message",
-        "rdstitch.pipeline": "Composer Recomposition Registration StitchOptions StitchResult "
-        "apply calibrate mosaic mosaic_blocks pano place_tiles tiles trajectory undistort write_layers",
+        "rdstitch.options": "StitchOptions",
+        "rdstitch.pipeline.apply_sidecar": "apply",
+        "rdstitch.pipeline.composer": "Composer",
         "rdstitch.pipeline.follow": "FollowedPoses Pose Tracker",
+        "rdstitch.pipeline.layers": "write_layers",
+        "rdstitch.pipeline.recipes": "calibrate mosaic mosaic_blocks pano trajectory",
+        "rdstitch.pipeline.recomposition": "Recomposition",
+        "rdstitch.pipeline.stage_tiles": "place_tiles tiles",
+        "rdstitch.pipeline.undistort_images": "undistort",
         "rdstitch.radial_homography": "RadialHomography",
+        "rdstitch.registration": "Registration",
         "rdstitch.report": "write_report",
         "rdstitch.robust": "estimate_radial_homography",
         "rdstitch.stage": "TileOptions",
+        "rdstitch.stitch_result": "StitchResult",
     }.items()
     for name in names.split()
 }

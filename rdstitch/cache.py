@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -173,6 +172,8 @@ class Cache:
 @cache
 def software() -> dict[str, str]:
     """Everything but its inputs that a result may depend on: our sources, and versions of what they compute with."""
+    from importlib.metadata import PackageNotFoundError, version
+
     found = {"rdstitch": sources_digest(files("rdstitch"))}
     for package in _PACKAGES:
         with suppress(PackageNotFoundError):

@@ -17,7 +17,7 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.read import DecodedImage
 from rdstitch.messages import Message, bytes_in_words, seconds_in_words, shortened, told_once
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline import mosaic
+from rdstitch.pipeline.recipes import mosaic
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 from rdstitch.verification.verdict import RefusedError

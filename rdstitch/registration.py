@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from rdstitch.alignment import Alignment
 from rdstitch.camera import Camera
@@ -12,7 +12,9 @@ from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import Message, of_severity
 from rdstitch.orientation import inverse
-from rdstitch.stage.register import TileRegistration
+
+if TYPE_CHECKING:
+    from rdstitch.stage.register import TileRegistration
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class Registration:
     static_background: bool = False
     mixed: TwoLenses | None = None
     stretch: tuple[float, float] | None = None
-    tiles: TileRegistration | None = None
+    tiles: "TileRegistration | None" = None
 
     def __repr__(self) -> str:
         return f"<Registration {self.summary}>"

@@ -14,8 +14,10 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
 from rdstitch.features import FeatureOptions
-from rdstitch.pipeline import Registration, StitchOptions, mosaic
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.recipes import mosaic
 from rdstitch.radial_homography import to_plane
+from rdstitch.registration import Registration
 from rdstitch.synthetic import (
     BrownLens,
     Lens,

@@ -1,6 +1,5 @@
 """``--config FILE.toml``: defaults of options, for all commands and for single ones; flags win."""
 
-import difflib
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -120,5 +119,7 @@ def _converted(option: click.Option, value: Any, where: str) -> Any:
 
 
 def _suggestion(name: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(name.replace("_", "-"), list(known), n=1)
+    from difflib import get_close_matches
+
+    close = get_close_matches(name.replace("_", "-"), list(known), n=1)
     return f"; do you mean {close[0]!r}?" if close else ""

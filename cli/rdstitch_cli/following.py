@@ -16,8 +16,9 @@ from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
-    from rdstitch.pipeline import Registration, StitchOptions
+    from rdstitch.options import StitchOptions
     from rdstitch.pipeline.follow import FollowedPoses
+    from rdstitch.registration import Registration
 
 follow = options.together(
     click.option(

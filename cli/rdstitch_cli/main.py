@@ -10,7 +10,6 @@ import sys
 import traceback
 import warnings
 from contextlib import suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import Never
 
@@ -86,7 +85,7 @@ class _Commands(click.Group):
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog=f"{_EXAMPLES}\n\n{EXIT_STATUSES}",
 )
-@click.version_option(version("rdstitch"), "-V", "--version", prog_name="rdstitch")
+@click.version_option(None, "-V", "--version", package_name="rdstitch", prog_name="rdstitch")
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 @click.pass_context
 def cli(context: click.Context, debug: bool) -> None:

@@ -19,17 +19,19 @@ from rdstitch_cli.terminal import Reporter
 if TYPE_CHECKING:
     from rdstitch.camera import Camera
     from rdstitch.compositing import CompositePlan
+    from rdstitch.options import StitchOptions
     from rdstitch.outputs import Outputs
-    from rdstitch.pipeline import Registration, StitchOptions, StitchResult
+    from rdstitch.registration import Registration
     from rdstitch.robust import SolverName
+    from rdstitch.stitch_result import StitchResult
 
 
 def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
     """The camera of a file; how well λ describes the lens of a foreign one is said on standard error."""
-    from rdstitch.camera_files import read_camera_file
-
     if file is None:
         return None
+    from rdstitch.camera_files import read_camera_file
+
     found = read_camera_file(file, partial(_size_of_images, file))
     if found.fit is not None:
         cause = f"; {found.cause}" if found.cause else ""
@@ -71,7 +73,7 @@ def stitch_options(
     """The library's options from a command's flags."""
     from rdstitch.compositing import CompositeOptions
     from rdstitch.features import FeatureOptions
-    from rdstitch.pipeline import StitchOptions
+    from rdstitch.options import StitchOptions
 
     _check_written([camera])
     if preview:
@@ -193,7 +195,7 @@ def staged_beside(
                     reporter.warn(str(message))
         if (folder := layers) is None:
             return
-        from rdstitch.pipeline import write_layers
+        from rdstitch.pipeline.layers import write_layers
 
         overwrite = result.options.overwrite
         write = partial(write_layers, result, folder, whole=whole_layers, overwrite=overwrite, outputs=outputs)

@@ -7,9 +7,9 @@ from contextlib import suppress
 from io import TextIOWrapper
 from typing import TYPE_CHECKING, Never, Self
 
-from tqdm import tqdm
-
 if TYPE_CHECKING:
+    from tqdm import tqdm
+
     from rdstitch.messages import Message
 
 _ASCII = {
@@ -80,6 +80,8 @@ class Reporter:
             self._stage = stage
             self.log(f"{stage} ({total})")
             if self._bars:
+                from tqdm import tqdm
+
                 self._bar = tqdm(total=total, desc=stage, leave=False, file=sys.stderr, dynamic_ncols=True)
         if self._bar is not None:
             self._bar.update(done - self._bar.n)

@@ -19,7 +19,8 @@ from examples.benchmarks.driver import run
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.pipeline import StitchOptions, pano
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.recipes import pano
 from rdstitch.synthetic import Photometry, TurningSequence, panorama_rotations, turning_sequence
 
 Pixels = NDArray[np.uint8]

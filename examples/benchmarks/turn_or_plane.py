@@ -13,7 +13,8 @@ import numpy as np
 from examples.benchmarks.driver import run
 from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
-from rdstitch.pipeline import StitchOptions, mosaic
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.recipes import mosaic
 from rdstitch.synthetic import (
     Photometry,
     Sequence,

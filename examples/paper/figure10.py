@@ -26,7 +26,7 @@ from examples.paper.common.settings import Effort, Settings
 from examples.paper.common.stitched import register_files, registration_error
 from rdstitch.arrays import FloatArray
 from rdstitch.features import FeatureOptions
-from rdstitch.pipeline import StitchOptions
+from rdstitch.options import StitchOptions
 from rdstitch.registration import Registration
 
 DISTORTION = -0.05

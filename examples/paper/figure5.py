@@ -5,7 +5,7 @@ from examples.paper.common.report import Pixels, Report, Table
 from examples.paper.common.settings import Effort, Settings
 from examples.paper.common.stitched import registration_error, stitch_files, stitch_rendered
 from rdstitch.errors import RegistrationError
-from rdstitch.pipeline import StitchOptions
+from rdstitch.options import StitchOptions
 from rdstitch.synthetic import FisheyeLens, best_division_model
 from rdstitch.synthetic.lenses import Lens
 

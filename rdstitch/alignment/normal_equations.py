@@ -14,7 +14,7 @@ from rdstitch.alignment.motion_models import ModelMatrices, inverses
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.arrays import FloatArray
-from rdstitch.scipy_parts import sparse, sparse_linalg
+from rdstitch.late_imports import sparse_linalg
 
 _LEAST_DAMPING = 1e-12
 """Relative to the diagonal: what makes poses solvable that nothing holds."""
@@ -28,8 +28,8 @@ class SparseNormalEquations:
     ----------
     blocks : PoseBlocks
         The pattern of A.
-    poses : sparse array of shape (F, F)
-        A, of the F free pose parameters.
+    poses : ndarray of shape (E,)
+        The entries of A, (F, F), of the F free pose parameters.
     coupling : ndarray of shape (F, S)
         B.
     shared : ndarray of shape (S, S)
@@ -38,7 +38,7 @@ class SparseNormalEquations:
     """
 
     blocks: PoseBlocks
-    poses: "sparse.csc_array"
+    poses: FloatArray
     coupling: FloatArray
     shared: FloatArray
     gradient_poses: FloatArray
@@ -97,13 +97,16 @@ class SparseNormalEquations:
     def _eliminate(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """The Schur complement (S, S) and ``A⁻¹ [B, gradient]``."""
         right = np.column_stack([self.coupling, self.gradient_poses])
-        if self.poses.shape[0] == 0:
+        if self.blocks.free == 0:
             return self.shared, right
-        diagonal = self.poses.data[self.blocks.diagonal]
+        diagonal = self.poses[self.blocks.diagonal]
         floor = max(float(diagonal.max()), 1e-300) * 1e-14
         damped = self.blocks.with_diagonal(self.poses, damping * diagonal + floor)
         factor = sparse_linalg.splu(
-            damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            self.blocks.matrix(damped),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
         )
         solved = factor.solve(right)
         return self.shared - self.coupling.T @ solved[:, : self.coupling.shape[1]], solved
@@ -151,7 +154,7 @@ def chain(
     pair = 2 * size
     return SparseNormalEquations(
         blocks,
-        blocks.matrix(local[:, :pair, :pair]),
+        blocks.entries(local[:, :pair, :pair]),
         blocks.sums(local[:, :pair, pair:]),
         local[:, pair:, pair:].sum(axis=0),
         blocks.sums(gradient[:, :pair]),

@@ -12,7 +12,7 @@ import numpy as np
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.scipy_parts import spatial
+from rdstitch.late_imports import spatial
 
 _CELLS = (2, 3, 4)
 """Cells per side of a link's overlap within which errors are added up; the worst counts."""

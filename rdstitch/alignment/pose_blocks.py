@@ -7,7 +7,7 @@ import numpy as np
 
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.scipy_parts import sparse
+from rdstitch.late_imports import sparse
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +23,11 @@ class PoseBlocks:
     kept : ndarray of shape (L, 2 D, 2 D), bool
         Entries of the links' blocks between free parameters.
     place : ndarray of shape (K,)
-        Where each of these is added in the data of the matrix.
+        Where each of these is added in the E entries of the matrix.
     indices, indptr : ndarray
         Of the matrix by columns; all of its diagonal is stored.
     diagonal : ndarray of shape (F,)
-        Where the diagonal lies in the data.
+        Where the diagonal lies in the entries.
     """
 
     column: IntArray
@@ -55,22 +55,22 @@ class PoseBlocks:
         indices = entries % max(total, 1)
         return cls(column, total, kept, own, indices.astype(np.int32), indptr.astype(np.int32), diagonal)
 
-    def matrix(self, local: FloatArray) -> "sparse.csc_array":
-        """The sum of blocks (L, 2 D, 2 D)."""
-        data: FloatArray = np.bincount(self.place, local[self.kept], minlength=len(self.indices)).astype(np.float64)
-        return self._of(data)
+    def entries(self, local: FloatArray) -> FloatArray:
+        """Entries of the matrix (E,) that is the sum of blocks (L, 2 D, 2 D)."""
+        return np.bincount(self.place, local[self.kept], minlength=len(self.indices)).astype(np.float64)
 
-    def with_diagonal(self, matrix: "sparse.csc_array", added: FloatArray) -> "sparse.csc_array":
-        """A matrix of this pattern with something (F,) added to its diagonal."""
-        data = matrix.data.copy()
-        data[self.diagonal] += added
-        return self._of(data)
+    def with_diagonal(self, entries: FloatArray, added: FloatArray) -> FloatArray:
+        """The entries (E,) with something (F,) added to the diagonal."""
+        entries = entries.copy()
+        entries[self.diagonal] += added
+        return entries
+
+    def matrix(self, entries: FloatArray) -> "sparse.csc_array":
+        """The matrix of some entries (E,)."""
+        return sparse.csc_array((entries, self.indices, self.indptr), shape=(self.free, self.free))
 
     def sums(self, values: FloatArray) -> FloatArray:
         """Of values (L, 2 D, ...) of each link the sum for each free parameter, (F, ...)."""
         total = np.zeros((self.free + 1, *values.shape[2:]))
         np.add.at(total, self.column, values)
         return total[:-1]
-
-    def _of(self, data: FloatArray) -> "sparse.csc_array":
-        return sparse.csc_array((data, self.indices, self.indptr), shape=(self.free, self.free))

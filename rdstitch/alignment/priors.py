@@ -23,6 +23,7 @@ tilt of a plane         0 ± 20°; 0 ± 45° (0.2)       what is laid flat is lo
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -49,7 +50,8 @@ class Prior:
         if not self.parts:
             return 0.0
         logs = self._logs(value)
-        return -2.0 * (max(logs) + math.log(sum(math.exp(log - max(logs)) for log in logs)))
+        highest = max(logs)
+        return -2.0 * (highest + math.log(sum(math.exp(log - highest) for log in logs)))
 
     def slope(self, value: float) -> float:
         """Return half the derivative of the cost."""
@@ -59,17 +61,27 @@ class Prior:
         """Return half the second derivative of the cost where the shares of the parts stay as they are: positive."""
         return sum(share / std**2 for share, (_, _, std) in self._shares(value))
 
-    def _logs(self, value: float) -> list[float]:
+    @cached_property
+    def _heights(self) -> list[float]:
+        """Logarithm of each part's density at its middle, relative to that of the core."""
         weight, _, core = self.parts[0]
-        return [math.log(w / weight * core / std) - ((value - mean) / std) ** 2 / 2.0 for w, mean, std in self.parts]
+        return [math.log(w / weight * core / std) for w, _, std in self.parts]
+
+    def _logs(self, value: float) -> list[float]:
+        return [
+            height - ((value - mean) / std) ** 2 / 2.0
+            for height, (_, mean, std) in zip(self._heights, self.parts, strict=True)
+        ]
 
     def _shares(self, value: float) -> list[tuple[float, tuple[float, float, float]]]:
         """How likely the value comes from each part, with the part."""
         if not self.parts:
             return []
         logs = self._logs(value)
-        densities = [math.exp(log - max(logs)) for log in logs]
-        return [(density / sum(densities), part) for density, part in zip(densities, self.parts, strict=True)]
+        highest = max(logs)
+        densities = [math.exp(log - highest) for log in logs]
+        total = sum(densities)
+        return [(density / total, part) for density, part in zip(densities, self.parts, strict=True)]
 
 
 def costs(priors: Sequence[Prior], values: FloatArray) -> float:

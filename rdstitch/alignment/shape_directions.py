@@ -22,8 +22,8 @@ from rdstitch.alignment.unmodelled import Effect, mapped
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.division_model import distort, undistort
+from rdstitch.late_imports import linalg
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
-from rdstitch.scipy_parts import linalg
 
 _STEP = 1e-4
 """Of differences by an effect's size, in units of its own."""

@@ -1,7 +1,8 @@
-"""Blocks of an output as tasks: workers elsewhere compute them, and they are put together here, strip by strip.
+"""Bands of an output as tasks: workers elsewhere compute them, and they are put together here, strip by strip.
 
 A block is composed as a whole output is, of the images that reach it, which the worker reads. Its strips go to a
-store that both see, so that neither they nor the images travel with tasks and results.
+store that both see, so that neither they nor the images travel with tasks and results. Blocks are bands across the
+output that are no narrower than an image, so that no image is read for more than two of them.
 """
 
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -14,8 +15,6 @@ from rdstitch.cache import Cache
 from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
 from rdstitch.opencv_state import one_opencv_thread
 from rdstitch.stored import Stored
-
-_MIN_TILES = 4  # tiles of a block, a side, at the least: images across the edges of blocks are read for each of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,21 +49,21 @@ def strips_of_blocks(
     whole: TiledOutput, run: BlockRunner, progress: ShareProgress | None = None
 ) -> Generator[OutputStrip]:
     """The strips of an output (h, W, ...) that is computed in blocks; the same, bit for bit, as here."""
-    (x0, y0, x1, y1), side = whole.box, _side(whole)
-    lefts = range(x0, x1, side)
+    (x0, y0, x1, y1), (width, height) = whole.box, _block_size(whole)
+    lefts = range(x0, x1, width)
 
     def blocks() -> Iterator[Block]:
-        for top in range(y0, y1, side):
+        for top in range(y0, y1, height):
             for left in lefts:
-                yield Block(*whole.part((left, top, min(left + side, x1), min(top + side, y1))))
+                yield Block(*whole.part((left, top, min(left + width, x1), min(top + height, y1))))
 
     with closing(run(blocks())) as done:
-        for top in range(y0, y1, side):
+        for top in range(y0, y1, height):
             row = []
             for left in lefts:
                 row.append(next(done))
                 if progress is not None:
-                    below = (min(top + side, y1) - top) * (min(left + side, x1) - x0)
+                    below = (min(top + height, y1) - top) * (min(left + width, x1) - x0)
                     progress(((top - y0) * (x1 - x0) + below) / ((x1 - x0) * (y1 - y0)))
             for parts in zip(*row, strict=True):
                 strips = [part.load() for part in parts]
@@ -76,7 +75,19 @@ def strips_of_blocks(
                 )
 
 
-def _side(whole: TiledOutput) -> int:
-    """Side of a block, canvas pixels: about that of an image, so that few blocks need the same one."""
-    sides = [max(warp.box[2] - warp.box[0], warp.box[3] - warp.box[1]) for warp in whole.renderer.warps]
-    return whole.tile_size * max(_MIN_TILES, round(float(np.median(sides)) / whole.tile_size))
+def _block_size(whole: TiledOutput) -> tuple[int, int]:
+    """Width and height of a block, canvas pixels.
+
+    Bands from left to right, each of them written when it is there; where these are too few for the workers, from top
+    to bottom. Where both are, the more numerous are made narrower, at the price of more reading.
+    """
+    boxes = [whole.renderer.support(warp.box) for warp in whole.renderer.warps]
+    fitting = []
+    for axis, length in enumerate(whole.size):
+        widest = max(box[axis + 2] - box[axis] for box in boxes)
+        fitting.append(max(length // (-(-widest // whole.tile_size) * whole.tile_size), 1))
+    axis = 1 if fitting[1] >= min(whole.workers, fitting[0]) else 0
+    count = max(fitting[axis], whole.workers)
+    size = list(whole.size)
+    size[axis] = -(-size[axis] // (count * whole.tile_size)) * whole.tile_size
+    return size[0], size[1]

@@ -131,12 +131,12 @@ def compose(
     LimitError
         When the memory limit is too low.
     """
-    with prepare_composite(images, canvas, options, progress) as prepared:
+    with prepare_composite(images, canvas, options, progress, elsewhere) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
         top = 0
-        with closing(prepared.strips(progress, elsewhere)) as strips:
+        with closing(prepared.strips(progress)) as strips:
             for samples, opaque in strips:
                 pixels[top : top + len(samples)], alpha[top : top + len(samples)] = samples, opaque
                 top += len(samples)
@@ -166,7 +166,7 @@ def compose_to_file(
     OutputError
         When the file cannot be written; nothing is left behind.
     """
-    with prepare_composite(images, canvas, options, progress) as prepared:
+    with prepare_composite(images, canvas, options, progress, elsewhere) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
         layout = Layout(
             size,
@@ -181,7 +181,7 @@ def compose_to_file(
         check_memory(file.path, size, renderer.options.max_memory)
         tags = () if file.extra_tags is None else file.extra_tags(prepared.canvas)
         # Nothing goes on behind a writer that fails.
-        with closing(prepared.strips(progress, elsewhere)) as strips:
+        with closing(prepared.strips(progress)) as strips:
             written = write_strips(file.path, layout, strips, tags, outputs=file.outputs)
     return FileComposite(
         Path(file.path),

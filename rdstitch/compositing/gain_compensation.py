@@ -12,7 +12,7 @@ With "balanced", fields tend to the brightness of each region's own images inste
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from rdstitch.compositing.overlap_cells import Cells, compare_overlaps
 from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale, no_exposure, squared_radius
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.survey import Survey
-from rdstitch.scipy_parts import sparse, sparse_linalg
+from rdstitch.late_imports import sparse
 
 _SRGB_OFFSET = 0.055
 # How well the gains of two images can explain their overlap, and how far gains stray (log units): keeps long chains
@@ -217,24 +217,31 @@ def _fit_robustly(
 def _solve(
     design: "sparse.csr_array", weight: FloatArray, values: FloatArray, prior: _Prior, start: FloatArray
 ) -> FloatArray:
-    """Weighted least squares with a prior, by conjugate gradients, in memory that grows with the number of images."""
+    """Weighted least squares with a prior, by conjugate gradients, in memory that grows with the number of images.
+
+    The columns are solved side by side: a product with the design is most of a step, and one serves them all.
+    """
     precision, expected, inverse = prior
-    shape = (design.shape[1],) * 2
+    transposed, weight = sparse.csr_array(design.T), weight[:, None]
 
     def normal(x: FloatArray) -> FloatArray:
-        return np.asarray(design.T @ (weight * (design @ x)) + precision @ x)
+        return np.asarray(transposed @ (weight * (design @ x)) + precision @ x)
 
-    def precondition(x: FloatArray) -> FloatArray:
-        return np.asarray((x.reshape(-1, len(inverse)) @ inverse).ravel())
-
-    right = design.T @ (weight[:, None] * values) + expected
-    operator, better = (
-        sparse_linalg.LinearOperator(shape, matvec=apply, dtype=np.float64) for apply in (normal, precondition)
-    )
-    options: dict[str, Any] = {"rtol": _TOLERANCE, "maxiter": _MAX_STEPS, "M": better}
-    return np.stack(
-        [sparse_linalg.cg(operator, b, x, **options)[0] for b, x in zip(right.T, start.T, strict=True)], axis=1
-    )
+    right = transposed @ (weight * values) + expected
+    x, left = start, right - normal(start)
+    enough = _TOLERANCE * np.linalg.norm(right, axis=0)
+    direction, previous = np.zeros_like(x), np.ones(x.shape[1])
+    for _ in range(_MAX_STEPS):
+        going = np.linalg.norm(left, axis=0) > enough
+        if not going.any():
+            break
+        better = np.einsum("ij,njc->nic", inverse, left.reshape(-1, len(inverse), x.shape[1])).reshape(x.shape)
+        now = (left * better).sum(axis=0)
+        direction = better + now / previous * direction
+        along = normal(direction)
+        step = np.where(going, now, 0.0) / np.where(going, (direction * along).sum(axis=0), 1.0)
+        x, left, previous = x + step * direction, left - step * along, np.where(going, now, 1.0)
+    return x
 
 
 def _medians(values: FloatArray, pair: IntArray, which: BoolArray) -> FloatArray:

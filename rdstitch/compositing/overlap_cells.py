@@ -11,7 +11,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.compositing.boxes import cut
 from rdstitch.compositing.photometric import full_scale
 from rdstitch.compositing.survey import Survey
-from rdstitch.scipy_parts import sparse
+from rdstitch.late_imports import sparse
 
 # Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.
 _CELLS, _MAX_CELLS = 16, 150_000

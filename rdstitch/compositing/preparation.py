@@ -43,24 +43,22 @@ class Prepared:
     tiles : TiledOutput
         Its pixels; their box is on the canvas of the renderer, before cropping.
     messages : tuple of Message
+    elsewhere : callable, optional
+        Computes the pixels in blocks, see :mod:`rdstitch.compositing.blocks`.
     """
 
     renderer: Renderer
     canvas: Canvas
     tiles: TiledOutput
     messages: tuple[Message, ...]
+    elsewhere: BlockRunner | None = None
 
-    def strips(
-        self, progress: ShareProgress | None = None, elsewhere: BlockRunner | None = None
-    ) -> Generator[OutputStrip]:
-        """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time.
-
-        ``elsewhere`` computes it in blocks, see :mod:`rdstitch.compositing.tiles`.
-        """
+    def strips(self, progress: ShareProgress | None = None) -> Generator[OutputStrip]:
+        """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
         progress = _part_of(progress, _PREPARATION, 1.0)
-        if elsewhere is None:
+        if self.elsewhere is None:
             return self.tiles.strips(progress)
-        return strips_of_blocks(self.tiles, elsewhere, progress)
+        return strips_of_blocks(self.tiles, self.elsewhere, progress)
 
 
 @contextmanager
@@ -69,10 +67,11 @@ def prepare_composite(
     canvas: Canvas,
     options: CompositeOptions | None = None,
     progress: ShareProgress | None = None,
+    elsewhere: BlockRunner | None = None,
 ) -> Iterator[Prepared]:
     """Decide on exposure, seams and cropping, from a small version of each image; see :func:`compose`.
 
-    Images are read ahead as long as it lasts.
+    Images are read ahead as long as it lasts, if they are needed here.
     """
     options = options or CompositeOptions()
     if len(images) != len(canvas.footprints):
@@ -84,13 +83,15 @@ def prepare_composite(
     if canvas.period is not None:
         canvas = canvas.widened(_wrap_margin(canvas, plan.bands))
     warps = plan_warps(images, canvas)
-    cache = ImageCache(reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1)
+    cache = ImageCache(
+        reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1 and elsewhere is None
+    )
     with closing(cache):
         same = no_exposure(len(images), channels)
         renderer = Renderer(warps, cache, same, None, options, plan.bands, channels, dtype)
         decided = _decided(renderer, reader, images, canvas, plan, _part_of(progress, 0.0, _PREPARATION))
         return_freed_memory()
-        yield decided
+        yield replace(decided, elsewhere=elsewhere)
 
 
 def _decided(

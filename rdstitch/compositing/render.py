@@ -86,7 +86,7 @@ class Renderer:
         What a pixel gets does not depend on the box.
         """
         blended = self.options.blend == "multiband"
-        around = self._blend_support(box) if blended else box
+        around = self.support(box)
         layers = [part for layer in self._layers(around) if (part := layer.weighted_part(around)) is not None]
         covered = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.bool_)
         for layer in layers:
@@ -102,7 +102,7 @@ class Renderer:
 
     def shown(self, box: Box) -> set[int]:
         """Find the images that a tile takes samples from, but for those where the seam map misses a pixel."""
-        around = self._blend_support(box) if self.options.blend == "multiband" else box
+        around = self.support(box)
         reaching = {index for index, warp in enumerate(self.warps) if intersection(warp.box, around) is not None}
         if self.seams is None:
             return reaching
@@ -116,7 +116,7 @@ class Renderer:
 
         It takes one of so many shares of the memory.
         """
-        around = self._blend_support(box) if self.options.blend == "multiband" else box
+        around = self.support(box)
         chosen = [index for index, warp in enumerate(self.warps) if intersection(warp.box, around) is not None]
         part = replace(
             self,
@@ -160,6 +160,10 @@ class Renderer:
             return None
         x0, y0, x1, y1 = zip(*parts, strict=True)
         return min(x0), min(y0), max(x1), max(y1)
+
+    def support(self, box: Box) -> Box:
+        """The box whose samples a box depends on."""
+        return self._blend_support(box) if self.options.blend == "multiband" else box
 
     def _blend_support(self, box: Box) -> Box:
         """The box from which weights reach a box through multi-band blending."""

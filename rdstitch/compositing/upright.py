@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
+from rdstitch.late_imports import linalg, special
 from rdstitch.planar_motion import nearest_rotation
-from rdstitch.scipy_parts import linalg, special
 
 Segment = tuple[float, float, float, float]
 Corners = tuple[float, float, float, float, float, float, float, float]

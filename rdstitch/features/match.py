@@ -14,7 +14,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.features.nearest import compare, mutual_nearest
-from rdstitch.scipy_parts import distance, spatial
+from rdstitch.late_imports import distance, spatial
 
 Matcher = Callable[[Features, Features], Correspondences]
 """Matches the features of two images: :func:`match`, or a network's."""

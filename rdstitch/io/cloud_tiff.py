@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-import tifffile
+from rdstitch.late_imports import tifffile
 
 _OFFSETS = (324, 273)  # of tiles and strips
 _ENTRY = "HH"  # of a directory, before count and value
@@ -57,7 +57,7 @@ def put_in_order(path: Path) -> None:
     ordered.replace(path)
 
 
-def _page(source: BinaryIO, page: tifffile.TiffPage | tifffile.TiffFrame) -> _Page:
+def _page(source: BinaryIO, page: "tifffile.TiffPage | tifffile.TiffFrame") -> _Page:
     assert isinstance(page, tifffile.TiffPage)
     values = {
         int(tag.code): (int(tag.dtype), int(tag.count), _bytes_at(source, tag.valueoffset, tag.valuebytecount))

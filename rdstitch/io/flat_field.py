@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 
 from rdstitch.errors import InputError
 from rdstitch.io.opening import check_readable, decoding
 from rdstitch.io.reduction import block_mean
+from rdstitch.late_imports import tifffile
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
 
-import tifffile
 from PIL import ExifTags, Image
 
 from rdstitch.camera import is_focal_length
@@ -19,6 +18,7 @@ from rdstitch.io.colour import ink_transform
 from rdstitch.io.ome_xml import read_ome
 from rdstitch.io.opening import check_megapixels, check_readable, decoding, has_late_metadata, opened_image
 from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
+from rdstitch.late_imports import tifffile
 from rdstitch.orientation import turned_size, turning_matrix
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)

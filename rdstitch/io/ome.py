@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 
 from rdstitch.io.layout import STRIP_ROWS, Layout, Strip
 from rdstitch.io.reduction import halved
 from rdstitch.io.tiff import TILE, encoded_tile, has_predictor, overview_sizes, tiles_of
+from rdstitch.late_imports import tifffile
 
 SUFFIXES = (".ome.tif", ".ome.tiff")
 

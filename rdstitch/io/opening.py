@@ -4,7 +4,6 @@ Failures of the decoders end as one InputError. Their warnings and log messages 
 process that this runs in decides what becomes of them, since Python's filters and handlers belong to all its threads.
 """
 
-import difflib
 import os
 import stat
 import struct
@@ -15,7 +14,6 @@ from pathlib import Path
 from typing import IO, BinaryIO
 
 import cv2
-import tifffile
 from PIL import (
     BmpImagePlugin,
     GifImagePlugin,
@@ -33,6 +31,7 @@ from PIL import (
 from rdstitch.errors import InputError
 from rdstitch.file_access import is_url, open_regular, remote_status
 from rdstitch.io.optional_readers import avif_factory, check_reader, heif_factory, is_raw
+from rdstitch.late_imports import tifffile
 
 # What Pillow, tifffile and OpenCV have been seen to raise on damaged files; warnings, where filters make them errors.
 _DAMAGE = (
@@ -49,7 +48,6 @@ _DAMAGE = (
     EOFError,
     struct.error,
     zlib.error,
-    tifffile.TiffFileError,  # no ValueError in older versions
     Image.DecompressionBombError,
     cv2.error,
 )
@@ -114,7 +112,9 @@ def _missing(path: Path) -> str:
         return f"no such file, since there is no folder {path.parent}; check the name"
     what = "file" if path.suffix else "folder"
     alike = [name for name in names if name.lower() == path.name.lower()]
-    alike = alike or difflib.get_close_matches(path.name, names, n=1, cutoff=0.8)
+    from difflib import get_close_matches
+
+    alike = alike or get_close_matches(path.name, names, n=1, cutoff=0.8)
     return f"no such {what}; " + (f"did you mean {path.with_name(alike[0])}?" if alike else "check the name")
 
 
@@ -144,7 +144,7 @@ def decoding(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: too large to read into memory; make it smaller first") from error
     except PermissionError as error:
         raise InputError(f"{path}: permission denied; make it readable") from error
-    except _DAMAGE as error:
+    except (*_DAMAGE, tifffile.TiffFileError) as error:
         if isinstance(error, cv2.error) and error.code == cv2.Error.StsNoMem:
             raise InputError(f"{path}: too large to read into memory; make it smaller first") from error
         reason = " ".join(str(error).split()) or type(error).__name__

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 from PIL import Image, JpegImagePlugin
 
 from rdstitch.io.deepzoom import read_deep_zoom
 from rdstitch.io.read import read_image
+from rdstitch.late_imports import tifffile
 
 _JPEG_QUALITY = 80
 _OVERVIEW_FROM = 60_000_000  # pixels; of larger TIFF files an overview is read

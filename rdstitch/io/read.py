@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import simplejpeg
-import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -23,6 +22,7 @@ from rdstitch.io.ome_xml import read_ome
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, opened_image
 from rdstitch.io.optional_readers import is_raw, read_raw
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
+from rdstitch.late_imports import tifffile
 from rdstitch.opencv_state import silent_opencv
 from rdstitch.orientation import turned
 
@@ -33,8 +33,7 @@ _OPAQUE = 255
 # A page of a TIFF file that masks the image, and how many pages are looked at for one.
 _MASK, _MASK_WITHIN = 4, 40
 
-_LAB = (tifffile.PHOTOMETRIC.CIELAB, tifffile.PHOTOMETRIC.ICCLAB)
-_PLAIN = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.MINISWHITE, tifffile.PHOTOMETRIC.RGB)
+_LAB, _PLAIN = (8, 9), (0, 1, 2)  # photometric interpretations: CIELAB, ICCLAB; white or black is 0, RGB
 
 _MAX_DECODED_REDUCTION = 8  # of the JPEG decoder
 _ROWS_AT_A_TIME = 128
@@ -307,7 +306,7 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
     return samples, mask
 
 
-def _channel_planes(tiff: tifffile.TiffFile) -> Pixels | None:
+def _channel_planes(tiff: "tifffile.TiffFile") -> Pixels | None:
     """The channels of an OME-TIFF that has them on pages of their own, (h, w, C); None of other files."""
     told = read_ome(tiff.ome_metadata)
     if told is None or not 1 < told.channels <= len(tiff.pages):

@@ -16,7 +16,6 @@ from typing import IO, Any
 
 import deflate
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
@@ -24,6 +23,7 @@ from rdstitch.io.cloud_tiff import put_in_order
 from rdstitch.io.layout import STRIP_ROWS, Layout, Strip, with_alpha
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.reduction import halved
+from rdstitch.late_imports import tifffile
 
 TILE = 256
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
@@ -79,7 +79,7 @@ def _has_mask(layout: Layout) -> bool:
 
 
 def _write_page(
-    tiff: tifffile.TiffWriter,
+    tiff: "tifffile.TiffWriter",
     layout: Layout,
     size: tuple[int, int],
     strips: Iterable[NDArray[Any]],
@@ -123,7 +123,7 @@ def _without_alpha(strips: Iterable[NDArray[Any]], mask: list[bytes]) -> Iterato
         yield strip[..., :-1]
 
 
-def _write_mask(tiff: tifffile.TiffWriter, size: tuple[int, int], tiles: list[bytes], kind: int) -> None:
+def _write_mask(tiff: "tifffile.TiffWriter", size: tuple[int, int], tiles: list[bytes], kind: int) -> None:
     """Write the page that says where the page before it has an image."""
     tiff.write(
         iter(tiles),

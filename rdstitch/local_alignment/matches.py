@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.late_imports import spatial
 from rdstitch.radial_homography import from_plane, to_plane
-from rdstitch.scipy_parts import spatial
 
 # Matches that the alignment expects farther away than this share of the image's diagonal are taken to be wrong; where
 # the ground rises by a tenth of the camera's height, and the alignment is that of the valleys, right ones are nearly as

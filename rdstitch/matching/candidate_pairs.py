@@ -12,10 +12,10 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.late_imports import sparse, spatial
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.retrieval import Similarity, similarity
 from rdstitch.radial_homography import from_plane, to_plane
-from rdstitch.scipy_parts import sparse, spatial
 
 EXHAUSTIVE_UP_TO = 30
 """Number of images up to which every pair is tried."""

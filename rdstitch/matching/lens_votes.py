@@ -8,11 +8,11 @@ from typing import Self
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.late_imports import sparse, sparse_linalg
 from rdstitch.matching.thinning import spread_choice
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.own_lenses import OwnLenses, own_lenses
-from rdstitch.scipy_parts import sparse, sparse_linalg
 
 _MAX_DISTANCE = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two
 _MAX_MATCHES = 250  # matches of a pair that are used

@@ -13,8 +13,8 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray
 from rdstitch.division_model import undistort
+from rdstitch.late_imports import spatial
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.scipy_parts import spatial
 from rdstitch.solvers.direct_linear import direct_linear
 
 _NEIGHBOURS = 6

@@ -8,7 +8,6 @@ from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.stored_frame import stored, turned_alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.camera_files.hugin import HEAD, hugin_lens
 from rdstitch.errors import ArgumentError
 from rdstitch.orientation import quarter_turn, turning_matrix
 from rdstitch.planar_motion import nearest_rotation, rotation_from_tilt
@@ -28,6 +27,8 @@ def project_of_hugin(result: StitchResult) -> str:
     ArgumentError
         When images have no files, or no poses: the model with one homography for each.
     """
+    from rdstitch.camera_files.hugin import HEAD, hugin_lens
+
     registration, sources = result.registration, result.registration.sources
     if any(source.frame is not None and source.frame.number is not None for source in sources):
         raise ArgumentError("Hugin opens image files, not frames of videos; write them as files first")

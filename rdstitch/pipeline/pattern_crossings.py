@@ -14,12 +14,12 @@ from rdstitch.features.crossings import find_crossings
 from rdstitch.features.options import CLOSER, WORK_MEGAPIXELS
 from rdstitch.features.prepared_image import Stretch, prepare
 from rdstitch.inputs.source import Source
+from rdstitch.late_imports import spatial
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.robust.verification import places
-from rdstitch.scipy_parts import spatial
 
 _MEGAPIXELS = WORK_MEGAPIXELS * CLOSER
 _ROUNDS = 2  # of matching, the second one with the lens that the first one has found

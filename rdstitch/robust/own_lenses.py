@@ -14,6 +14,7 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD
 from rdstitch.division_model import MAX_ABS_DISTORTION
+from rdstitch.late_imports import spatial
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.covariance import covariances
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, descend
@@ -21,7 +22,6 @@ from rdstitch.robust.linearization import PairLenses, differentiate, entry_equat
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.model_selection import loss_width, noise_of
 from rdstitch.robust.pair_models import HomographyPairModel
-from rdstitch.scipy_parts import spatial
 
 _HOMOGRAPHY = HomographyPairModel()
 _OWN_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of image 1, λ of image 2, μ, and the distortion centre

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.scipy_parts import special
+from rdstitch.late_imports import special
 
 _CELLS_PER_DIAGONAL = 32
 _CELL_STRIDE = 2.0**20
@@ -24,7 +24,7 @@ _MAX_CHANCE = 1e-4
 def places(points1: FloatArray, points2: FloatArray, image_size: tuple[int, int]) -> int:
     """In how many cells of a grid the matches (N, 2), pixels, lie, in the image in which these are fewer."""
     cell = float(np.hypot(*image_size)) / _CELLS_PER_DIAGONAL
-    return min(len(np.unique(numbered_cells(points / cell))) for points in (points1, points2))
+    return min(len(set(numbered_cells(points / cell).tolist())) for points in (points1, points2))
 
 
 def numbered_cells(points: FloatArray) -> FloatArray:

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import platform
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -239,6 +238,8 @@ def _pairs(result: StitchResult) -> list[dict[str, Any]]:
 
 def versions() -> dict[str, str]:
     """Versions of what has a say in the result."""
+    from importlib.metadata import version
+
     import scipy
 
     return {

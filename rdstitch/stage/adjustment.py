@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.scipy_parts import sparse, sparse_linalg
+from rdstitch.late_imports import sparse, sparse_linalg
 from rdstitch.stage.grid import TileGrid
 
 _ROUNDS = 12

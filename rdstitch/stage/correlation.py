@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.scipy_parts import fft
+from rdstitch.late_imports import fft
 from rdstitch.stage.overlap import Overlap
 
 Image = NDArray[np.float32]

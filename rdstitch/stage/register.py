@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.io.reduction import block_mean
+from rdstitch.late_imports import csgraph, sparse
 from rdstitch.progress import Progress, silent
-from rdstitch.scipy_parts import csgraph, sparse
 from rdstitch.stage.adjustment import Adjustment, LinkedPoints, adjust
 from rdstitch.stage.correlation import Surfaces, best_place, correlate
 from rdstitch.stage.grid import TileGrid

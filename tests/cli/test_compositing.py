@@ -12,7 +12,8 @@ from rdstitch_cli.main import cli
 from rdstitch.compositing import CompositeOptions
 from rdstitch.io import read_image
 from rdstitch.io.deepzoom import read_deep_zoom
-from rdstitch.pipeline import StitchOptions, mosaic
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.recipes import mosaic
 from tests.cli.running import CACHED, Run
 
 LIBRARY_ONLY = {"bands", "tile_size", "workers"}

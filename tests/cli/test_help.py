@@ -10,7 +10,7 @@ from rdstitch_cli.main import EXIT_STATUSES, cli
 from rdstitch_cli.stitching import stitch_options
 from rdstitch_cli.terminal import Reporter
 
-from rdstitch.pipeline import StitchOptions
+from rdstitch.options import StitchOptions
 from tests.cli.running import Run
 
 COMMANDS = sorted(set(cli.commands) - {"help"})

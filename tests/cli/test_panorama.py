@@ -13,8 +13,9 @@ from PIL import Image
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions
-from rdstitch.pipeline import StitchOptions, pano
+from rdstitch.options import StitchOptions
 from rdstitch.pipeline.compose import viewed_images
+from rdstitch.pipeline.recipes import pano
 from rdstitch.report.camera_path import view_directions
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry

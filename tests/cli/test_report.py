@@ -18,7 +18,8 @@ from rdstitch.compositing import CompositeOptions
 from rdstitch.io import preview, read_image
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline import accept, calibrate, pano
+from rdstitch.pipeline import accept
+from rdstitch.pipeline.recipes import calibrate, pano
 from rdstitch.progress import StageTimer
 from rdstitch.report import geometry as thumbnails
 from rdstitch.report import report_page, write_report

@@ -71,7 +71,7 @@ def apply(
     shape. Compositing options that are not given are those of the sidecar.
     """
     from rdstitch.messages import told_once
-    from rdstitch.pipeline import apply as recipe
+    from rdstitch.pipeline.apply_sidecar import apply as recipe
     from rdstitch.sidecar.read import read_sidecar
 
     given = {name: value for name, value in compositing.items() if options.is_given(name)}

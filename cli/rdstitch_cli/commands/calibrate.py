@@ -56,7 +56,7 @@ def calibrate(
     """
     from rdstitch.alignment.lens_description import describe_camera
     from rdstitch.camera_files import export_note
-    from rdstitch.pipeline import calibrate as recipe
+    from rdstitch.pipeline.recipes import calibrate as recipe
 
     wanted = stitch_options(reporter, save_camera=output, **given)
     paths = options.resolve(inputs)

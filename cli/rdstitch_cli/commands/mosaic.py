@@ -81,8 +81,10 @@ def mosaic(
     list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
-    from rdstitch.pipeline import mosaic as recipe
-    from rdstitch.pipeline import mosaic_blocks, poses_table, project_of_hugin
+    from rdstitch.pipeline.hugin_project import project_of_hugin
+    from rdstitch.pipeline.poses import poses_table
+    from rdstitch.pipeline.recipes import mosaic as recipe
+    from rdstitch.pipeline.recipes import mosaic_blocks
 
     if all_blocks and (following or given["strict"]):
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")

@@ -42,8 +42,8 @@ def pano(
     INPUT is what 'rdstitch mosaic' takes, but every image must be readable. The image goes to the output,
     everything estimated to the output's name with .json added, and λ to standard output.
     """
-    from rdstitch.pipeline import pano as recipe
-    from rdstitch.pipeline import project_of_hugin
+    from rdstitch.pipeline.hugin_project import project_of_hugin
+    from rdstitch.pipeline.recipes import pano as recipe
 
     paths = options.resolve(inputs)
     report_page = Report(report, reporter, paths, given["overwrite"], output)

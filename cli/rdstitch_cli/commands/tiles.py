@@ -96,8 +96,8 @@ def tiles(
     brightened.
     """
     from rdstitch.compositing import CompositeOptions
-    from rdstitch.pipeline import place_tiles
-    from rdstitch.pipeline import tiles as recipe
+    from rdstitch.pipeline.stage_tiles import place_tiles
+    from rdstitch.pipeline.stage_tiles import tiles as recipe
     from rdstitch.stage import TileOptions
 
     if output is None and positions_only is None:

@@ -91,8 +91,8 @@ def trajectory(
     poses are printed as frames arrive.
     """
     from rdstitch.export.trajectory_files import frame_of
-    from rdstitch.pipeline import trajectory as recipe
     from rdstitch.pipeline.follow import FollowedPoses
+    from rdstitch.pipeline.recipes import trajectory as recipe
 
     with ExitStack() as stack:
         stitch = stitch_options(reporter, **given)

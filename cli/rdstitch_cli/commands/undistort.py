@@ -57,7 +57,7 @@ def undistort(
     INPUT is what 'rdstitch mosaic' takes. The lens comes from a camera file, as 'rdstitch pano --save-camera' and
     'rdstitch calibrate' write it, or is given as λ for half the image diagonal.
     """
-    from rdstitch.pipeline import undistort as recipe
+    from rdstitch.pipeline.undistort_images import undistort as recipe
 
     if (camera is None) == (distortion is None):
         raise click.UsageError("give either --camera FILE or --lambda L")

@@ -12,9 +12,9 @@ from typing import Any
 
 def rdstitch(output: str, images: Sequence[str]) -> int:
     """``rdstitch mosaic`` without any setting."""
-    errors, pipeline = import_module("rdstitch.errors"), import_module("rdstitch.pipeline")
+    errors, package = import_module("rdstitch.errors"), import_module("rdstitch")
     try:
-        pipeline.mosaic(images, output)
+        package.mosaic(images, output)
     except errors.RdstitchError as error:
         print(error, file=sys.stderr)
         return int(error.exit_status)

@@ -12,7 +12,8 @@ from examples.paper.common.report import Pixels
 from rdstitch.alignment import Alignment
 from rdstitch.errors import RegistrationError
 from rdstitch.io.read import read_image
-from rdstitch.pipeline import StitchOptions, calibrate, mosaic
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.recipes import calibrate, mosaic
 from rdstitch.radial_homography import to_plane
 from rdstitch.registration import Registration
 from rdstitch.synthetic import Sequence

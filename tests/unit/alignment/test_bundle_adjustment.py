@@ -71,7 +71,8 @@ def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: flo
         assert analytic == pytest.approx(numeric, rel=1e-5)
 
     # the step solves the dense system
-    dense = np.block([[normal.poses.toarray(), normal.coupling], [normal.coupling.T, normal.shared]])
+    poses = normal.blocks.matrix(normal.poses).toarray()
+    dense = np.block([[poses, normal.coupling], [normal.coupling.T, normal.shared]])
     right = -np.concatenate([normal.gradient_poses, normal.gradient_shared])
     damped = dense + 1e-3 * np.diag(np.diag(dense))
     np.testing.assert_allclose(np.concatenate(normal.solve(1e-3)), np.linalg.solve(damped, right), rtol=1e-6, atol=1e-9)
@@ -112,7 +113,8 @@ def test_information_on_shared_parameters_is_what_elimination_leaves() -> None:
         1.0,
     )
     normal = normal.with_priors(np.full(int(free.sum()), 1e4), np.zeros(int(free.sum())), np.eye(4), np.zeros(4))
-    dense = np.block([[normal.poses.toarray(), normal.coupling], [normal.coupling.T, normal.shared]])
+    poses = normal.blocks.matrix(normal.poses).toarray()
+    dense = np.block([[poses, normal.coupling], [normal.coupling.T, normal.shared]])
     expected = np.linalg.inv(np.linalg.inv(dense)[-4:, -4:])
     np.testing.assert_allclose(normal.shared_information(), expected, rtol=1e-5, atol=1e-5)
 

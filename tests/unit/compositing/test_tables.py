@@ -10,7 +10,8 @@ from rdstitch.compositing import CompositeOptions, compose
 from rdstitch.compositing.tables import CompositeTables
 from rdstitch.errors import ArgumentError
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline import apply, pano
+from rdstitch.pipeline.apply_sidecar import apply
+from rdstitch.pipeline.recipes import pano
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import Scene, grey, render
 

@@ -19,7 +19,10 @@ from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.georeference import Georeference, georeference
 from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition, GroundControl
-from rdstitch.pipeline import StitchOptions, apply, mosaic, poses_table
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.apply_sidecar import apply
+from rdstitch.pipeline.poses import poses_table
+from rdstitch.pipeline.recipes import mosaic
 from rdstitch.radial_homography import from_plane
 from rdstitch.report import report_page
 from tests.cli.running import flight, transfers

@@ -7,7 +7,8 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.messages import Message
-from rdstitch.pipeline import StitchOptions, pano
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.recipes import pano
 from rdstitch.synthetic import Photometry, camera_rotations, turning_sequence
 from tests.sampled import sampled
 

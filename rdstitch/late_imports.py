@@ -1,27 +1,39 @@
-"""SciPy's parts, imported when they are first used: most of what a start would take, and no run needs all of them."""
+"""Large modules, imported when they are first used: most of what a start would take, and no run needs all of them."""
 
 from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 
-class _Part(ModuleType):
+class _Late(ModuleType):
     def __getattr__(self, name: str) -> Any:
         return getattr(import_module(self.__name__), name)
 
 
 if TYPE_CHECKING:
+    import tifffile
     from scipy import fft, linalg, ndimage, sparse, spatial, special
     from scipy.sparse import csgraph
     from scipy.sparse import linalg as sparse_linalg
     from scipy.spatial import distance
 else:
-    fft, linalg, ndimage, sparse, spatial, special, csgraph, sparse_linalg, distance = map(
-        _Part,
+    fft, linalg, ndimage, sparse, spatial, special, csgraph, sparse_linalg, distance, tifffile = map(
+        _Late,
         (
             *("scipy.fft", "scipy.linalg", "scipy.ndimage", "scipy.sparse", "scipy.spatial", "scipy.special"),
-            *("scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial.distance"),
+            *("scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial.distance", "tifffile"),
         ),
     )
 
-__all__ = ["csgraph", "distance", "fft", "linalg", "ndimage", "sparse", "sparse_linalg", "spatial", "special"]
+__all__ = [
+    "csgraph",
+    "distance",
+    "fft",
+    "linalg",
+    "ndimage",
+    "sparse",
+    "sparse_linalg",
+    "spatial",
+    "special",
+    "tifffile",
+]
