@@ -214,7 +214,7 @@ class Camera:
         nearest, scale = nearest_one_parameter(self._radii2(), self.distortion, self.higher)
         straight = undistort(np.stack([radii, np.zeros_like(radii)], axis=-1), self.distortion, self.higher)
         other = distort(straight / scale, nearest)[..., 0]
-        return np.asarray((radii - other) * self.half_diagonal)
+        return np.asarray((radii - other) * self.scale)
 
     @property
     def sees_beyond_horizon(self) -> bool:
@@ -225,13 +225,13 @@ class Camera:
     def _corner_radius(self) -> float:
         """Distance of the farthest corner from the centre, or of the edge of the image circle, half diagonals."""
         farthest = (max(c, n - 1 - c) + 0.5 for c, n in zip(self.center, self.image_size, strict=True))
-        return min(math.hypot(*farthest), self.image_circle or math.inf) / self.half_diagonal
+        return min(math.hypot(*farthest), self.image_circle or math.inf) / self.scale
 
     def _radii2(self) -> FloatArray:
         """Squared radii, half diagonals, of points evenly over the image, as far as it can be undistorted."""
         x, y = self.normalize(points_over(self.image_size, _GRID)).T
         squares: FloatArray = x**2 + y**2
-        farthest = self.drawn_radius / self.half_diagonal
+        farthest = self.drawn_radius / self.scale
         return squares[(squares > 0.0) & (squares <= farthest**2)]
 
     @property
@@ -240,17 +240,17 @@ class Camera:
         circle = self.image_circle or math.inf
         if not self.sees_beyond_horizon:
             return circle
-        return min(circle, stretch_radius(self.distortion, self.higher, _MAX_STRETCH) * self.half_diagonal)
+        return min(circle, stretch_radius(self.distortion, self.higher, _MAX_STRETCH) * self.scale)
 
     @property
-    def half_diagonal(self) -> float:
-        """Half the image diagonal, or the radius of a smaller image circle, pixels: the scale ``s`` of λ's frame."""
+    def scale(self) -> float:
+        """The scale ``s`` of λ's frame, pixels: half the image diagonal, or the radius of a smaller image circle."""
         return min(math.hypot(*self.image_size) / 2, self.image_circle or math.inf)
 
     @property
     def distortion_px(self) -> float:
         """:attr:`nearest_distortion` for points in pixels from the centre: ``λ / s²``, 1/px²."""
-        return self.nearest_distortion / self.half_diagonal**2
+        return self.nearest_distortion / self.scale**2
 
     @property
     def distortion_focal(self) -> float | None:
@@ -268,7 +268,7 @@ class Camera:
         """The camera with a focal length; without one given, with a guessed one where none is known."""
         if focal is None and self.focal is not None:
             return self
-        guessed = _GUESSED_FOCAL * self.half_diagonal if focal is None else focal
+        guessed = _GUESSED_FOCAL * self.scale if focal is None else focal
         return replace(self, focal=guessed, focal_source=source, focal_std=std)
 
     def with_coefficients(self, distortion: float, distortion2: float = 0.0, distortion3: float = 0.0) -> Self:
@@ -281,12 +281,12 @@ class Camera:
         return Camera(self.image_size, center=self.center, image_circle=self.image_circle)
 
     def normalize(self, points: ArrayLike) -> FloatArray:
-        """Pixels (..., 2) to normalized points, in half diagonals from the centre."""
-        return (np.asarray(points, dtype=np.float64) - self.center) / self.half_diagonal
+        """Pixels (..., 2) to normalized points, from the centre in units of :attr:`scale`."""
+        return (np.asarray(points, dtype=np.float64) - self.center) / self.scale
 
     def denormalize(self, points: ArrayLike) -> FloatArray:
-        """Normalized points (..., 2), in half diagonals from the centre, to pixels."""
-        return np.asarray(points, dtype=np.float64) * self.half_diagonal + self.center
+        """Normalized points (..., 2), from the centre in units of :attr:`scale`, to pixels."""
+        return np.asarray(points, dtype=np.float64) * self.scale + self.center
 
     def undistort(self, points: ArrayLike) -> FloatArray:
         """Measured pixels (..., 2) to the pixels of a lens without distortion; NaN outside the model's domain."""

@@ -326,5 +326,5 @@ class RadialHomography:
 
 def _pixel_matrix(camera: Camera) -> FloatArray:
     """Matrix (3, 3) from half-diagonal-normalized to pixel coordinates."""
-    s, (cx, cy) = camera.half_diagonal, camera.center
+    s, (cx, cy) = camera.scale, camera.center
     return np.array([[s, 0.0, cx], [0.0, s, cy], [0.0, 0.0, 1.0]])

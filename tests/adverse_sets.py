@@ -112,7 +112,7 @@ def adverse_set(kind: str, seed: int) -> Sequence:
     size = (400, 300)
     lens = Camera(size, distortion=float(rng.uniform(-0.3, 0.0)), focal=float(rng.uniform(0.8, 1.4) * size[0]))
     if kind == "off centre":
-        angle, far = rng.uniform(0.0, 2.0 * np.pi), lens.half_diagonal * rng.uniform(0.05, 0.2)
+        angle, far = rng.uniform(0.0, 2.0 * np.pi), lens.scale * rng.uniform(0.05, 0.2)
         x, y = np.array(lens.center) + far * np.array([np.cos(angle), np.sin(angle)])
         lens = replace(lens, center=(float(x), float(y)))
     count = 6 if kind == "blurred" else int(rng.integers(3, 7))

@@ -82,7 +82,7 @@ def scene(
     """
     lens = lens or Camera(size, distortion=distortion)
     size, distortion = lens.image_size, lens.nearest_distortion
-    ratio = focal / lens.half_diagonal
+    ratio = focal / lens.scale
     shared = TILTING.shared_from_physical(np.array([*tilt, np.log(ratio)]))
     truth = TILTING.matrices(poses * [1, ratio, ratio, 1, 1 / ratio, 1 / ratio], shared).matrices
     cameras = [Camera(size, focal=guess or focal, focal_source=focal_source) for _ in poses]

@@ -146,11 +146,11 @@ def _odd_lens(lens: Camera, rng: np.random.Generator) -> Lens:
     assert lens.focal is not None
     kind = int(rng.integers(3))
     if kind == 0:
-        x, y = np.array(lens.center) + lens.half_diagonal * rng.normal(0.0, 0.02, 2)
+        x, y = np.array(lens.center) + lens.scale * rng.normal(0.0, 0.02, 2)
         return replace(lens, center=(float(x), float(y)))
     if kind == 1:
         return replace(lens, distortion2=float(rng.uniform(-0.08, 0.08)))
-    square = (lens.focal / lens.half_diagonal) ** 2
+    square = (lens.focal / lens.scale) ** 2
     k2 = float(rng.uniform(-0.01, 0.03)) * square**2
     p1, p2 = rng.uniform(-0.002, 0.002, 2).tolist()
     return BrownLens(lens.image_size, lens.focal, k1=0.4 * lens.distortion * square, k2=k2, p1=p1, p2=p2)

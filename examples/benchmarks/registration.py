@@ -81,7 +81,7 @@ def _lomsac(homlib: Any, function: str, pair: PairMatches) -> tuple[float, float
     """Seconds and λ of homlib's estimator of a pair, with the options that ours has."""
     camera = pair.camera1
     options = homlib.LORansacOptions()
-    options.squared_inlier_threshold = (3.0 / camera.half_diagonal) ** 2
+    options.squared_inlier_threshold = (3.0 / camera.scale) ** 2
     options.success_probability = 0.999
     options.max_num_iterations = 10_000
     options.final_least_squares = True

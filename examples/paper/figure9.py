@@ -103,7 +103,7 @@ def _from_solver(d: Drive, solver: MinimalSolver) -> _Path:
 def _focal_normalized(d: Drive, homography: FloatArray) -> FloatArray:
     """From half diagonals to focal lengths."""
     assert d.camera.focal is not None
-    k = np.array([d.camera.focal, d.camera.focal, d.camera.half_diagonal])
+    k = np.array([d.camera.focal, d.camera.focal, d.camera.scale])
     normalized: FloatArray = homography * (k / k[:, None])
     return normalized
 
@@ -130,7 +130,7 @@ def _adjusted(d: Drive, start: Trajectory, tilt: tuple[float, float], distortion
     """All frames adjusted with the rigid model from a trajectory, a tilt and a λ."""
     cameras, count = d.blank_cameras, len(start)
     assert d.camera.focal is not None
-    focal = d.camera.focal / d.camera.half_diagonal
+    focal = d.camera.focal / d.camera.scale
     natural = np.array([*tilt, np.log(focal)])
     poses = np.zeros((count, 6))
     poses[:, YAW], poses[:, [X, Y]] = start.yaw, start.position * focal

@@ -117,7 +117,7 @@ def build_alignment(found: AdjustedImages) -> Alignment:
     def adjusted_camera(camera: Camera) -> Camera:
         result = _with_lens(found, camera, lens, (lens_covariance, considered))
         if focal is not None and focal_std is not None:
-            size = camera.half_diagonal
+            size = camera.scale
             result = result.with_focal(focal * size, "estimate", focal_std * size)
         return replace(result, tilt=tilt, tilt_std=tilt_std)
 
@@ -192,7 +192,7 @@ def _with_lens(
 ) -> Camera:
     """The camera of an image with the lens that was found; covariances of what was estimated, and of all of a lens."""
     covariance, considered = covariances
-    center = np.asarray(camera.center) + lens[CENTER] * camera.half_diagonal
+    center = np.asarray(camera.center) + lens[CENTER] * camera.scale
     estimated = bool(covariance.any())
     result = replace(
         camera,
@@ -291,7 +291,7 @@ def _overruled_focal(found: AdjustedImages, camera: Camera) -> str | None:
     given = found.problem.camera_priors
     if given.focal_source != "exif" or not found.choice.fit.model.one_camera or camera.focal is None:
         return None
-    ratio = camera.focal / camera.half_diagonal / math.exp(given.log_focal)
+    ratio = camera.focal / camera.scale / math.exp(given.log_focal)
     if abs(math.log(ratio)) < math.log(_OVERRULED):
         return None
     times = f"{ratio:.1f} times the one" if ratio > 1.0 else f"1/{1.0 / ratio:.1f} of the one"

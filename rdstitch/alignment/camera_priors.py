@@ -80,6 +80,6 @@ class CameraPriors:
 def known_focal(cameras: Sequence[Camera]) -> tuple[float, float, str]:
     """Mean and standard deviation of the logarithm of the focal length in half diagonals, and where it comes from."""
     known = [camera for camera in cameras if camera.focal is not None] or [cameras[0].with_focal()]
-    ratios = [camera.focal / camera.half_diagonal for camera in known if camera.focal is not None]
+    ratios = [camera.focal / camera.scale for camera in known if camera.focal is not None]
     vaguest = max(known, key=lambda camera: camera.focal_log_std)
     return float(np.log(np.median(ratios))), vaguest.focal_log_std, vaguest.focal_source or "guess"

@@ -47,7 +47,7 @@ def describe_lens(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
     middle = (np.array(camera.image_size) - 1.0) / 2.0
     if free[CENTER].all():
         x, y = camera.center
-        dx, dy = std[CENTER] * camera.half_diagonal
+        dx, dy = std[CENTER] * camera.scale
         off = float(np.linalg.norm(camera.center - middle))
         lines.append(f"centre {x:.1f} ± {dx:.1f}, {y:.1f} ± {dy:.1f} pixels, {off:.1f} off the middle of the image")
     else:
@@ -94,4 +94,4 @@ def radius_std(camera: Camera, radii: FloatArray) -> FloatArray:
     by_coefficient = by_coefficient - np.outer(by_scale, area @ by_coefficient / max(float(area @ by_scale), 1e-300))
     covariance = np.array(camera.lens_covariance)[:3, :3]
     variance = np.einsum("ni,ij,nj->n", by_coefficient, covariance, by_coefficient)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)) * camera.half_diagonal)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)) * camera.scale)

@@ -176,7 +176,7 @@ def _choose_by_some(
     return replace(choice, apart=apart)
 
 
-def _distance(simple: BundleAdjustmentResult, rich: BundleAdjustmentResult, half_diagonal: float) -> float:
+def _distance(simple: BundleAdjustmentResult, rich: BundleAdjustmentResult, scale: float) -> float:
     """Largest distance of the places at which two lenses measure the same rays, pixels, at the best common scale."""
     radii = np.linspace(0.0, 1.0, _RADII + 1)[1:]
     (distortion, *higher), other = rich.parameters.lens[:3].tolist(), float(simple.parameters.lens[0])
@@ -188,7 +188,7 @@ def _distance(simple: BundleAdjustmentResult, rich: BundleAdjustmentResult, half
         known = np.isfinite(difference) & np.isfinite(slope)
         # Radii count by the area that they stand for.
         scale *= 1.0 - float((radii * slope * difference)[known].sum() / (radii * slope**2)[known].sum())
-    return float(np.nanmax(np.abs(difference))) * half_diagonal
+    return float(np.nanmax(np.abs(difference))) * scale
 
 
 def _images(observations: Observations) -> int:

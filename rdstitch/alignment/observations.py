@@ -56,7 +56,7 @@ class Observations:
     def from_links(cls, links: Sequence[Link], cameras: Sequence[Camera], most: int | None = None) -> Self:
         """Of each link at most about ``most`` correspondences, well spread over its overlap."""
         thinned = [link.thinned(most) for link in links]
-        sizes = [camera.half_diagonal for camera in cameras]
+        sizes = [camera.scale for camera in cameras]
         index1, index2 = np.array([(link.image1, link.image2) for link in links], dtype=np.intp).reshape(-1, 2).T
         empty = [np.empty((0, 2))]
         return cls(
@@ -68,7 +68,7 @@ class Observations:
             np.array([sizes[i] for i in index1]),
             np.array([sizes[j] for j in index2]),
             np.array([len(link) for link in links], dtype=np.intp),
-            min([1.0, *(camera.drawn_radius / camera.half_diagonal for camera in cameras)]),
+            min([1.0, *(camera.drawn_radius / camera.scale for camera in cameras)]),
         )
 
     def __len__(self) -> int:

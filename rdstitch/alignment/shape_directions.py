@@ -154,7 +154,7 @@ def places(found: Directions, cameras: Sequence[Camera], count: int) -> tuple[Fl
     flat = (ground - np.nanmean(ground, axis=0)) / max(float(np.nanstd(ground)), 1e-12)
     frame = [np.outer(own, unit).reshape(-1, 2) for own in (np.ones(len(flat)), *flat.T) for unit in np.eye(2)]
     frame += [flat * flat[:, [axis]] for axis in (0, 1)]
-    by_ground = here.by_ground(ground) * np.array([camera.half_diagonal for camera in cameras])[images, None, None]
+    by_ground = here.by_ground(ground) * np.array([camera.scale for camera in cameras])[images, None, None]
     moved, by_frame = (np.einsum("pab,pbs->pas", by_ground, np.stack(each, axis=2)) for each in (columns, frame))
     seen = np.isfinite(moved).all(axis=(1, 2)) & np.isfinite(by_frame).all(axis=(1, 2))
     moved, by_frame = moved[seen], by_frame[seen]

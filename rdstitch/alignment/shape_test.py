@@ -60,7 +60,7 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
     at = *places(found, cameras, tried), problem.count
     usual = _Prediction.of(effects, information, gradient, *at, max(1.0, probed))
     extreme = _Prediction.of(effects, _with_extremes(information, effects), gradient, *at, max(1.0, probed))
-    diagonals = np.array([2.0 * camera.half_diagonal for camera in cameras])
+    diagonals = np.array([2.0 * camera.scale for camera in cameras])
     judged, off = usual, np.hypot(usual.shifts, usual.stds)
     # Extreme cases count where the errors show them. Where the images only fail to exclude them, as along any row, no
     # image would be good enough.

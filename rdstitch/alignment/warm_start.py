@@ -56,7 +56,7 @@ class WarmStart:
         own[:, LOG_HEIGHT] = logs - median
         own[:, [PSI, THETA]] = (poses.tilt[images] - np.array(tilt)) / focal  # free, or zero
         found, given = former.cameras[0], cameras[0]
-        center = (np.asarray(found.center) - np.asarray(given.center)) / given.half_diagonal
+        center = (np.asarray(found.center) - np.asarray(given.center)) / given.scale
         lens = np.where(free_lens, [*found.coefficients, *center], lens)
         shared = model.shared_from_physical(np.array([*tilt, np.log(focal)]))
         return cls(model, Parameters(own, shared, lens), former.tilt_spread)

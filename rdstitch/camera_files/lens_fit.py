@@ -121,7 +121,7 @@ def fit_lens(forward: Forward, camera: Camera) -> tuple[Camera, LensFit]:
             best = lens, fit
         if best[1].largest <= _EXACT_ERROR:
             break
-    if best is None or best[1].largest > _MAX_ERROR * camera.half_diagonal:
+    if best is None or best[1].largest > _MAX_ERROR * camera.scale:
         raise ArgumentError("the lens is far from every lens that the division model can describe")
     return best
 
@@ -141,7 +141,7 @@ def _fit_divisor(radius2: FloatArray, divisor: FloatArray, weights: FloatArray, 
 def _rays(forward: Forward, camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points along rays from the centre to the border of the measured image: straight, measured, and their areas."""
     angles = np.arange(_RAYS) * (2.0 * np.pi / _RAYS)
-    radii = np.linspace(0.0, _REACH * camera.half_diagonal, _SAMPLES + 1)[1:]
+    radii = np.linspace(0.0, _REACH * camera.scale, _SAMPLES + 1)[1:]
     rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None] * radii[None, :, None] + camera.center
     with np.errstate(all="ignore"):
         measured = forward(rays.reshape(-1, 2)).reshape(rays.shape)

@@ -168,8 +168,8 @@ def _is_rather(fisheye: CameraFile, brown: CameraFile) -> bool:
     camera, one, other = brown.camera, fisheye.fit, brown.fit
     if camera.focal is None or one is None or other is None:
         return False
-    wide = camera.half_diagonal > _WIDE * camera.focal
-    return wide and other.largest > max(_ASYMMETRIC * camera.half_diagonal, _TIMES_CLOSER * one.largest)
+    wide = camera.scale > _WIDE * camera.focal
+    return wide and other.largest > max(_ASYMMETRIC * camera.scale, _TIMES_CLOSER * one.largest)
 
 
 def _size(record: _OpenCV, center: tuple[float, float], image_size: ImageSize | None) -> tuple[int, int]:

@@ -62,10 +62,10 @@ class NearPart:
     def _shown(self, width: int, height: int) -> NDArray[np.bool_]:
         """Which pixels of the image at a size are drawn; in measured coordinates the limit is a conic."""
         camera = self.camera.resized((width, height))
-        x = (np.arange(width) - camera.center[0]) / camera.half_diagonal
+        x = (np.arange(width) - camera.center[0]) / camera.scale
         shown = np.empty((height, width), dtype=np.bool_)
         for top in range(0, height, _ROWS):
-            y = ((np.arange(top, min(top + _ROWS, height)) - camera.center[1]) / camera.half_diagonal)[:, None]
+            y = ((np.arange(top, min(top + _ROWS, height)) - camera.center[1]) / camera.scale)[:, None]
             radius2 = x**2 + y**2
             lens = np.zeros_like(radius2)
             for coefficient in (*reversed(camera.coefficients), 1.0):  # Horner's scheme, in place
@@ -127,5 +127,5 @@ def _stretch(camera: Camera, matrix: FloatArray, resolution: float) -> tuple[Flo
         plane = moved[:, :2] / depth[:, None]
         jacobian = (matrix[None, :2, :2] - plane[:, :, None] * matrix[None, 2:, :2]) / depth[:, None, None]
         jacobian = np.where((depth > 0.0)[:, None, None], jacobian, 0.0)
-        largest = np.linalg.norm(jacobian, 2, axis=(1, 2)) * resolution / camera.half_diagonal
+        largest = np.linalg.norm(jacobian, 2, axis=(1, 2)) * resolution / camera.scale
     return np.where(depth > 0.0, largest, np.inf), depth

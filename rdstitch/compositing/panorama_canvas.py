@@ -139,7 +139,7 @@ def plan_panorama(
         return plan_canvas(cameras, directions, max_stretch=max_stretch, **how)
     called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
     lengths = np.linalg.norm(directions, axis=1)
-    focal = lengths[:, 2] / lengths[:, 0] * [camera.half_diagonal for camera in cameras]
+    focal = lengths[:, 2] / lengths[:, 0] * [camera.scale for camera in cameras]
     resolution = scale * float(np.median(focal) if reference is None else focal[reference])
     extent = np.array(chosen.extent(max_stretch))
     if chosen.periodic:

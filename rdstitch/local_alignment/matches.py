@@ -142,7 +142,7 @@ def place_matches(matches: Iterable[Match], images: ImagesOnPlane) -> Iterator[P
     for match in matches:
         pair, measured = (match.image1, match.image2), np.stack([match.points1, match.points2], axis=1)
         placed = np.stack([images.to_plane(k, measured[:, part]) for part, k in enumerate(pair)], axis=1)
-        radius = _SEARCH_RADIUS * min(2.0 * images.cameras[k].half_diagonal for k in pair)
+        radius = _SEARCH_RADIUS * min(2.0 * images.cameras[k].scale for k in pair)
         near = np.linalg.norm(placed[:, 0] - placed[:, 1], axis=1) < radius
         if (count := int(near.sum())) >= _MIN_MATCHES:
             yield PlaneMatches(np.tile(np.array(pair), (count, 1)), measured[near], placed[near])

@@ -169,7 +169,7 @@ def _at_size(features: Features, size: Size) -> Features:
     """Features in pixels of the image at another size."""
     before = features.image_size
     assert before is not None
-    factor = Camera(size).half_diagonal / Camera(before).half_diagonal
+    factor = Camera(size).scale / Camera(before).scale
     return replace(
         features, points=_moved(features.points, before, size), scale=features.scale * factor, image_size=size
     )

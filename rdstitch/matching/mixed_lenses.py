@@ -58,7 +58,7 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     """
     if not len(votes):
         return None
-    count, gap = len(cameras), max(_MIN_GAP, _MIN_GAP_PX / min(camera.half_diagonal for camera in cameras))
+    count, gap = len(cameras), max(_MIN_GAP, _MIN_GAP_PX / min(camera.scale for camera in cameras))
     divisions = [found for found in _divisions(count, votes) if abs(found[1][1] - found[1][0]) >= gap]
     if not divisions:
         return None

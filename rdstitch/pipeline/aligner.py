@@ -234,7 +234,7 @@ def select_by_whole_lens(aligner: Aligner, aligned: AlignedPairs) -> AlignedPair
 
 def _same_lens(former: Camera, found: Camera) -> bool:
     """Whether no parameter of a lens has changed by more than its standard deviation."""
-    before, after = (np.array([*c.coefficients, *np.array(c.center) / c.half_diagonal]) for c in (former, found))
+    before, after = (np.array([*c.coefficients, *np.array(c.center) / c.scale]) for c in (former, found))
     variance = 0.0 if found.lens_covariance is None else np.diag(found.lens_covariance)
     return bool(((after - before) ** 2 <= variance).all())
 

@@ -194,7 +194,7 @@ def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registr
             f"({tiled.grid.source}) or the overlap may be wrong; --search PX looks farther"
         )
     cameras = [replace(source.camera, distortion=fitted.distortion) for source in sources]
-    half = cameras[0].half_diagonal
+    half = cameras[0].scale
     places = fitted.places - fitted.places[0]
     if fitted.distortion == 0.0:
         # Without a lens to take out every sample can stay as it was measured.

@@ -202,7 +202,7 @@ def undistorted_canvas(camera: Camera, view: Framing) -> Canvas:
     size = np.maximum(np.floor(high - low + 1e-6), 1).astype(int)
     shift = -(low + 0.5)
     matrix = np.eye(3)
-    matrix[:2, :2] *= camera.half_diagonal
+    matrix[:2, :2] *= camera.scale
     matrix[:2, 2] = np.array(camera.center) + shift
     return Canvas((int(size[0]), int(size[1])), matrix, (outline + shift,))
 

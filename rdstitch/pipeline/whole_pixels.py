@@ -45,8 +45,8 @@ def on_whole_pixels(registration: Registration) -> Registration:
     own, homographies = cameras[alignment.reference], np.full_like(alignment.homographies, np.nan)
     for index, shift in zip(np.flatnonzero(alignment.used), whole, strict=True):
         camera = cameras[index]
-        middle = (shift + camera.center - own.center) / own.half_diagonal
-        homographies[index] = np.diag([unit * camera.half_diagonal / own.half_diagonal] * 2 + [1.0])
+        middle = (shift + camera.center - own.center) / own.scale
+        homographies[index] = np.diag([unit * camera.scale / own.scale] * 2 + [1.0])
         homographies[index][:2, 2] = frame[:2, 2] + unit * middle
     return replace(
         registration, alignment=replace(alignment, cameras=cameras, homographies=homographies, distortion=0.0)

@@ -149,9 +149,7 @@ def _curve(camera: Camera, radii: FloatArray, counts: FloatArray) -> str:
         parts.append(label(_LEFT - 6, y + 4, f"{value:+.2f}" if value else "0", text_anchor="end"))
     for share in np.linspace(0.0, 1.0, 6):
         x = float(_LEFT + share * (right - _LEFT))
-        parts.append(
-            label(x, _HEIGHT - _BOTTOM + 16, f"{share * radii[-1] * camera.half_diagonal:.0f}", text_anchor="middle")
-        )
+        parts.append(label(x, _HEIGHT - _BOTTOM + 16, f"{share * radii[-1] * camera.scale:.0f}", text_anchor="middle"))
     parts.append(label(_WIDTH / 2, _HEIGHT - 8, "pixels from the distortion centre", text_anchor="middle"))
     parts.append(label(_LEFT, _TOP - 8, "pixels farther out than the one-parameter lens"))
     return drawing(_WIDTH, _HEIGHT, parts, "the lens against the one-parameter lens")

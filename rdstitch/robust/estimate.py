@@ -58,7 +58,7 @@ class PairMatches:
     def focal(self) -> float:
         """Focal length in half diagonals."""
         assert self.camera1.focal is not None
-        return self.camera1.focal / self.camera1.half_diagonal
+        return self.camera1.focal / self.camera1.scale
 
     @property
     def batch_key(self) -> tuple[int, float, float, bool]:

@@ -52,7 +52,7 @@ class Measurements:
         for row, (both, pair_cameras) in enumerate(zip(points, cameras, strict=True)):
             for side, (measured, camera) in enumerate(zip(both, pair_cameras, strict=True)):
                 x[side, row, :, : counts[row]] = camera.normalize(measured).T
-        size1, size2 = (np.array([pair[side].half_diagonal for pair in cameras]) for side in (0, 1))
+        size1, size2 = (np.array([pair[side].scale for pair in cameras]) for side in (0, 1))
         return cls(x[0], x[1], np.arange(width) < counts[:, None], counts, size2, size2 / size1)
 
     @classmethod

@@ -317,11 +317,7 @@ class Tracker:
             cameras = [camera.with_coefficients(known) for camera in cameras]
         if self._focal is not None:
             # Another focal length would give other heights: those of one map must not depend on the window.
-            half_diagonals = (camera.half_diagonal for camera in cameras)
-            cameras = [
-                camera.with_focal(self._focal * size, "option")
-                for camera, size in zip(cameras, half_diagonals, strict=True)
-            ]
+            cameras = [camera.with_focal(self._focal * camera.scale, "option") for camera in cameras]
         options = replace(
             self._options.alignment,
             model=self._model,

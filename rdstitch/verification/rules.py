@@ -74,7 +74,7 @@ def _errors(found: Evidence) -> Iterator[Finding]:
     rms, relief = alignment.rms, alignment.relief
     if rms <= limit("error") * threshold:
         return
-    largest = limit("error that relief explains") * 2.0 * max(camera.half_diagonal for camera in alignment.cameras)
+    largest = limit("error that relief explains") * 2.0 * max(camera.scale for camera in alignment.cameras)
     # Without what neighbours have in common, errors are those of a plane.
     explained = rms <= largest and rms**2 - relief.size**2 <= (limit("error") * threshold) ** 2
     # Where the pixels agree, depth that one surface does not explain has been found a place all the same.
@@ -173,7 +173,7 @@ def _second_motion(found: Evidence) -> Iterator[Finding]:
     if compared is not None:
         clear = compared.won or (clear and not compared.lost)
     worst = max(motions, key=lambda own: own.area)
-    off = min(worst.disagreement, 2.0 * found.alignment.cameras[worst.images[0]].half_diagonal)
+    off = min(worst.disagreement, 2.0 * found.alignment.cameras[worst.images[0]].scale)
     values = {"share": share, "place": worst.center, "shown": worst.images, "off": off}
     if found.alignment.on_sphere:
         yield Finding("parallax", worst.images, "warning", {"size": off, "share": share})
@@ -232,7 +232,7 @@ as before."""
 
 
 def _bent(found: Evidence) -> bool:
-    return found.flat and _size_of_shape(found) < min(2.0 * camera.half_diagonal for camera in found.alignment.cameras)
+    return found.flat and _size_of_shape(found) < min(2.0 * camera.scale for camera in found.alignment.cameras)
 
 
 def _seen(found: Evidence) -> bool:

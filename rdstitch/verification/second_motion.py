@@ -60,9 +60,7 @@ class SecondMotion:
     @property
     def is_far(self) -> bool:
         """Whether it moves by more than tree tops do, as far as its images are known."""
-        return (
-            self.relation is None or self.disagreement > limit("far motion") * 2.0 * self.relation.camera.half_diagonal
-        )
+        return self.relation is None or self.disagreement > limit("far motion") * 2.0 * self.relation.camera.scale
 
 
 def find_second_motions(
@@ -105,7 +103,7 @@ def _second_motion(
     camera, points = alignment.cameras[pair.image1], pair.correspondences.points1
     plane = _cells(points[errors < threshold], camera)
     disagreement = 0.0 if found is None else float(np.median(errors[found.inliers]))
-    if found is None or disagreement < limit("motion") * 2.0 * camera.half_diagonal:
+    if found is None or disagreement < limit("motion") * 2.0 * camera.scale:
         return SecondMotion(pair.images, 0, len(plane))
     u, v = np.median(points[found.inliers], axis=0).tolist()
     area = _cells(points[found.inliers], camera) - plane

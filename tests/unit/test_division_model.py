@@ -73,7 +73,7 @@ def test_what_a_fisheye_sees_beyond_the_horizon_is_masked(coefficients: tuple[fl
     assert np.isfinite(camera.undistort(outline)).all()
     inner, outer = (np.linalg.norm(camera.undistort(camera.denormalize([[r, 0.0]])) - camera.center) for r in
                     (border.max() - 1e-3, border.max()))  # fmt: skip
-    assert 15.0 < (outer - inner) / (1e-3 * camera.half_diagonal) < 21.0
+    assert 15.0 < (outer - inner) / (1e-3 * camera.scale) < 21.0
     assert not Camera((640, 480), -0.9).sees_beyond_horizon
 
 
@@ -94,7 +94,7 @@ def test_nearest_lambda_is_what_a_fit_of_measured_points_gives() -> None:
 
     scale = 1.0 / nearest_one_parameter(radii**2, lens.distortion, lens.higher)[1]
     best = misfit(nearest, scale)
-    assert rms == pytest.approx(np.sqrt(best) * lens.half_diagonal, rel=1e-6)
+    assert rms == pytest.approx(np.sqrt(best) * lens.scale, rel=1e-6)
     assert rms < largest
     for distortion, factor in ((nearest + 0.002, scale), (nearest - 0.002, scale), (nearest, 1.002 * scale)):
         assert misfit(distortion, factor) > best

@@ -101,7 +101,7 @@ def _lomsac(homlib: Any, function: str) -> Callable[[FloatArray, FloatArray, tup
     def run(points1: FloatArray, points2: FloatArray, size: tuple[int, int]) -> Estimate:
         camera = Camera(size)
         options = homlib.LORansacOptions()
-        options.squared_inlier_threshold = (THRESHOLD / camera.half_diagonal) ** 2
+        options.squared_inlier_threshold = (THRESHOLD / camera.scale) ** 2
         options.success_probability = CONFIDENCE
         options.max_num_iterations = ITERATIONS
         options.final_least_squares = True
@@ -134,7 +134,7 @@ def _magsac(cv2: Any) -> Callable[[FloatArray, FloatArray, tuple[int, int]], Est
 
 def _normalized(homography: FloatArray, camera: Camera) -> FloatArray:
     """From px to half diagonals."""
-    (cx, cy), s = camera.center, camera.half_diagonal
+    (cx, cy), s = camera.center, camera.scale
     to_pixels = np.array([[s, 0.0, cx], [0.0, s, cy], [0.0, 0.0, 1.0]])
     normalized: FloatArray = np.linalg.inv(to_pixels) @ homography @ to_pixels
     return normalized

@@ -29,7 +29,7 @@ def all_solvers(camera: Camera, tilt: tuple[float, float]) -> list[MinimalSolver
     ``camera``: with a focal length. ``tilt``: (ψ, θ), radians, for the solvers that are told it.
     """
     assert camera.focal is not None
-    given = partial(minimal_solvers, camera.focal / camera.half_diagonal, 0.01)
+    given = partial(minimal_solvers, camera.focal / camera.scale, 0.01)
     told, untold, flat = given(True, None), given(False, None), given(True, 0.0)
     told = [replace(solver, solve=_with_tilt(solver, tilt)) for solver in told]
     names = {

@@ -36,10 +36,10 @@ def _pair_errors(found: Alignment, truth: Scene) -> np.ndarray:
             x = camera.normalize(link.points1)
             right = truth.truth[link.image2] @ np.linalg.inv(truth.truth[link.image1])
             should = transfer(right, truth.distortion, x)
-            center = (np.array(found.cameras[0].center) - camera.center) / camera.half_diagonal
+            center = (np.array(found.cameras[0].center) - camera.center) / camera.scale
             own = found.relation(link.image1, link.image2)
             there = transfer(own, found.distortion, x - center) + center
-            errors.append(np.linalg.norm(there - should, axis=1) * camera.half_diagonal)
+            errors.append(np.linalg.norm(there - should, axis=1) * camera.scale)
     return np.concatenate(errors)
 
 
@@ -120,7 +120,7 @@ def test_focal_length_that_is_guessed_wrong_is_found() -> None:
     found = _run(given)
     assert found.focal is not None
     assert found.focal_std is not None
-    true = 520.0 / given.cameras[0].half_diagonal
+    true = 520.0 / given.cameras[0].scale
     assert found.focal_std < 0.05 * true
     assert abs(found.focal - true) < 4 * found.focal_std
     assert found.cameras[0].focal_source == "estimate"
@@ -328,7 +328,7 @@ def test_small_tilts_do_not_ask_for_a_short_focal_length() -> None:
     given = scene(poses, noise=0.5, per_link=60, relief=0.02, reach=2, focal_source=None, rng=rng)
     found = _run(given, model="tilting", lens="division")
     assert found.focal is not None
-    assert abs(math.log(found.focal * given.cameras[0].half_diagonal / 520.0)) < 0.3
+    assert abs(math.log(found.focal * given.cameras[0].scale / 520.0)) < 0.3
 
 
 def test_matches_off_by_less_than_a_lens_is_exact_agree() -> None:

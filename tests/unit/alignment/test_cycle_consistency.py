@@ -67,7 +67,7 @@ def test_a_link_is_suspected_by_what_its_covariance_allows(shift: float, noise: 
     given = scene(grid(3, 3, (0.3, 0.25), 0.1, rng), noise=noise, outliers=0.0, per_link=40, rng=rng)
     wrong = next(k for k, link in enumerate(given.links) if (link.image1, link.image2) == (3, 4))
     link = given.links[wrong]
-    moved = link.points2 + shift * given.cameras[0].half_diagonal * np.array([0.6, 0.8])
+    moved = link.points2 + shift * given.cameras[0].scale * np.array([0.6, 0.8])
     links = [replace(link, points2=moved) if k == wrong else other for k, other in enumerate(given.links)]
     suspects, confirmed = _judged(given, links)
     assert np.flatnonzero(suspects).tolist() == [wrong] * suspected

@@ -57,7 +57,7 @@ def test_a_fisheye_off_centre_is_found() -> None:
     covariance = np.array(found.cameras[0].lens_covariance)
     assert covariance.shape == (len(LENS_PARAMETERS),) * 2
     offset = np.array(found.cameras[0].center) - FISHEYE.center
-    assert (np.abs(offset) < 5.0 * np.sqrt(np.diag(covariance))[3:] * found.cameras[0].half_diagonal + 0.1).all()
+    assert (np.abs(offset) < 5.0 * np.sqrt(np.diag(covariance))[3:] * found.cameras[0].scale + 0.1).all()
     assert "simpler lenses more" in found.lens_reason
 
 

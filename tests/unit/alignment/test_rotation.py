@@ -20,7 +20,7 @@ LENS = Camera((640, 480), -0.2, focal=554.0, focal_source="guess")
 def _links(rotations: np.ndarray, rng: np.random.Generator, noise: float = 0.2, count: int = 120) -> list[Link]:
     """Matches between all images that overlap, with their true homographies."""
     assert LENS.focal is not None
-    focal = LENS.focal / LENS.half_diagonal
+    focal = LENS.focal / LENS.scale
     k = np.diag([focal, focal, 1.0])
     links = []
     for i in range(len(rotations)):
@@ -113,7 +113,7 @@ def test_a_full_turn_closes_and_gives_lens_and_focal_length() -> None:
     assert found.on_sphere
     assert found.distortion == pytest.approx(-0.2, abs=0.002)
     assert found.focal is not None
-    assert found.focal * LENS.half_diagonal == pytest.approx(554.0, rel=0.003)
+    assert found.focal * LENS.scale == pytest.approx(554.0, rel=0.003)
     middle = np.array([(319.5, 239.5)])
     for i in range(13):
         j = (i + 1) % 13
@@ -141,7 +141,7 @@ def test_a_turn_of_cropped_images_with_parallax_is_a_turn() -> None:
     axis = np.array(LENS.center) - cut
     np.testing.assert_allclose(found.cameras[0].center, axis, atol=6.0)
     assert found.focal is not None
-    assert found.focal * found.cameras[0].half_diagonal == pytest.approx(554.0, rel=0.02)
+    assert found.focal * found.cameras[0].scale == pytest.approx(554.0, rel=0.02)
 
 
 def test_a_shift_over_a_plane_is_no_turn() -> None:

@@ -51,7 +51,7 @@ def _miss(seed: int, shared_keypoints: bool) -> float:
         rows.append((points[i][both], points[j][both]))
     count = np.array([len(first) for first, _ in rows])
     image1, image2 = np.array(PAIRS).T
-    size = np.full(len(PAIRS), LENS.half_diagonal)
+    size = np.full(len(PAIRS), LENS.scale)
     start = np.concatenate([[0], np.cumsum(count)]).astype(np.intp)
     first, second = (np.concatenate([row[side] for row in rows]) for side in (0, 1))
     observations = Observations(image1, image2, start, first, second, size, size, count)

@@ -49,7 +49,7 @@ def _views(
             if inside.sum() < count:
                 continue
             p1, p2 = (p[inside][:count] + rng.normal(0.0, 0.2, (count, 2)) for p in (first, second))
-            k = np.diag([FOCAL / lens.half_diagonal, FOCAL / lens.half_diagonal, 1.0])
+            k = np.diag([FOCAL / lens.scale, FOCAL / lens.scale, 1.0])
             relation = RadialHomography(
                 k @ rotations[j] @ rotations[i].T @ np.linalg.inv(k), given, given, np.ones(count, dtype=np.bool_)
             )
@@ -67,7 +67,7 @@ def _turn(step: float, *, pitch: float = 0.0, moved: float = 0.0, **options: obj
 
 def _focal_error(found: Alignment) -> float:
     assert found.focal is not None
-    return abs(found.focal * Camera(SIZE).half_diagonal / FOCAL - 1.0)
+    return abs(found.focal * Camera(SIZE).scale / FOCAL - 1.0)
 
 
 @pytest.mark.parametrize("moved", [0.0, 0.03])

@@ -105,9 +105,9 @@ def test_of_a_foreign_file_the_lens_is_fitted_and_the_residual_reported(
     assert found.camera.nearest_distortion == pytest.approx(camera.distortion + camera.distortion2, abs=0.006)
     # The residual is what a user sees: px between the two lenses. The file's own model is off by some px too.
     apart = np.linalg.norm(found.camera.distort(camera.undistort(_points(camera))) - _points(camera), axis=1)
-    assert apart.max() < found.fit.largest + 0.002 * camera.half_diagonal
+    assert apart.max() < found.fit.largest + 0.002 * camera.scale
     assert found.fit.rms <= found.fit.largest
-    assert found.fit.largest < 0.004 * camera.half_diagonal
+    assert found.fit.largest < 0.004 * camera.scale
 
 
 @pytest.mark.parametrize("name", ["c.yml", "opencv.json"])

@@ -24,7 +24,7 @@ def test_one_flat_image_is_its_own_canvas() -> None:
 
 
 def test_neighbours_side_by_side() -> None:
-    step = 100 / FLAT.half_diagonal
+    step = 100 / FLAT.scale
     canvas = plan_canvas([FLAT, FLAT], np.stack([np.eye(3), _shift(step, 0.0)]))
     assert canvas.size == (500, 300)
     assert canvas.box(1)[0] == 99 or canvas.box(1)[0] == 100

@@ -169,7 +169,7 @@ def test_what_only_one_image_shows_colours_nothing(share: float, noise: float) -
         frames = [np.clip(frame + rng.normal(0, noise, frame.shape), 0, 255).astype(np.uint8) for frame in frames]
     lens = Camera((width, height))
     places = np.array([np.eye(3), np.eye(3)])
-    places[1, 1, 2] = step / lens.half_diagonal
+    places[1, 1, 2] = step / lens.scale
     images = place_images([partial(as_image, frame) for frame in frames], [lens] * 2, places)
     result = compose(images, plan_canvas([lens] * 2, places), CompositeOptions(blend="none"))
     first, second = frames[0], frames[1]
@@ -254,8 +254,8 @@ def test_crop_keeps_no_hole_and_most_of_the_image() -> None:
 def test_crop_that_would_keep_little_is_not_done() -> None:
     """Images that meet at their corners only."""
     lens = Camera((100, 80))
-    steps = [np.array([[1.0, 0.0, 100.0 * k], [0.0, 1.0, 80.0 * k], [0.0, 0.0, lens.half_diagonal]]) for k in range(6)]
-    matrices = np.stack([step @ np.diag([lens.half_diagonal] * 2 + [1.0]) for step in steps])
+    steps = [np.array([[1.0, 0.0, 100.0 * k], [0.0, 1.0, 80.0 * k], [0.0, 0.0, lens.scale]]) for k in range(6)]
+    matrices = np.stack([step @ np.diag([lens.scale] * 2 + [1.0]) for step in steps])
     canvas = plan_canvas([lens] * 6, matrices)
     sources = [partial(as_image, np.full((80, 100), 50, np.uint8))] * 6
     result = compose(place_images(sources, [lens] * 6, matrices), canvas, CompositeOptions(crop="auto"))

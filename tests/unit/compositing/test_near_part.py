@@ -16,7 +16,7 @@ from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.radial_homography import to_plane
 
 LENS = Camera((400, 300), distortion=-0.2, focal=300.0)
-FOCAL = 300.0 / LENS.half_diagonal
+FOCAL = 300.0 / LENS.scale
 
 
 def _image_to_plane(tilt: float) -> FloatArray:
@@ -25,7 +25,7 @@ def _image_to_plane(tilt: float) -> FloatArray:
 
 
 def _near(tilt: float, max_stretch: float = 3.0) -> NearPart | None:
-    resolution = FOCAL * LENS.half_diagonal  # of the image straight from above
+    resolution = FOCAL * LENS.scale  # of the image straight from above
     return near_parts([LENS], [_image_to_plane(tilt)], resolution, max_stretch)[0]
 
 
@@ -44,7 +44,7 @@ def test_nothing_is_drawn_beyond_the_stretch(tilt: float) -> None:
     assert inside.all()
     # Along the line of sight, a pixel of the image at most three times as long as that of one from above.
     steps = np.stack([to_plane(LENS, _image_to_plane(tilt), outline + np.array([0.0, s])) for s in (-0.05, 0.05)])
-    along = np.linalg.norm(steps[1] - steps[0], axis=1) / 0.1 * FOCAL * LENS.half_diagonal
+    along = np.linalg.norm(steps[1] - steps[0], axis=1) / 0.1 * FOCAL * LENS.scale
     finest = float(along.min())
     assert along.max() < 3.0 * max(finest, 1.0) * 1.6  # a little more where the lens itself stretches
     assert along.max() > 2.0

@@ -42,7 +42,7 @@ def _row(count: int) -> tuple[Survey, list[PlacedImage]]:
     """Tiny images side by side, each half over the next, and by turns darker and brighter."""
     lens = Camera((32, 24), distortion=0.0, focal=32.0)
     frames = [np.full((24, 32, 3), 100 + 20 * (k % 2), dtype=np.uint8) for k in range(count)]
-    step = 16 / lens.half_diagonal
+    step = 16 / lens.scale
     places = np.array([[[1, 0, k * step], [0, 1, 0], [0, 0, 1]] for k in range(count)], dtype=np.float64)
     cameras = [lens] * count
     images = place_images([partial(as_image, frame) for frame in frames], cameras, places)

@@ -26,7 +26,7 @@ def test_a_seam_runs_where_two_images_look_alike(place: int, swapped: bool) -> N
         frames.append(np.tile(row[None, :, None], (SIZE[1], 1, 3)))
     lens = Camera(SIZE)
     move = np.eye(3)
-    move[0, 2] = SHIFT / lens.half_diagonal
+    move[0, 2] = SHIFT / lens.scale
     homographies = np.stack([np.eye(3), move])
     if swapped:  # whichever is added last
         frames, homographies = frames[::-1], homographies[::-1]
@@ -48,7 +48,7 @@ def test_a_seam_avoids_fine_detail_that_is_off_by_a_pixel() -> None:
     path = 800 + 60 * np.sin(np.arange(height) / 120)[:, None]
     off = np.where((np.abs(column - path) < 30)[..., None], grain, np.roll(grain, 1, axis=1))
     frames, lens, move = [grain[:, :width], off[:, shift:]], Camera((width, height)), np.eye(3)
-    move[0, 2] = shift / lens.half_diagonal
+    move[0, 2] = shift / lens.scale
     homographies = np.stack([np.eye(3), move])
     canvas = plan_canvas([lens, lens], homographies)
     images = place_images([partial(as_image, frame) for frame in frames], [lens, lens], homographies)

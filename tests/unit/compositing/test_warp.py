@@ -86,7 +86,7 @@ def test_coverage_ends_half_a_pixel_outside() -> None:
     base = plan_canvas([lens], np.eye(3)[None])
     for shift, first in ((0.3, 0), (0.7, 1)):
         matrix = np.eye(3)
-        matrix[0, 2] = shift / lens.half_diagonal
+        matrix[0, 2] = shift / lens.scale
         canvas = type(base)((60, 40), base.matrix, (base.footprints[0] + (shift, 0.0),))
         result = compose(
             place_images([lambda: as_image(np.full((40, 50), 9, np.uint8))], [lens], matrix[None]), canvas, PLAIN

@@ -35,7 +35,7 @@ def homographies(sequence: Sequence, level: float | None = None) -> FloatArray:
     # A plane parallel to that of the texture: similar to it from each camera's foot.
     lowered = np.stack([np.array([[s, 0, (1 - s) * x], [0, s, (1 - s) * y], [0, 0, 1.0]])
                         for s, (x, y) in zip(share, poses.position, strict=True)])  # fmt: skip
-    scale = np.diag([LENS.half_diagonal / 520.0] * 2 + [1.0])
+    scale = np.diag([LENS.scale / 520.0] * 2 + [1.0])
     return np.stack([lowered[k] @ np.linalg.inv(sequence.from_plane(k)) @ scale for k in range(len(poses))])
 
 

@@ -135,7 +135,7 @@ def test_images_without_features_look_like_none() -> None:
 def test_images_that_overlap_by_a_fifth_are_neighbours(overlap: float, found: list[object], size: float) -> None:
     """Of the smaller footprint: the second image may have been taken from nearer."""
     lens = Camera((640, 480))
-    width, height = 639 / lens.half_diagonal, 479 / lens.half_diagonal
+    width, height = 639 / lens.scale, 479 / lens.scale
     x = (0.5 - size * (overlap - 0.5)) * width
     shifted = np.array([[size, 0.0, x], [0.0, size, (1 - size) * height / 4], [0.0, 0.0, 1.0]])
     assert neighbours([lens, lens], np.stack([np.eye(3), shifted]), set()) == found
@@ -240,7 +240,7 @@ def test_of_a_turn_neighbours_are_those_that_see_a_part_of_each_other(focal: flo
     count, camera = 36, Camera((640, 480))
     turned = Rotation.from_rotvec(np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None] * [0, 1, 0]).as_matrix()
     found = neighbours([camera] * count, turned @ np.diag([1.0, 1.0, focal]), set(), on_sphere=True)
-    half = np.degrees(np.arctan2(320.0, focal * camera.half_diagonal))
+    half = np.degrees(np.arctan2(320.0, focal * camera.scale))
     reach = min(5, int(2.0 * half * 0.8 // 10.0))
     assert reach >= 1
     apart = {min((j - i) % count, (i - j) % count) for i, j in found}

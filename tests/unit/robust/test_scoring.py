@@ -32,7 +32,7 @@ def test_errors_are_those_of_the_transfer(distortion: float) -> None:
     data = _measurements()
     found = transfer_errors2(H[None], np.array([distortion]), np.zeros(1, dtype=np.intp), data)[0, :40]
     moved = transfer(H, distortion, data.x1[0, :, :40].T)
-    expected = (((moved - data.x2[0, :, :40].T) * CAMERAS[1].half_diagonal) ** 2).sum(axis=1)
+    expected = (((moved - data.x2[0, :, :40].T) * CAMERAS[1].scale) ** 2).sum(axis=1)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 

@@ -27,7 +27,7 @@ def _placed(
     """A window of the plane; ``put`` so many pixels beside its place."""
     seen = PLANE[top : top + SIZE[1], left : left + SIZE[0]] if pixels is None else pixels
     matrix = np.eye(3)
-    matrix[:2, 2] = (np.array([left, top]) + put) / LENS.half_diagonal
+    matrix[:2, 2] = (np.array([left, top]) + put) / LENS.scale
     return ComparedImage(np.ascontiguousarray(seen, dtype=np.float32), LENS, matrix)
 
 

@@ -54,7 +54,7 @@ def _images(covered: float, count: int = 2) -> list[Grey]:
 def _shift(pixels: float) -> FloatArray:
     """As a homography from image 1 to image 2."""
     matrix = np.eye(3)
-    matrix[0, 2] = -pixels / LENS.half_diagonal
+    matrix[0, 2] = -pixels / LENS.scale
     return matrix
 
 

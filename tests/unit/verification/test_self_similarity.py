@@ -19,7 +19,7 @@ def _placed(
     plane: np.ndarray, left: int, top: int, *, put: tuple[float, float] = (0.0, 0.0), scale: float = 1.0
 ) -> ComparedImage:
     matrix = np.diag([scale, scale, 1.0])
-    matrix[:2, 2] = scale * (np.array([left, top]) + put) / LENS.half_diagonal
+    matrix[:2, 2] = scale * (np.array([left, top]) + put) / LENS.scale
     return ComparedImage(np.ascontiguousarray(plane[top : top + 192, left : left + 256], np.float32), LENS, matrix)
 
 

@@ -25,7 +25,7 @@ def _image(stains: np.ndarray, left: int, top: int, put: tuple[int, int] = (0, 0
     clean = plane[top : top + SIZE[1], left : left + SIZE[0]]
     seen = clean + np.random.default_rng(seed).normal(0.0, 0.005, clean.shape)
     matrix = np.eye(3)
-    matrix[:2, 2] = (np.array([left, top]) + put) / LENS.half_diagonal
+    matrix[:2, 2] = (np.array([left, top]) + put) / LENS.scale
     return ComparedImage(seen.astype(np.float32), LENS, matrix)
 
 
@@ -54,7 +54,7 @@ def test_stains_say_by_how_many_periods_an_image_is_off(periods: tuple[int, int]
     put = periods[0] * PERIOD[0], periods[1] * PERIOD[1]
     placed = {0: _image(TWO, 150, 100, put), 4: _image(TWO, 213, 128, seed=1)}
     found = unique_shifts(placed, [(0, 4)])[0, 4]
-    assert found.shift * LENS.half_diagonal == pytest.approx([-put[0], -put[1]], abs=1.0)
+    assert found.shift * LENS.scale == pytest.approx([-put[0], -put[1]], abs=1.0)
     assert found.share > 0.9
     assert found.rival < found.matched / 3.0
 
