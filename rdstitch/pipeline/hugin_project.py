@@ -72,7 +72,7 @@ def _pose(alignment: Alignment, k: int) -> dict[str, float]:
     poses = alignment.poses
     if poses is None:
         focal = alignment.cameras[k].with_focal().focal or 1.0
-        scaled = alignment.homographies[k] @ np.diag([1.0, 1.0, focal / alignment.cameras[k].half_diagonal])
+        scaled = alignment.homographies[k] @ np.diag([1.0, 1.0, focal / alignment.cameras[k].scale])
         rotation = nearest_rotation(scaled * np.sign(np.linalg.det(scaled)))
         place = {}
     else:
@@ -96,7 +96,7 @@ def _panorama(alignment: Alignment, used: list[int]) -> str:
     if alignment.poses is None:
         width = 2 * round(math.pi * focal)
         return f'p f2 w{width} h{width // 2} v360 n"TIFF_m c:LZW"'
-    reach = camera.half_diagonal / focal + np.abs(alignment.poses.position[used]).max(axis=0)
+    reach = camera.scale / focal + np.abs(alignment.poses.position[used]).max(axis=0)
     half = np.minimum(reach, math.tan(math.radians(_LARGEST_VIEW / 2)))
     width, height = (2 * math.ceil(side * focal) for side in half.tolist())
     return f'p f0 w{width} h{height} v{2 * math.degrees(math.atan(width / 2 / focal)):.8g} n"TIFF_m c:LZW"'

@@ -78,7 +78,7 @@ def _upright(placed: PlacedImages, options: UprightOptions) -> tuple[FloatArray 
     focal = _focal(placed)
     start = nearest_rotation(np.asarray(np.linalg.inv(to_axes(frame, focal.value))))
     camera = placed.cameras[placed.reference]
-    pixel = 1.0 / camera.half_diagonal
+    pixel = 1.0 / camera.scale
     said: list[Message] = []
     if options.rectangle is not None:
         corners = _in_reference(placed, np.reshape(options.rectangle, (4, 2)))
@@ -115,7 +115,7 @@ def _focal(placed: PlacedImages) -> Focal:
         return Focal(float(lengths[2] / lengths[0]))
     camera = placed.cameras[placed.reference].with_focal()
     assert camera.focal is not None
-    return Focal(camera.focal / camera.half_diagonal, camera.focal_log_std)
+    return Focal(camera.focal / camera.scale, camera.focal_log_std)
 
 
 def _in_reference(placed: PlacedImages, points: FloatArray) -> FloatArray:
@@ -143,7 +143,7 @@ def _edges(placed: PlacedImages) -> Edges:
         flat = camera.normalize(camera.undistort(image.to_full_size(ends))).reshape(-1, 2, 2)[clear]
         flat = flat[np.linalg.norm(flat[:, 1] - flat[:, 0], axis=1) > _MIN_LENGTH]
         found.append(np.concatenate([flat, np.ones((len(flat), 2, 1))], axis=2) @ to_reference[k].T)
-        error = max(error, _DETECTION * float(image.factor.max()) / camera.half_diagonal)
+        error = max(error, _DETECTION * float(image.factor.max()) / camera.scale)
     return _between(placed, np.concatenate(found), error)
 
 
