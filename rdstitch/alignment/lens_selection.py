@@ -181,13 +181,13 @@ def _distance(simple: BundleAdjustmentResult, rich: BundleAdjustmentResult, scal
     radii = np.linspace(0.0, 1.0, _RADII + 1)[1:]
     (distortion, *higher), other = rich.parameters.lens[:3].tolist(), float(simple.parameters.lens[0])
     straight = undistort(np.column_stack([radii, np.zeros(_RADII)]), distortion, higher)
-    difference, scale = np.zeros(_RADII), 1.0
+    difference, factor = np.zeros(_RADII), 1.0
     for _ in range(_SCALE_STEPS):
-        seen, more = (distort(factor * straight, other)[:, 0] for factor in (scale, scale * (1.0 + _SCALE_STEP)))
+        seen, more = (distort(k * straight, other)[:, 0] for k in (factor, factor * (1.0 + _SCALE_STEP)))
         difference, slope = seen - radii, (more - seen) / _SCALE_STEP
         known = np.isfinite(difference) & np.isfinite(slope)
         # Radii count by the area that they stand for.
-        scale *= 1.0 - float((radii * slope * difference)[known].sum() / (radii * slope**2)[known].sum())
+        factor *= 1.0 - float((radii * slope * difference)[known].sum() / (radii * slope**2)[known].sum())
     return float(np.nanmax(np.abs(difference))) * scale
 
 

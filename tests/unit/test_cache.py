@@ -59,9 +59,9 @@ def test_what_is_no_source_makes_none_void(tmp_path: Path, package: Path) -> Non
 def test_a_new_version_of_a_package_makes_entries_void(
     tmp_path: Path, package: Path, changed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cache, "version", lambda name: "1.0")
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "1.0")
     assert _recall(tmp_path / "cache", 1) == 1
-    monkeypatch.setattr(cache, "version", lambda name: "2.0" if name == changed else "1.0")
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "2.0" if name == changed else "1.0")
     assert _recall(tmp_path / "cache", 2) == 2
 
 

@@ -14,7 +14,7 @@ def test_another_wheel_of_opencv_will_do(monkeypatch: pytest.MonkeyPatch) -> Non
             raise PackageNotFoundError(name)
         return "1.2"
 
-    monkeypatch.setattr(write, "version", only_rdstitch)
+    monkeypatch.setattr("importlib.metadata.version", only_rdstitch)
     found = write.versions()
     assert (found["rdstitch"], found["opencv"]) == ("1.2", cv2.__version__)
     assert all(found.values())
