@@ -59,6 +59,12 @@ def to_directions(camera: Camera, matrix: FloatArray, points: ArrayLike) -> Floa
     return directions
 
 
+def from_directions(camera: Camera, matrix: FloatArray, directions: FloatArray) -> FloatArray:
+    """Pixels (N, 2) where an image shows directions (N, 3), inverse of :func:`to_directions`; NaN where it cannot."""
+    back = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    return camera.distort(camera.denormalize(project(directions @ back.T)))
+
+
 def _mapped(homography: FloatArray, points: FloatArray) -> FloatArray:
     return project(points @ homography[:, :2].T + homography[:, 2])
 

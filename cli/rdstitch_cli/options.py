@@ -410,7 +410,7 @@ stitching = together(
         metavar="auto|off|N",
         default="auto",
         show_default=True,
-        help="Where the ground is not quite a plane, bring images together by a smooth displacement of each: auto "
+        help="Where the scene has depth, bring images together by a smooth displacement of each: auto "
         "where matches that took no part in it come nearer; a number of cells along an image's longer side: always.",
     ),
     compositing,

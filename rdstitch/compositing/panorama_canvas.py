@@ -12,7 +12,7 @@ from rdstitch.camera import Camera, points_over
 from rdstitch.compositing.canvas import Canvas, canvas_between, plan_canvas, refuse_scale, turned_and_scaled
 from rdstitch.compositing.projection import PLANE, PROJECTIONS, TURN, Projection
 from rdstitch.errors import ArgumentError, LimitError
-from rdstitch.radial_homography import project, to_directions
+from rdstitch.radial_homography import from_directions, to_directions
 
 _POINTS_PER_SIDE = 64
 _GRID = 33  # points along each side of an image, over all of it
@@ -221,8 +221,7 @@ def _outline(camera: Camera, matrix: FloatArray) -> FloatArray:
 
 def _shows(camera: Camera, matrix: FloatArray, directions: FloatArray) -> BoolArray:
     """Which directions (K, 3) an image shows."""
-    flat = project(directions @ np.asarray(np.linalg.inv(matrix), dtype=np.float64).T)
-    points, (width, height) = camera.distort(camera.denormalize(flat)), camera.image_size
+    points, (width, height) = from_directions(camera, matrix, directions), camera.image_size
     return np.asarray(((points >= -0.5) & (points <= (width - 0.5, height - 0.5))).all(axis=1))
 
 

@@ -1,4 +1,4 @@
-"""Local alignment: a smooth residual warp per image, where the ground is not quite a plane."""
+"""Local alignment: a smooth residual warp per image, where the scene has depth that no plane and no turn explains."""
 
 from rdstitch.local_alignment.estimate import (
     MAX_CELLS,

@@ -9,8 +9,8 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
-from rdstitch.local_alignment.fit import PlaneFields, Stiffness, fit_fields
-from rdstitch.local_alignment.matches import ImagesOnPlane, Match, PlaneMatches, place_matches
+from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
+from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
 
 LocalAlignmentMode = Literal["auto", "off"] | int
 
@@ -21,7 +21,7 @@ _SLOPES = (0.02, 0.06, 0.2)
 _HELD_OUT = 5  # every fifth match
 # Share by which held-out residuals must get smaller for local alignment to be worth while, and for freer fields.
 _WORTHWHILE, _BETTER = 0.15, 0.03
-_MIN_MATCHES = 100
+_MIN_MATCHES = 60  # of 60 planes with so many matches and noise, none was bent; with 40, five were
 # Of thousands of images, fields are fitted to a part: each match takes about 600 bytes meanwhile.
 _MAX_MATCHES = 250_000
 # Correlation of the residuals of neighbouring matches below which no smooth field is worth while: one that brings the
@@ -39,7 +39,7 @@ class HeldOut:
 
     @classmethod
     def of(cls, residual: FloatArray) -> "HeldOut":
-        """From residuals (M, 2)."""
+        """From residuals (M, D)."""
         length = np.linalg.norm(residual, axis=1)
         return cls(float(np.median(length)), float(np.percentile(length, 95)))
 
@@ -73,7 +73,12 @@ def no_local_alignment(reason: str) -> LocalAlignment:
 
 
 def align_locally(
-    matches: Sequence[Match], cameras: Sequence[Camera], homographies: FloatArray, choice: LocalAlignmentMode = "auto"
+    matches: Sequence[Match],
+    cameras: Sequence[Camera],
+    homographies: FloatArray,
+    choice: LocalAlignmentMode = "auto",
+    *,
+    on_sphere: bool = False,
 ) -> LocalAlignment:
     """Smooth displacement fields that bring matches of overlapping images together.
 
@@ -82,14 +87,16 @@ def align_locally(
     matches : sequence of Match
         Putative matches of all pairs, right and wrong; ``image1`` and ``image2`` count the cameras.
     homographies : ndarray of shape (N, 3, 3)
-        Undistorted coordinates, in half diagonals, to the plane.
+        Undistorted coordinates, in half diagonals, to the plane, or to directions.
     choice : "auto", "off" or int
         "auto": only where matches that are held out of the fit come nearer by 15 % or more. A number: always, with so
         many cells along the longer side of an image.
+    on_sphere : bool
+        Whether the camera turned on the spot, so that ``homographies`` lead to directions.
     """
     if choice == "off":
         return no_local_alignment("switched off")
-    images = ImagesOnPlane.of(cameras, homographies)
+    images = ImagesOnSurface.of(cameras, homographies, on_sphere=on_sphere)
     # Pair by pair, again and again: together, the matches of thousands of images are what takes memory.
     lengths = [np.linalg.norm(pair.residual, axis=1) for pair in place_matches(matches, images)]
     count = sum(map(len, lengths))
@@ -102,7 +109,7 @@ def align_locally(
                 f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only"
             )
     share = min(1.0, _MAX_MATCHES / count)
-    placed = PlaneMatches.join(pair.thinned(share) for pair in place_matches(matches, images))
+    placed = PlacedMatches.join(pair.thinned(share) for pair in place_matches(matches, images))
     cells = _CELLS if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
     start, before, after = _choose(placed.take(~held_out), placed.take(held_out), images, cells)
@@ -113,7 +120,7 @@ def align_locally(
     return LocalAlignment(fields, text, cells, before, after)
 
 
-def _agreement_of_neighbours(pairs: Iterable[PlaneMatches], most: float) -> float:
+def _agreement_of_neighbours(pairs: Iterable[PlacedMatches], most: float) -> float:
     """Correlation of the residuals of each match and the nearest one of the same pair of images, in [-1, 1].
 
     Residuals that are longer than ``most`` count as if they were so long.
@@ -128,10 +135,10 @@ def _agreement_of_neighbours(pairs: Iterable[PlaneMatches], most: float) -> floa
 
 
 def _choose(
-    fitted: PlaneMatches, held_out: PlaneMatches, images: ImagesOnPlane, cells: int
-) -> tuple[PlaneFields, HeldOut, HeldOut]:
+    fitted: PlacedMatches, held_out: PlacedMatches, images: ImagesOnSurface, cells: int
+) -> tuple[PlacedFields, HeldOut, HeldOut]:
     """The fields that held-out matches like best, and the residuals of these without and with them."""
-    tried: list[PlaneFields] = []
+    tried: list[PlacedFields] = []
     for slope in reversed(_SLOPES):
         # What is far from the plane is found by the freest; the stiffer ones start from there.
         tried.append(fit_fields(fitted, images, Stiffness(cells, slope), tried[-1] if tried else None))

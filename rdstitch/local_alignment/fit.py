@@ -1,10 +1,10 @@
-"""Displacements on the plane, one regularised field per image, by robust sparse least squares over all images.
+"""Displacements on a plane or sphere, one regularised field per image, by robust sparse least squares over all images.
 
-A match of the images i and j that the alignment puts ``r`` apart on the plane is explained by
+A match of the images i and j that the alignment puts ``r`` apart is explained by
 ``d_i(e_i) - d_j(e_j)``, where ``e`` is the pixel at which the alignment expects what is at the measured one: fields say
 for each place of the output where its content is, so ``e`` is found anew from round to round. Fields rise and bend
 little, and vanish where nothing supports them; that alone fixes what the matches leave open, a displacement of all
-images together, at zero. Both coordinates have the same normal equations.
+images together, at zero. All coordinates have the same normal equations.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.late_imports import sparse, sparse_linalg
 from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_shape, node_points
-from rdstitch.local_alignment.matches import ImagesOnPlane, PlaneMatches
+from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches
 
 # Residuals are trusted up to about this many times their median, or their noise where relief makes them larger, but at
 # least so many pixels; at first, up to this percentile of them, then by this factor less from round to round, and as
@@ -59,26 +59,26 @@ class Stiffness:
 
 
 @dataclass(frozen=True, eq=False)
-class PlaneFields:
-    """Displacement of each image on the plane, at the nodes of its grid.
+class PlacedFields:
+    """Displacement of each image on the plane or sphere, at the nodes of its grid.
 
     Attributes
     ----------
-    images : ImagesOnPlane
+    images : ImagesOnSurface
     stiffness : Stiffness
     shapes : tuple of (int, int)
         Rows and columns of nodes of each image.
-    values : tuple of ndarray of shape (m n, 2)
+    values : tuple of ndarray of shape (m n, D)
         Pixels of the median image.
     """
 
-    images: ImagesOnPlane
+    images: ImagesOnSurface
     stiffness: Stiffness
     shapes: Shapes
     values: tuple[FloatArray, ...]
 
-    def explain(self, matches: PlaneMatches) -> tuple[FloatArray, FloatArray]:
-        """What they leave over at matches, (M, 2), and pixels (2 M, 2) where the alignment expects these."""
+    def explain(self, matches: PlacedMatches) -> tuple[FloatArray, FloatArray]:
+        """What they leave over at matches, (M, D), and pixels (2 M, 2) where the alignment expects these."""
         values, expected = np.concatenate(self.values), matches.points.reshape(-1, 2)
         for _ in range(_STEPS):
             design = _design(matches, expected, self.images.cameras, self.shapes)
@@ -92,7 +92,7 @@ class PlaneFields:
             size = self.images.cameras[k].image_size
             points = node_points(size, shape)
             with np.errstate(invalid="ignore"):
-                shown = self.images.from_plane(k, self.images.to_plane(k, points) + values)
+                shown = self.images.from_surface(k, self.images.to_surface(k, points) + values)
             found = np.where(np.isfinite(shown), shown - points, 0.0).reshape(*shape, 2)
             field = DisplacementField.of(size, found)
             if field.steepest > _MAX_GRADIENT:
@@ -102,8 +102,8 @@ class PlaneFields:
 
 
 def fit_fields(
-    matches: PlaneMatches, images: ImagesOnPlane, stiffness: Stiffness, start: PlaneFields | None = None
-) -> PlaneFields:
+    matches: PlacedMatches, images: ImagesOnSurface, stiffness: Stiffness, start: PlacedFields | None = None
+) -> PlacedFields:
     """Fields of all images, by reweighted least squares.
 
     They start from fields that were fitted to much the same matches, or, without these, by graduated non-convexity
@@ -120,7 +120,7 @@ def fit_fields(
     else:
         left, expected, scale = *start.explain(matches), 0.0
     sharp = 0 if start is None else 1
-    solution = np.zeros((prior.shape[0], 2)) if start is None else np.concatenate(start.values)
+    solution = np.zeros((prior.shape[0], left.shape[1])) if start is None else np.concatenate(start.values)
     while sharp < _SHARP_ROUNDS:
         length = np.linalg.norm(left, axis=1)
         sharpest = max(_MIN_SCALE, _ROBUST * min(float(np.median(length)), matches.noise))
@@ -132,46 +132,48 @@ def fit_fields(
         left = matches.residual - design @ solution
         expected = _expected(matches, images, design, solution)
         scale *= _SHARPENED
-    return PlaneFields(images, stiffness, shapes, tuple(np.split(solution, _first_nodes(shapes)[1:-1])))
+    return PlacedFields(images, stiffness, shapes, tuple(np.split(solution, _first_nodes(shapes)[1:-1])))
 
 
 def _solve(
     design: "sparse.csr_array", weight: FloatArray, prior: "sparse.csr_array", residual: FloatArray, start: FloatArray
 ) -> FloatArray:
-    """Both coordinates (nodes, 2) of the fields, from near ones, by conjugate gradients.
+    """All coordinates (nodes, D) of the fields, from near ones, by conjugate gradients.
 
     The matrix of the normal equations, by far the largest array, is never made.
     """
     weighted, across = weight[:, None], design.T
 
     def normal(values: FloatArray) -> FloatArray:
-        both = values.reshape(-1, 2)
-        return np.asarray(across @ (weighted * (design @ both)) + prior @ both).ravel()
+        nodes = values.reshape(start.shape)
+        return np.asarray(across @ (weighted * (design @ nodes)) + prior @ nodes).ravel()
 
-    diagonal = np.repeat(design.power(2).T @ weight + prior.diagonal(), 2)
+    diagonal = np.repeat(design.power(2).T @ weight + prior.diagonal(), start.shape[1])
     operator = sparse_linalg.LinearOperator((diagonal.size, diagonal.size), normal, dtype=np.float64)
     solution, _ = sparse_linalg.cg(operator, (across @ (weighted * residual)).ravel(), start.ravel(), rtol=_TOLERANCE,
                                    maxiter=_MAX_ITERATIONS, M=sparse.diags_array(1.0 / diagonal))  # fmt: skip
-    return np.asarray(solution).reshape(-1, 2)
+    return np.asarray(solution).reshape(start.shape)
 
 
 def _expected(
-    matches: PlaneMatches, images: ImagesOnPlane, design: "sparse.csr_array", values: FloatArray
+    matches: PlacedMatches, images: ImagesOnSurface, design: "sparse.csr_array", values: FloatArray
 ) -> FloatArray:
     """Pixels (2 M, 2) at which the alignment expects matches, in images that are displaced by ``values`` at nodes."""
     sides = sparse.csr_array(
         (design.data, design.indices, np.arange(0, design.nnz + 1, 4, dtype=np.int32)),
         shape=(2 * len(matches), len(values)),
     )
-    moved = (sides @ values).reshape(-1, 2, 2) * _SIGNS[:, None]
-    places, expected = (matches.places - moved).reshape(-1, 2), matches.points.reshape(-1, 2).copy()
+    moved = (sides @ values).reshape(matches.places.shape) * _SIGNS[:, None]
+    places, expected = (matches.places - moved).reshape(2 * len(matches), -1), matches.points.reshape(-1, 2).copy()
     for k, chosen in matches.of_image:
-        found = images.from_plane(k, places[chosen])
+        found = images.from_surface(k, places[chosen])
         expected[chosen] = np.where(np.isfinite(found), found, expected[chosen])
     return expected
 
 
-def _design(matches: PlaneMatches, pixels: FloatArray, cameras: Sequence[Camera], shapes: Shapes) -> "sparse.csr_array":
+def _design(
+    matches: PlacedMatches, pixels: FloatArray, cameras: Sequence[Camera], shapes: Shapes
+) -> "sparse.csr_array":
     """What all nodes do to the residuals of matches at pixels (2 M, 2): four in either image, shape (M, nodes)."""
     first = _first_nodes(shapes)
     columns, entries = np.empty((len(pixels), 4), dtype=np.int32), np.empty((len(pixels), 4))

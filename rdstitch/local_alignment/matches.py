@@ -1,7 +1,7 @@
-"""Matches of overlapping images on the common plane, and what the alignment leaves over at each of them."""
+"""Matches of overlapping images on their plane or sphere, and what the alignment leaves over at each of them."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Self
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.late_imports import spatial
-from rdstitch.radial_homography import from_plane, to_plane
+from rdstitch.radial_homography import from_directions, from_plane, to_directions, to_plane
 
 # Matches that the alignment expects farther away than this share of the image's diagonal are taken to be wrong; where
 # the ground rises by a tenth of the camera's height, and the alignment is that of the valleys, right ones are nearly as
@@ -32,44 +32,55 @@ class Match:
 
 
 @dataclass(frozen=True, eq=False)
-class ImagesOnPlane:
-    """Where the alignment puts the images; places on the plane are in pixels of the median image.
+class ImagesOnSurface:
+    """Where the alignment puts the images: on a plane, or on a sphere about a camera that turned on the spot.
+
+    Places (..., D) are in pixels of the median image: (x, y) on the plane, points in space of the sphere.
 
     Attributes
     ----------
     cameras : sequence of Camera
     homographies : ndarray of shape (N, 3, 3)
-        Normalized undistorted coordinates of each image to the plane.
+        Normalized undistorted coordinates of each image to the plane, or to directions.
+    on_sphere : bool
     scale : float
-        Pixels of the median image per unit of the plane, at the images' centres; NaN if it shows none of them.
+        Pixels of the median image per unit of the plane, or radian, at the images' centres; NaN if none is there.
     """
 
     cameras: Sequence[Camera]
     homographies: FloatArray
+    on_sphere: bool
     scale: float
 
     @classmethod
-    def of(cls, cameras: Sequence[Camera], homographies: FloatArray) -> Self:
+    def of(cls, cameras: Sequence[Camera], homographies: FloatArray, *, on_sphere: bool = False) -> Self:
         """With the scale of the median image."""
+        unscaled = cls(cameras, homographies, on_sphere, 1.0)
         steps = np.array([(0.5, 0.0), (0.0, 0.5), (-0.5, 0.0), (0.0, -0.5)])
         areas = []
-        for camera, matrix in zip(cameras, homographies, strict=True):
-            around = to_plane(camera, matrix, (np.array(camera.image_size) - 1.0) / 2.0 + steps)
+        for k, camera in enumerate(cameras):
+            around = unscaled.to_surface(k, (np.array(camera.image_size) - 1.0) / 2.0 + steps)
             if np.isfinite(around).all():  # a centre beyond the horizon is nowhere on the plane
-                areas.append(abs(np.linalg.det(around[:2] - around[2:])))
-        return cls(cameras, homographies, float(np.median(areas) ** -0.5) if areas else np.nan)
+                sides = around[:2] - around[2:]
+                areas.append(float(np.sqrt(np.linalg.det(sides @ sides.T))))
+        return replace(unscaled, scale=float(np.median(areas) ** -0.5) if areas else np.nan)
 
-    def to_plane(self, image: int, points: FloatArray) -> FloatArray:
-        """Places (M, 2) of measured pixels (M, 2); NaN beyond the horizon."""
-        return self.scale * to_plane(self.cameras[image], self.homographies[image], points)
+    def to_surface(self, image: int, points: FloatArray) -> FloatArray:
+        """Places (M, D) of measured pixels (M, 2); NaN beyond the horizon."""
+        camera, matrix = self.cameras[image], self.homographies[image]
+        if not self.on_sphere:
+            return self.scale * to_plane(camera, matrix, points)
+        directions = to_directions(camera, matrix, points)
+        return np.asarray(self.scale * directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
-    def from_plane(self, image: int, places: FloatArray) -> FloatArray:
-        """Measured pixels (M, 2) of places (M, 2); NaN where the image cannot show them."""
-        return from_plane(self.cameras[image], self.homographies[image], places / self.scale)
+    def from_surface(self, image: int, places: FloatArray) -> FloatArray:
+        """Measured pixels (M, 2) of places (M, D); NaN where the image cannot show them."""
+        camera, matrix = self.cameras[image], self.homographies[image]
+        return (from_directions if self.on_sphere else from_plane)(camera, matrix, places / self.scale)
 
 
 @dataclass(frozen=True, eq=False)
-class PlaneMatches:
+class PlacedMatches:
     """Matches of one pair of images, or of many, one pair after the other.
 
     Attributes
@@ -78,8 +89,8 @@ class PlaneMatches:
         The two images of each match.
     points : ndarray of shape (M, 2, 2)
         Measured pixels in either.
-    places : ndarray of shape (M, 2, 2)
-        Where the alignment puts either on the plane, pixels of the median image.
+    places : ndarray of shape (M, 2, D)
+        Where the alignment puts either.
     """
 
     images: NDArray[np.intp]
@@ -90,14 +101,14 @@ class PlaneMatches:
         return len(self.images)
 
     @classmethod
-    def join(cls, parts: Iterable["PlaneMatches"]) -> Self:
+    def join(cls, parts: Iterable["PlacedMatches"]) -> Self:
         """All of them, one after the other."""
         every = list(parts)
         return cls(*(np.concatenate([getattr(p, name) for p in every]) for name in ("images", "points", "places")))
 
     @cached_property
     def residual(self) -> FloatArray:
-        """From where the second image puts them to where the first does, (M, 2)."""
+        """From where the second image puts them to where the first does, (M, D)."""
         return np.asarray(self.places[:, 0] - self.places[:, 1])
 
     @cached_property
@@ -125,24 +136,24 @@ class PlaneMatches:
         apart = self.residual - self.residual[self.neighbours]
         return float(np.median(np.linalg.norm(apart, axis=1)) / np.sqrt(2.0))
 
-    def thinned(self, share: float) -> "PlaneMatches":
+    def thinned(self, share: float) -> "PlacedMatches":
         """About such a share of them, evenly."""
         return self.take(np.linspace(0, len(self) - 1, round(share * len(self))).astype(np.intp))
 
-    def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "PlaneMatches":
+    def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "PlacedMatches":
         """A part of them."""
-        return PlaneMatches(self.images[chosen], self.points[chosen], self.places[chosen])
+        return PlacedMatches(self.images[chosen], self.points[chosen], self.places[chosen])
 
 
-def place_matches(matches: Iterable[Match], images: ImagesOnPlane) -> Iterator[PlaneMatches]:
-    """For each pair, matches that lie near each other on the plane: inliers of the alignment, and a little farther off.
+def place_matches(matches: Iterable[Match], images: ImagesOnSurface) -> Iterator[PlacedMatches]:
+    """For each pair, matches that lie near each other: inliers of the alignment, and a little farther off.
 
     Pairs that have hardly any are left out.
     """
     for match in matches:
         pair, measured = (match.image1, match.image2), np.stack([match.points1, match.points2], axis=1)
-        placed = np.stack([images.to_plane(k, measured[:, part]) for part, k in enumerate(pair)], axis=1)
+        placed = np.stack([images.to_surface(k, measured[:, part]) for part, k in enumerate(pair)], axis=1)
         radius = _SEARCH_RADIUS * min(2.0 * images.cameras[k].scale for k in pair)
         near = np.linalg.norm(placed[:, 0] - placed[:, 1], axis=1) < radius
         if (count := int(near.sum())) >= _MIN_MATCHES:
-            yield PlaneMatches(np.tile(np.array(pair), (count, 1)), measured[near], placed[near])
+            yield PlacedMatches(np.tile(np.array(pair), (count, 1)), measured[near], placed[near])

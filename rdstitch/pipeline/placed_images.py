@@ -21,7 +21,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
-from rdstitch.local_alignment import LocalAlignment, LocalAlignmentMode, Match, align_locally, no_local_alignment
+from rdstitch.local_alignment import LocalAlignment, LocalAlignmentMode, Match, align_locally
 from rdstitch.registration import Registration
 
 _COMPARED, _COMPARED_SIDE = 8, 400
@@ -39,8 +39,6 @@ def align_registration_locally(registration: Registration, choice: LocalAlignmen
         See :func:`rdstitch.local_alignment.align_locally`.
     """
     alignment = registration.alignment
-    if alignment.on_sphere:
-        return no_local_alignment("a camera that turned on the spot sees no relief")
     position = np.cumsum(alignment.used) - 1
     matches = [
         Match(
@@ -53,7 +51,9 @@ def align_registration_locally(registration: Registration, choice: LocalAlignmen
         if pair.relation and alignment.used[pair.image1] and alignment.used[pair.image2]
     ]
     cameras = [camera for camera, used in zip(alignment.cameras, alignment.used, strict=True) if used]
-    return align_locally(matches, cameras, alignment.homographies[alignment.used], choice)
+    return align_locally(
+        matches, cameras, alignment.homographies[alignment.used], choice, on_sphere=alignment.on_sphere
+    )
 
 
 @dataclass(frozen=True)

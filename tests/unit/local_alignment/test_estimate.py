@@ -4,6 +4,7 @@ import tracemalloc
 from dataclasses import replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,8 +12,8 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.local_alignment import LocalAlignment, Match, align_locally
 from rdstitch.local_alignment.fit import Stiffness, fit_fields
-from rdstitch.local_alignment.matches import ImagesOnPlane, PlaneMatches, place_matches
-from rdstitch.radial_homography import from_plane, to_plane
+from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches, place_matches
+from rdstitch.radial_homography import from_directions, from_plane, to_directions, to_plane
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
 
 LENS = Camera((640, 480), -0.2, focal=520.0)
@@ -130,8 +131,8 @@ def test_a_number_of_cells_is_used_in_any_case_and_off_in_none() -> None:
 def test_the_whole_does_not_move_and_fields_fade_where_nothing_supports_them() -> None:
     sequence = scene("bumps", 0.1)
     matrices = homographies(sequence)
-    images = ImagesOnPlane.of(CAMERAS, matrices)
-    placed = PlaneMatches.join(place_matches(matches(sequence), images))
+    images = ImagesOnSurface.of(CAMERAS, matrices)
+    placed = PlacedMatches.join(place_matches(matches(sequence), images))
     fields = fit_fields(placed, images, Stiffness(12, 0.02))
     values = np.concatenate(fields.values)
     assert np.abs(values.mean(axis=0)).max() < 0.02 * np.abs(values).max()
@@ -147,8 +148,8 @@ def test_nothing_folds_even_where_matches_say_so() -> None:
         Match(m.image1, m.image2, m.points1, m.points2 + 14.0 * np.sign(np.sin(m.points2[:, ::-1] / 15.0)))
         for m in matches(sequence, count=1000)
     ]
-    images = ImagesOnPlane.of(CAMERAS, homographies(sequence))
-    placed = PlaneMatches.join(place_matches(torn, images))
+    images = ImagesOnSurface.of(CAMERAS, homographies(sequence))
+    placed = PlacedMatches.join(place_matches(torn, images))
     fields = fit_fields(placed, images, Stiffness(30, 5.0)).of_images()
     assert 0.45 < max(field.steepest for field in fields) <= 0.501
 
@@ -194,5 +195,61 @@ def test_too_few_matches_are_said() -> None:
 def test_images_beyond_the_horizon_are_nowhere() -> None:
     nowhere = -np.broadcast_to(np.eye(3), (6, 3, 3))
     some = np.concatenate([nowhere[:3], homographies(scene(None))[3:]])
-    assert np.isfinite(ImagesOnPlane.of(CAMERAS, some).scale)
+    assert np.isfinite(ImagesOnSurface.of(CAMERAS, some).scale)
     assert align_locally(matches(scene(None)), CAMERAS, nowhere).reason == "there are too few matches"
+
+
+def turn(step: float) -> tuple[list[Match], FloatArray, list[FloatArray]]:
+    """Four images of hills about ten away; between them the camera turned by 25 degrees and moved by ``step``."""
+    rng = np.random.default_rng(5)
+    angles = np.radians(25.0) * np.arange(4)
+    rotations = np.stack([cv2.Rodrigues(np.array([0.0, angle, 0.0]))[0] for angle in angles])
+    centers = step * np.column_stack([np.arange(4), np.zeros(4), np.sin(np.arange(4))])
+    matrices: FloatArray = (rotations @ np.diag([1.0, 1.0, 520.0 / LENS.scale])).astype(np.float64)
+
+    def shown(points: FloatArray, image: int) -> FloatArray:
+        return from_directions(LENS, matrices[image], points - centers[image])
+
+    found, first_and_second = [], []
+    for i in range(3):
+        rays = to_directions(LENS, matrices[i], rng.uniform((0, 0), (639, 479), (400, 2)))
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        depth = 10.0 + 3.0 * np.sin(4.0 * rays[:, :1]) * np.cos(5.0 * rays[:, 1:2])
+        places = [shown(centers[i] + depth * rays, k) for k in (i, i + 1)]
+        seen = np.isfinite(places[1]).all(axis=1) & ((places[1] >= 0) & (places[1] <= (639, 479))).all(axis=1)
+        exact = np.stack([p[seen] for p in places])
+        noisy = exact + rng.normal(0.0, 0.2, exact.shape)
+        found.append(Match(i, i + 1, *noisy))
+        first_and_second.append(exact)
+    return found, matrices, first_and_second
+
+
+def test_what_a_turn_off_the_spot_moves_apart_comes_together() -> None:
+    found, matrices, exact = turn(0.3)
+    local = align_locally(found, CAMERAS[:4], matrices, on_sphere=True)
+    surface = ImagesOnSurface.of(CAMERAS[:4], matrices, on_sphere=True)
+    apart: dict[bool, list[FloatArray]] = {False: [], True: []}
+    for match, (first, second) in zip(found, exact, strict=True):
+        for mended, lengths in apart.items():
+            expected = [
+                surface.to_surface(k, _expected(local, k, points) if mended else points)
+                for k, points in ((match.image1, first), (match.image2, second))
+            ]
+            lengths.append(np.linalg.norm(expected[0] - expected[1], axis=1))
+    before, after = (np.concatenate(apart[mended]) for mended in (False, True))
+    assert np.median(before) > 3.0
+    assert np.median(after) < 0.15 * np.median(before)
+    assert np.percentile(after, 95) < 0.3 * np.percentile(before, 95)
+
+
+def _expected(local: LocalAlignment, image: int, points: FloatArray) -> FloatArray:
+    """Pixels at which the alignment expects what is at measured ones."""
+    expected = points
+    for _ in range(20):
+        expected = points - local.fields[image](expected)
+    return expected
+
+
+def test_a_turn_on_the_spot_is_left_alone() -> None:
+    found, matrices, _ = turn(0.0)
+    assert align_locally(found, CAMERAS[:4], matrices, on_sphere=True).fields == ()
