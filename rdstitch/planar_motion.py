@@ -93,11 +93,6 @@ class PlanarMotion:
         The plane normal is a left eigenvector, ``H' n = height n``, because the motion keeps the distances from the
         plane. For φ = 0 and equal heights the eigenvalue is threefold; then ``H - I = -R t n'`` has rank one, and n
         spans its row space. Of all these candidates the one that reproduces H best is taken.
-
-        Parameters
-        ----------
-        homography : array_like of shape (3, 3)
-            In focal-normalized coordinates, of any scale and sign.
         """
         h = np.array(homography, dtype=np.float64)
         return cls._of_row(motions_from_homographies(h[None])[0])
@@ -114,15 +109,7 @@ class PlanarMotion:
 
 
 def motions_from_homographies(homography: FloatArray, normal: FloatArray | None = None) -> FloatArray:
-    """Rows (ψ, θ, φ, tx, ty, height) of the planar motions that homographies describe, or come close to, (B, 6).
-
-    Parameters
-    ----------
-    homography : ndarray of shape (B, 3, 3)
-        In focal-normalized coordinates, of any scale and sign.
-    normal : ndarray of shape (B, 3), optional
-        Plane normals, of any length and sign; found as :meth:`PlanarMotion.from_homography` says if not given.
-    """
+    """Rows (ψ, θ, φ, tx, ty, height), (B, 6), of the planar motions nearest to homographies (B, 3, 3), focal-normalized."""
     if normal is not None:
         return _motions_for_normals(homography, normal)
     h = homography / np.linalg.norm(homography, axis=(1, 2), keepdims=True)

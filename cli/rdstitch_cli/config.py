@@ -32,20 +32,7 @@ def config_option() -> click.Option:
 
 
 def read_config(path: Path, commands: Mapping[str, click.Command], running: str) -> dict[str, Any]:
-    """The defaults that a file gives a command, by parameter name; all tables are checked.
-
-    Parameters
-    ----------
-    path : Path
-        TOML with a table for each command, and one that holds for all of them. Keys are long options without dashes.
-    running : str
-        Name of the command that runs.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, is no TOML, names an unknown command or option, or gives one a wrong value.
-    """
+    """The defaults that a file gives a command, by parameter name; all tables are checked."""
     tables = _parse(path)
     known = {name: _options(command) for name, command in commands.items()}
     known[COMMON] = {key: option for options in known.values() for key, option in options.items()}

@@ -110,17 +110,7 @@ def _check_written(read: Iterable[Path | None]) -> None:
 
 
 class Report:
-    """The report of a run: the progress that measures its stages, and the file that is written with the image.
-
-    Parameters
-    ----------
-    file : Path or None
-        None writes nothing.
-    inputs : sequence of Path
-        Files that it must not be written over.
-    output : Path, optional
-        Image that is made, beside which there may be a page.
-    """
+    """The report of a run: the progress that measures its stages, and the file that is written with the image."""
 
     def __init__(
         self, file: Path | None, reporter: Reporter, inputs: Sequence[Path], overwrite: bool, output: Path | None = None

@@ -78,17 +78,6 @@ def read_camera_file(path: str | Path, image_size: ImageSize | None = None) -> C
     """Read a camera file of any known format.
 
     A file that rdstitch wrote gives back λ exactly; to the lens model of any other, λ is fitted.
-
-    Parameters
-    ----------
-    path : path
-    image_size : callable, optional
-        Gives width and height of the images, pixels, for a file of OpenCV or lensfun that does not say them.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, is no camera file, or tells of a lens that λ cannot describe.
     """
     text, file = read_text(path), str(path)
     try:
@@ -153,13 +142,7 @@ def save_camera(camera: Camera, path: str | Path) -> None:
 
 
 def camera_file_text(camera: Camera, path: str | Path) -> str:
-    """Give what :func:`save_camera` writes into a file of this name.
-
-    Raises
-    ------
-    OutputError
-        When the name says no format.
-    """
+    """Give what :func:`save_camera` writes into a file of this name."""
     file = Path(path)
     name = file.name.lower().removesuffix(".yml")
     name += ".yaml" if name != file.name.lower() else ""
@@ -170,13 +153,7 @@ def camera_file_text(camera: Camera, path: str | Path) -> str:
 
 
 def export_note(camera: Camera, path: str | Path) -> tuple[str, ...]:
-    """Say what the model of a camera file of others costs, in one sentence; nothing for rdstitch's own.
-
-    Parameters
-    ----------
-    path : path
-        As :func:`save_camera` takes it.
-    """
+    """Say what the model of a camera file of others costs, in one sentence; nothing for rdstitch's own."""
     largest = _STATED.findall(camera_file_text(camera, path))
     return tuple(f"{path}: its lens model is at most {float(value):.3f} pixels from the lens" for value in largest[-1:])
 

@@ -49,13 +49,7 @@ class _Image(Struct, kw_only=True):
 
 
 def read_hugin(text: str, file: str) -> CameraFile:
-    """The lens of the first image, to which λ is fitted.
-
-    Raises
-    ------
-    InputError, ArgumentError
-        When there is no image, a parameter is wrong, or the lens is neither a rectilinear one nor a fisheye.
-    """
+    """The lens of the first image, to which λ is fitted."""
     image = next((line for line in text.splitlines() if line.startswith("i ")), None)
     if image is None:
         raise ArgumentError("has no image line, and so no lens")

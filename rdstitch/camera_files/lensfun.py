@@ -23,13 +23,7 @@ _TYPES = {"rectilinear": False, "fisheye": True}
 
 
 def read_lensfun(text: str, file: str, image_size: Callable[[], tuple[int, int]] | None) -> CameraFile:
-    """The only lens of a file, at its only focal length, to which λ is fitted; the crop factor is that of the images.
-
-    Raises
-    ------
-    InputError, ArgumentError
-        When it is none, holds several, or another model.
-    """
+    """Fit λ to the only lens of a file at its only focal length; the crop factor is that of the images."""
     lenses = list(parse_xml(text, file).iter("lens"))
     found = [(lens, item) for lens in lenses for item in lens.iter("distortion")]
     if len(found) != 1:

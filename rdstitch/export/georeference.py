@@ -198,11 +198,6 @@ def georeference(
     -------
     Georeference or None, str
         And the reason where there is none.
-
-    Raises
-    ------
-    ArgumentError
-        When the coordinate system cannot be used; see :class:`rdstitch.crs.Crs`.
     """
     source, std = (_CONTROL, _CONTROL_STD) if any(control) else (_GPS, POSITION_STD)
     if source == _GPS:

@@ -62,11 +62,6 @@ def as_inputs(images: Images, channel_order: ChannelOrder = "bgr") -> list[Named
         with its EXIF. The i-th input, if it is an array or such an image, is called ``image_000i``.
     channel_order : str
         "bgr" or "rgb": order of the channels of colour arrays; that of five bands and more stays.
-
-    Raises
-    ------
-    ArgumentError
-        When an input is neither a path nor such an array.
     """
     if channel_order not in get_args(ChannelOrder):
         raise ArgumentError(f"channel_order must be 'bgr' or 'rgb', not {channel_order!r}")

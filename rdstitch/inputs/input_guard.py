@@ -21,13 +21,7 @@ GuardNotes = tuple[dict[Path, _Stamp | None], dict[Path, int], dict[Path, str]]
 
 
 class InputGuard:
-    """What is known of the input files of one run; shared by its sources, and by threads.
-
-    Parameters
-    ----------
-    strict : bool
-        Refuse a damaged image, rather than warn of it.
-    """
+    """What is known of the input files of one run; shared by its sources, and by threads."""
 
     def __init__(self, strict: bool = False) -> None:
         self._strict = strict
@@ -38,13 +32,7 @@ class InputGuard:
 
     @contextmanager
     def reading(self, path: Path) -> Iterator[None]:
-        """Read a file inside the block; its content must be what it was before.
-
-        Raises
-        ------
-        InputError
-            When it has changed since it was read for the first time, or changes meanwhile.
-        """
+        """Read a file inside the block; its content must be what it was before."""
         before = _stamp(path)
         yield
         # One after the other: of two that read a file first, both would take it for unknown.
@@ -58,13 +46,7 @@ class InputGuard:
             raise InputError(f"{path}: is being written to; run again when that has ended")
 
     def check(self, path: Path, image: DecodedImage) -> None:
-        """Take note of an image that may be damaged.
-
-        Raises
-        ------
-        InputError
-            When damaged images are refused.
-        """
+        """Take note of an image that may be damaged."""
         if not image.damage:
             return
         reason = f"is damaged, and parts of it may be wrong ({image.damage}); copy it again from its source"
@@ -87,13 +69,7 @@ class InputGuard:
         )
 
     def learn(self, notes: GuardNotes) -> None:
-        """Take over what a guard in another process has noticed.
-
-        Raises
-        ------
-        InputError
-            When a file had another content there.
-        """
+        """Take over what a guard in another process has noticed."""
         stamps, checksums, damaged = notes
         with self._lock:
             for path, checksum in checksums.items():

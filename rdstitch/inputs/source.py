@@ -112,18 +112,7 @@ class Source:
         return 1 if megapixels is None else fitting_reduction(halving(self.camera.image_size, megapixels))
 
     def read(self, reduction: int = 1, *, keep: bool = False) -> DecodedImage:
-        """The pixels, of blocks of so many pixels a side; what the mask excludes is transparent.
-
-        Parameters
-        ----------
-        keep : bool
-            It will be looked at again, so that the file need not be decoded once more.
-
-        Raises
-        ------
-        InputError
-            When the file cannot be read, or is no longer what it was.
-        """
+        """The pixels, of blocks of so many pixels a side; what the mask excludes is transparent."""
         # Smaller ones are made from one size, whether that is at hand or not: the same comes out.
         usual = self.reduction(WORK_MEGAPIXELS)
         if reduction % usual:
@@ -186,30 +175,7 @@ def read_sources(
     guard: InputGuard | None = None,
     max_memory: int | None = None,
 ) -> tuple[list[Source], list[Message]]:
-    """Read the headers of the images; a file named twice counts once.
-
-    Parameters
-    ----------
-    camera : Camera, optional
-        Known camera; adapted to the size of each image.
-    focal : float, optional
-        Known focal length, pixels.
-    distortion : float, optional
-        Known λ, half-diagonal frame.
-    skip_bad : bool
-        Leave out files that cannot be read, with the reason, instead of raising.
-    guard : InputGuard, optional
-        What notices changes of the files, and damage.
-    max_memory : int or None
-        Bytes that an image may take while it is decoded.
-
-    Raises
-    ------
-    InputError
-        When a file cannot be read.
-    LimitError
-        When an image needs more memory.
-    """
+    """Read the headers of the images; a file named twice counts once."""
     guard = guard or InputGuard()
     sources: list[Source] = []
     unread: list[Message] = []

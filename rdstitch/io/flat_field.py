@@ -51,13 +51,7 @@ class FlatField:
 
 
 def read_flat_field(file: str | Path, size: tuple[int, int], channels: int) -> FlatField:
-    """The flat field of an image file, and the dark field where it has a second page.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read, has another size than the images, or is not positive.
-    """
+    """The flat field of an image file, and the dark field where it has a second page."""
     path = Path(file)
     check_readable(path)
     read: Callable[[Any], NDArray[np.float32]] = lambda page: np.asarray(page.asarray(), dtype=np.float32)  # noqa: E731

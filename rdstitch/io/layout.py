@@ -38,11 +38,6 @@ class Layout:
         Of JPEG and WebP, 1 to 100.
     background : int
         Grey (0 to 255) of what is transparent, in a format without transparency.
-
-    Raises
-    ------
-    ArgumentError
-        When a value has no meaning.
     """
 
     size: tuple[int, int]
@@ -68,13 +63,7 @@ class Layout:
 
 
 def check_strips(layout: Layout, strips: Iterable[Strip]) -> Iterator[Strip]:
-    """The strips, when they are what the layout says.
-
-    Raises
-    ------
-    ArgumentError
-        When a strip has another shape or type, or rows are missing.
-    """
+    """The strips, when they are what the layout says."""
     width, height = layout.size
     rows = 0
     for samples, alpha in strips:

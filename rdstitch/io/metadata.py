@@ -144,13 +144,7 @@ class Metadata:
 
 
 def read_metadata(path: str | Path) -> Metadata:
-    """Read an image file's header; no pixel is decoded.
-
-    Raises
-    ------
-    InputError
-        When the file is missing, unreadable, or no image.
-    """
+    """Read an image file's header; no pixel is decoded."""
     file = Path(path)
     check_readable(file)
     with decoding(file):

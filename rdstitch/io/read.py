@@ -43,17 +43,10 @@ _GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 
 
 def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> tuple[NDArray[Any] | None, str]:
-    """Samples (h, w) or (h, w, 3) in RGB order as stored, not turned upright, and what is wrong with the file.
+    """Samples of 1/``factor`` of the size, (h, w) or (h, w, 3) in RGB order as stored, and what is wrong with the file.
 
     What Pillow would decode, bit for bit, in less time and memory. Pillow has the last word on files about which
     the decoder has any complaint: it refuses some, and decodes others without a word, whatever comes out.
-
-    Parameters
-    ----------
-    size : (int, int)
-        Width and height of the whole image, pixels.
-    factor : int
-        1, 2, 4 or 8; so many pixels a side become one.
 
     Returns
     -------
@@ -130,11 +123,6 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
     metadata : Metadata, optional
         What :func:`read_metadata` has found in the file, which is not looked for again: of a small JPEG file that takes
         as long as its pixels.
-
-    Raises
-    ------
-    InputError
-        When the file is missing, unreadable, no image, or damaged; the text names the file.
     """
     file = Path(path)
     check_readable(file)
@@ -317,22 +305,7 @@ def _channel_planes(tiff: "tifffile.TiffFile") -> Pixels | None:
 
 
 def as_image(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadata) -> DecodedImage:
-    """An image from samples as stored: upright, in one of the three sample types, contiguous, and without NaN.
-
-    Parameters
-    ----------
-    file : Path
-        For messages.
-    samples : ndarray of shape (h, w) or (h, w, C)
-        Colour in RGB order.
-    alpha : ndarray of shape (h, w), or None
-        Of any sample type; full where the image is opaque.
-
-    Raises
-    ------
-    InputError
-        When there are no pixels.
-    """
+    """An image from samples as stored: upright, in one of the three sample types, contiguous, and without NaN."""
     if samples.size == 0:
         raise InputError(f"{file}: has no pixels")
     opaque = None if alpha is None else _as_uint8(alpha)

@@ -86,13 +86,7 @@ class SavedRegistration:
 
 
 def read_sidecar(path: str | Path) -> SavedRegistration:
-    """Read a sidecar; every field that is there is checked.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, is no sidecar, or a field is not what it should be; the text names both.
-    """
+    """Read a sidecar; every field that is there is checked."""
     # Imported late: no other command should wait for it.
     from rdstitch.records import convert, parse_json
     from rdstitch.sidecar.schema import SidecarRecord

@@ -118,17 +118,7 @@ class Adjustment:
 def adjust(
     grid: TileGrid, links: LinkedPoints, stage_std: float, distortion: float = 0.0, *, free_lens: bool = False
 ) -> Adjustment:
-    """Adjust all places.
-
-    Parameters
-    ----------
-    stage_std : float
-        How far a tile may be from where it should be, to begin with, pixels.
-    distortion : float
-        λ to begin with, or to keep.
-    free_lens : bool
-        Estimate λ.
-    """
+    """Adjust all places; to begin with a tile may be ``stage_std`` pixels off."""
     problem = _Problem(grid, links, free_lens)
     state = problem.start(distortion)
     variances = np.array([stage_std**2] * 3)

@@ -103,15 +103,7 @@ def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
 
 
 def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
-    """Estimate the flat field and the dark level of tiles.
-
-    Parameters
-    ----------
-    read : callable
-        Gives a tile (h, w) or (h, w, C).
-    count : int
-        Number of tiles.
-    """
+    """Estimate the flat field and the dark level of tiles."""
     first = read(0)
     shown = _Statistics(read(index) for index in range(count))
     channels = shown.ground.shape[3]

@@ -55,13 +55,7 @@ class TileGrid:
         return _lines(self.places[:, 0], _SAME_LINE * self.size[0])
 
     def neighbours(self, reach: float) -> NDArray[np.intp]:
-        """Pairs of tiles that overlap along a good part of a side, or come so near that they may, (M, 2).
-
-        Parameters
-        ----------
-        reach : float
-            How much nearer to one another tiles may be than they were told, pixels.
-        """
+        """Pairs of tiles that overlap along a good part of a side, or come so near that they may, (M, 2)."""
         size = np.array(self.size, dtype=np.float64)
         order = np.argsort(self.places[:, 1], kind="stable")
         y = self.places[order, 1]

@@ -88,17 +88,7 @@ def register_tiles(
     distortion: float | None = None,
     progress: Progress = silent,
 ) -> TileRegistration:
-    """Find the places of all tiles.
-
-    Parameters
-    ----------
-    read : callable
-        Gives each tile (h, w); called twice for each, in their order.
-    search : float, optional
-        How far two neighbours may be from where they should be to each other, pixels.
-    distortion : float, optional
-        λ where it is known.
-    """
+    """Find the places of all tiles; ``search`` is how far neighbours may be off, pixels."""
     side = max(grid.size)
     search = _SEARCH * side if search is None else search
     pairs = grid.neighbours(search)

@@ -26,13 +26,7 @@ _CORNERS = 64  # of an outline, at most
 def seam_image(
     seams: SeamMap, origin: tuple[int, int], size: tuple[int, int]
 ) -> tuple[bytes, tuple[float, float, float, float]]:
-    """Seams as PNG, and the box (x, y, width, height) that it fills, pixels of the mosaic from its corner.
-
-    Parameters
-    ----------
-    origin, size : (int, int)
-        Where the mosaic begins in the canvas of the seams, and how large it is, pixels.
-    """
+    """Seams as PNG, and the box (x, y, width, height) that it fills, pixels of the mosaic from its corner."""
     labels, factor = seams.labels, seams.factor
     left, top = origin[0] // factor, origin[1] // factor
     right, bottom = -(-(origin[0] + size[0]) // factor), -(-(origin[1] + size[1]) // factor)
@@ -83,19 +77,7 @@ def viewer_page(
     origin: tuple[int, int] = (0, 0),
     gsd: float | None = None,
 ) -> str:
-    """The page of a ``.dzi`` file, as HTML.
-
-    Parameters
-    ----------
-    output : path
-        The ``.dzi`` file.
-    size : (int, int)
-        Width and height of the mosaic, pixels.
-    origin : (int, int)
-        Where the mosaic begins in the canvas of the seams, pixels.
-    gsd : float, optional
-        Metres that a pixel takes, for the scale bar; without it that counts pixels.
-    """
+    """The page of a ``.dzi`` file, as HTML."""
     output = Path(output)
     data: dict[str, Any] = {
         "size": size,
