@@ -92,7 +92,7 @@ class Cache:
     def recall_many(
         self, stage: str, inputs: Sequence[tuple[Any, ...]], compute: Callable[[list[int]], list[Value]]
     ) -> list[Value]:
-        """As :meth:`recall`, of several results; ``compute`` is called with the places of the inputs that have none yet."""
+        """As :meth:`recall`, of several; ``compute`` is called with the places of the inputs without a result."""
         if self.folder is None:
             return compute(list(range(len(inputs))))
         files = [self._file(stage, own) for own in inputs]

@@ -174,7 +174,7 @@ def _fold_radius(distortion: float, higher: tuple[float, ...]) -> float:
 
 
 def nearest_one_parameter(radius2: FloatArray, distortion: float, higher: Sequence[float] = ()) -> tuple[float, float]:
-    """The λ of the one-parameter model nearest to a lens, by least squares over squared measured radii (N,), normalized.
+    """The λ of the one-parameter model nearest to a lens, by least squares of measured radii; these are given squared.
 
     The scale of the undistorted image is free, as no image of a plane shows it. So this is the λ that the
     estimation of one λ would find from points spread like those given.

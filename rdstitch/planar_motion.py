@@ -109,7 +109,7 @@ class PlanarMotion:
 
 
 def motions_from_homographies(homography: FloatArray, normal: FloatArray | None = None) -> FloatArray:
-    """Rows (ψ, θ, φ, tx, ty, height), (B, 6), of the planar motions nearest to homographies (B, 3, 3), focal-normalized."""
+    """Rows (ψ, θ, φ, tx, ty, height), (B, 6), of planar motions nearest to focal-normalized homographies (B, 3, 3)."""
     if normal is not None:
         return _motions_for_normals(homography, normal)
     h = homography / np.linalg.norm(homography, axis=(1, 2), keepdims=True)

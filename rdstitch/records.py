@@ -73,7 +73,7 @@ def parse_xml(text: str, file: str) -> ElementTree.Element:
 
 
 def convert(value: Any, kind: Callable[..., Kind], file: str, field: str = "", *, strict: bool = True) -> Kind:
-    """Plain values as a record; ``field`` says where in the file they are, and without ``strict`` texts are numbers too."""
+    """Plain values as a record; ``field`` is where in the file they are; unless ``strict``, texts are numbers too."""
     try:
         return msgspec.convert(value, kind, strict=strict)  # type: ignore[no-any-return]
     except msgspec.ValidationError as error:
