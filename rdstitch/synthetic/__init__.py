@@ -29,7 +29,6 @@ from rdstitch.synthetic.rendering import Photometry, Sequence, sequence_over
 from rdstitch.synthetic.textures import (
     EndlessTexture,
     ImageTexture,
-    LinedTexture,
     Texture,
     blank,
     gradient,
@@ -46,7 +45,6 @@ __all__ = [
     "ImageTexture",
     "Instances",
     "Lens",
-    "LinedTexture",
     "Photometry",
     "PlanarInstances",
     "Poses",

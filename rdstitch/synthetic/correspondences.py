@@ -56,12 +56,6 @@ def correspondences(
 
     Parameters
     ----------
-    count : int
-        N.
-    seed : int
-        Equal seeds give equal matches.
-    image_size : (int, int)
-        Width and height, pixels.
     focal : float, optional
         Focal length, pixels; 1.2 times half the diagonal if not given.
     distortion : float
