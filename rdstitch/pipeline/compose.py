@@ -277,7 +277,7 @@ def compose_block(task: BlockTask) -> tuple[list[Stored[OutputStrip]], GuardNote
     """Compute a block; and what was noticed of its files."""
     strips = task.block.compute(task.store)
     if not task.sources:
-        return strips, ({}, {}, {})
+        return strips, ({}, {})
     # All have one guard, which travels with them.
     return strips, task.sources[0].guard.notes_on([source.path for source in task.sources])
 
