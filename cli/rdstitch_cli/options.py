@@ -147,7 +147,7 @@ lens = together(
     _file(
         "--camera",
         "FILE",
-        "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is kept.",
+        "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap or Hugin; its lens is kept.",
     ),
     distortion,
 )
@@ -428,7 +428,7 @@ stitching = together(
     _file(
         "--save-camera",
         "FILE",
-        "Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), .xml (lensfun), camera_info.yaml (ROS) …",
+        "Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), camera_info.yaml (ROS) …",
     ),
     registration,
     as_json("the sidecar"),

@@ -27,7 +27,7 @@ class CameraFile:
     ----------
     camera : Camera
     kind : str
-        Whose format it is: "rdstitch", "OpenCV", "COLMAP", "Kalibr", "OpenDroneMap", "Hugin" or "lensfun".
+        Whose format it is: "rdstitch", "OpenCV", "COLMAP", "Kalibr", "OpenDroneMap" or "Hugin".
     fit : LensFit or None
         How well λ agrees with the file's own lens model; None where the file gives λ itself.
     cause : str

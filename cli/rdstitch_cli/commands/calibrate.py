@@ -29,7 +29,7 @@ Examples:
     required=True,
     metavar="FILE",
     help="Camera file to write: .json, .yml and .fisheye.yml (OpenCV), .pto (Hugin), cameras.json (OpenDroneMap), "
-    "cameras.txt (COLMAP), camera_info.yaml (ROS), camchain.yaml (Kalibr), .xml (lensfun).",
+    "cameras.txt (COLMAP), camera_info.yaml (ROS), camchain.yaml (Kalibr).",
 )
 @options.every
 @options.topic
