@@ -8,7 +8,7 @@ import click
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
 from rdstitch_cli.parameter_types import RealNumber, WholeNumber
-from rdstitch_cli.stitching import Report, report_registration, summarize
+from rdstitch_cli.stitching import Report, composite_fields, report_registration, summarize
 from rdstitch_cli.terminal import Reporter
 
 
@@ -102,14 +102,8 @@ def tiles(
 
     if output is None and positions_only is None:
         raise click.UsageError("nothing to write: give --output or --positions-only")
-    composite = {name: given.pop(name) for name in CompositeOptions.__dataclass_fields__ if name in given}
-    workers = composite.pop("workers")
-    chosen = TileOptions(
-        overlap=overlap / 100.0,
-        composite=CompositeOptions(exposure="none", seam="none", **composite),
-        workers=workers,
-        **given,
-    )
+    composite = CompositeOptions(exposure="none", seam="none", **composite_fields(given))
+    chosen = TileOptions(overlap=overlap / 100.0, composite=composite, **given)
     paths = options.resolve(inputs)
     page = Report(report, reporter, paths, chosen.overwrite, output)
     if output is None:

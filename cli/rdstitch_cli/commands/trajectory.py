@@ -97,31 +97,20 @@ def trajectory(
     with ExitStack() as stack:
         stitch = stitch_options(reporter, **given)
         if following:
-            arrived = live.followed(
-                inputs,
-                stitch,
-                reporter,
-                output=output,
-                plot=plot,
-                every=every,
-                idle=idle,
-                poses=FollowedPoses(height, timestamps, frame or frame_of(layout)),
-            )
+            printed = FollowedPoses(height, timestamps, frame or frame_of(layout))
+            watched: dict[str, Any] = {"output": output, "plot": plot, "every": every, "idle": idle, "poses": printed}
+            arrived = live.followed(inputs, stitch, reporter, **watched)
             paths: Sequence[Named] = stack.enter_context(arrived)
         else:
             paths = options.resolve(inputs)
-        _, registration = recipe(
-            paths,
-            output,
-            stitch,
-            layout=layout,
-            timestamps=timestamps,
-            plot=plot,
-            height=height,
-            frame=frame,
-            every=every,
-            progress=reporter,
-        )
+        how: dict[str, Any] = {
+            "layout": layout,
+            "timestamps": timestamps,
+            "plot": plot,
+            "height": height,
+            "frame": frame,
+        }
+        _, registration = recipe(paths, output, stitch, every=every, progress=reporter, **how)
         if following:
             live.print_result(registration, reporter, output)
         else:
