@@ -8,6 +8,7 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
+from rdstitch_cli.options import option
 from rdstitch_cli.stitching import composite_fields, show_plan
 from rdstitch_cli.terminal import Reporter
 
@@ -23,25 +24,12 @@ Examples:
 """,
 )
 @click.argument("sidecar", type=options.IMAGE, metavar="SIDECAR")
-@click.option(
-    "--images",
-    type=options.IMAGE,
-    required=True,
-    multiple=True,
-    metavar="INPUT",
-    help="Images to compose: what 'rdstitch mosaic' takes; may be given several times.",
-)
+@option("--images", options.IMAGE, required=True, multiple=True)
 @options.output
 @options.overwrite
 @options.every_frame
 @options.topic
-@click.option(
-    "--match",
-    type=click.Choice(["auto", "name", "order"]),
-    default="auto",
-    show_default=True,
-    help="How images find their places: by name (the suffix may differ), by order, or by order if no name fits.",
-)
+@option("--match", ("auto", "name", "order"), "auto")
 @options.mask
 @options.flat_field("off")
 @options.compositing

@@ -7,6 +7,7 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
+from rdstitch_cli.options import option
 from rdstitch_cli.stitching import read_lens
 from rdstitch_cli.terminal import Reporter
 
@@ -22,24 +23,11 @@ Examples:
 )
 @options.inputs
 @options.lens
-@click.option(
-    "-o", "--output", type=options.IMAGE, required=True, metavar="DIR", help="Folder to write to; made if missing."
-)
+@option("-o --output", options.IMAGE, of="undistort", required=True)
 @options.overwrite
 @options.topic
-@click.option(
-    "--view",
-    type=click.Choice(["same", "all", "valid"]),
-    default="same",
-    show_default=True,
-    help="What to show: the same scale and size as the image, all of it, or only where it has no empty border.",
-)
-@click.option(
-    "--format",
-    "image_format",
-    type=click.Choice(["jpg", "png", "tif", "webp"]),
-    help="Of the files written; that of each image, or png where that cannot be written, if not given.",
-)
+@option("--view", ("same", "all", "valid"), "same")
+@option("--format", ("jpg", "png", "tif", "webp"), of="undistort", dest="image_format")
 @options.verbosity
 def undistort(inputs: tuple[Path, ...], camera: Path | None, output: Path, reporter: Reporter, **given: Any) -> None:
     """Undistort images with a known lens, each into a file of the same name in a folder.
