@@ -10,7 +10,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.synthetic.instances import Instances, PlanarInstances, general_instances, planar_instances
+from tests.instances import Instances, PlanarInstances, general_instances, planar_instances
 
 
 @dataclass(frozen=True)
