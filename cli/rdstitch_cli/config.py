@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from rdstitch.errors import InputError
+from rdstitch_cli.option_texts import TEXTS
 
 COMMON = "common"
 """The table that holds for every command."""
@@ -22,11 +23,11 @@ def config_option() -> click.Option:
     return click.Option(
         ["--config"],
         type=click.Path(path_type=Path, readable=False),
-        metavar="FILE",
+        metavar=TEXTS["--config"].called,
         is_eager=True,
         expose_value=False,
         callback=_apply,
-        help="Take options from this TOML file; those on the command line win.",
+        help=TEXTS["--config"].text,
     )
 
 

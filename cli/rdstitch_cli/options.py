@@ -73,12 +73,12 @@ def option(
     ``kind`` is a type, some words, or bool for a flag; ``usual`` the default that help pages show; ``of`` the command
     whose text it is, where others have another; ``dest`` the parameter's name where it is not the option's.
     """
-    called, text = TEXTS[f"{of} {names}".strip()]
+    entry = TEXTS[f"{of} {names}".strip()]
     kinds = {"is_flag": True} if kind is bool else {"type": click.Choice(kind) if isinstance(kind, tuple) else kind}
     default = {} if usual is None else {"default": usual, "show_default": True}
     called_in_code = [] if dest is None else [dest]
     return click.option(
-        *names.split(), *called_in_code, **{"metavar": called, "help": text, **kinds, **default, **more}
+        *names.split(), *called_in_code, **{"metavar": entry.called, "help": entry.text, **kinds, **default, **more}
     )
 
 
@@ -92,7 +92,7 @@ def _every(otherwise: int | None) -> Decorator[Any]:
         "--every",
         word_or_number(("auto",), 1, 1_000_000),
         callback=lambda _context, _option, value: {None: otherwise, "auto": None}.get(value, value),
-        help=f"{TEXTS['--every'][1]}  [default: {usual}]",
+        help=f"{TEXTS['--every'].text}  [default: {usual}]",
     )
 
 
@@ -104,7 +104,7 @@ overwrite = option("--overwrite", bool)
 
 def as_json(what: str) -> Decorator[Any]:
     """The option, of a command that would print so much."""
-    return click.option("--json", "as_json", is_flag=True, help=f"Print {what} as JSON.")
+    return click.option("--json", "as_json", is_flag=True, help=TEXTS["--json"].text.format(what))
 
 
 def verbosity(command: Callable[..., Any]) -> Any:
