@@ -33,18 +33,10 @@ _PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
 
 @dataclass(frozen=True)
 class Cache:
-    """Results on disk; several processes may share one.
+    """Results on disk; several processes may share one."""
 
-    Attributes
-    ----------
-    folder : Path or None
-        Without one nothing is kept, and everything is computed.
-    temporary : TemporaryFolder or None
-        Where the folder serves this run alone, what removes it.
-    """
-
-    folder: Path | None = None
-    temporary: TemporaryFolder | None = None
+    folder: Path | None = None  # without one nothing is kept, and everything is computed
+    temporary: TemporaryFolder | None = None  # where the folder serves this run alone, what removes it
 
     @classmethod
     def at(cls, folder: Path | None) -> Self:

@@ -157,18 +157,11 @@ def holds_only_tiles(folder: Path) -> bool:
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """What an image's files come to.
+    """What an image's files come to."""
 
-    Attributes
-    ----------
-    size : int
-        Bytes of all files.
-    sha256 : str
-        Of the file; of a Deep Zoom image that of the list of its files, as ``sha256sum`` prints it (digest, two
-        spaces, name), in order of names, the description first as ``.dzi``.
-    """
-
-    size: int
+    size: int  # bytes of all files
+    # of the file; of a Deep Zoom image that of the list of its files, as ``sha256sum`` prints it (digest, two spaces,
+    # name), in order of names, the description first as ``.dzi``
     sha256: str
 
 

@@ -62,24 +62,12 @@ def turned_tilt(tilt: tuple[float, float], turning: FloatArray) -> tuple[float, 
 
 @dataclass(frozen=True)
 class PlanarMotion:
-    """Motion between two images of one camera over one plane.
+    """Motion between two images of one camera over one plane."""
 
-    Attributes
-    ----------
-    tilt : (float, float)
-        (ψ, θ), radians, of the camera to the plane, the same in both images.
-    yaw : float
-        φ, radians.
-    translation : (float, float)
-        (tx, ty) in units of the first image's height above the plane.
-    height : float
-        Height of the second image in units of the first's; 1 for planar motion.
-    """
-
-    tilt: tuple[float, float]
-    yaw: float
-    translation: tuple[float, float]
-    height: float = 1.0
+    tilt: tuple[float, float]  # (ψ, θ), radians, of the camera to the plane, the same in both images
+    yaw: float  # φ, radians
+    translation: tuple[float, float]  # (tx, ty) in units of the first image's height above the plane
+    height: float = 1.0  # height of the second image in units of the first's; 1 for planar motion
 
     def homography(self) -> FloatArray:
         """``H = R Rz(φ) diag(1, 1, height) T R'``, shape (3, 3), focal-normalized; its determinant is ``height``."""

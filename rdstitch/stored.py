@@ -51,21 +51,11 @@ def _folder(path: Path) -> TemporaryFolder:
 
 @dataclass(frozen=True)
 class Stored(Generic[Value]):
-    """A result that is read when it is needed; one that could not be kept on disk stays in memory.
+    """A result that is read when it is needed; one that could not be kept on disk stays in memory."""
 
-    Attributes
-    ----------
-    file : Path or None
-        Entry of a cache.
-    value : Value or None
-        The result itself, without a file.
-    folder : TemporaryFolder or None
-        What must not be removed before.
-    """
-
-    file: Path | None = None
-    value: Value | None = None
-    folder: TemporaryFolder | None = field(default=None, compare=False, repr=False)
+    file: Path | None = None  # entry of a cache
+    value: Value | None = None  # the result itself, without a file
+    folder: TemporaryFolder | None = field(default=None, compare=False, repr=False)  # what must not be removed before
 
     def load(self) -> Value:
         """The result; those used recently are still in memory."""

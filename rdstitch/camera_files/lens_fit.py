@@ -21,23 +21,12 @@ _SQUARE = 0.005  # calibrations give focal lengths along x and y that differ by 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """A camera as a file tells it.
-
-    Attributes
-    ----------
-    camera : Camera
-    kind : str
-        Whose format it is: "rdstitch", "OpenCV", "COLMAP", "Kalibr", "OpenDroneMap" or "Hugin".
-    fit : LensFit or None
-        How well λ agrees with the file's own lens model; None where the file gives λ itself.
-    cause : str
-        What of the file's model λ cannot describe; empty where it is only the curve of the lens.
-    """
+    """A camera as a file tells it."""
 
     camera: Camera
-    kind: str
-    fit: LensFit | None = None
-    cause: str = ""
+    kind: str  # whose format it is: "rdstitch", "OpenCV", "COLMAP", "Kalibr", "OpenDroneMap" or "Hugin"
+    fit: LensFit | None = None  # how well λ agrees with the file's own lens model; None where the file gives λ itself
+    cause: str = ""  # what of the file's model λ cannot describe; empty where it is only the curve of the lens
 
 
 def fitted_camera(

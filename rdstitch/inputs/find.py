@@ -29,24 +29,13 @@ IMAGE_SUFFIXES = frozenset(
 
 @dataclass(frozen=True)
 class FoundImages:
-    """What the user's arguments stand for.
+    """What the user's arguments stand for."""
 
-    Attributes
-    ----------
-    frames : list of Frame
-        In natural order within a folder or pattern.
-    outputs : list of Path
-        Images in folders and patterns that rdstitch wrote, by the sidecars beside them, and that are no input.
-    containers : tuple of Path
-        The ``@list`` files, videos and bags that frames come from.
-    notes : tuple of Message
-        On videos of which not every frame was taken.
-    """
-
-    frames: list[Frame]
+    frames: list[Frame]  # in natural order within a folder or pattern
+    # images in folders and patterns that rdstitch wrote, by the sidecars beside them, and that are no input
     outputs: list[Path]
-    containers: tuple[Path, ...] = ()
-    notes: tuple[Message, ...] = ()
+    containers: tuple[Path, ...] = ()  # the ``@list`` files, videos and bags that frames come from
+    notes: tuple[Message, ...] = ()  # on videos of which not every frame was taken
 
     @property
     def files(self) -> list[Path]:

@@ -21,24 +21,12 @@ ChannelOrder = Literal["bgr", "rgb"]
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One input image.
+    """One input image."""
 
-    Attributes
-    ----------
-    path : Path
-        Its file; for an array in memory the name that stands for it.
-    number : int or None
-        Its number in the video, bag or list of arrays that it comes from, from 0.
-    timestamp : float or None
-        When it was taken, s, where its video or bag knows that.
-    image : DecodedImage or None
-        The image itself where it is no file.
-    """
-
-    path: Path
-    number: int | None = None
-    timestamp: float | None = None
-    image: DecodedImage | None = None
+    path: Path  # its file; for an array in memory the name that stands for it
+    number: int | None = None  # its number in the video, bag or list of arrays that it comes from, from 0
+    timestamp: float | None = None  # when it was taken, s, where its video or bag knows that
+    image: DecodedImage | None = None  # the image itself where it is no file
 
 
 Image = str | os.PathLike[str] | NDArray[Any] | PIL.Image.Image

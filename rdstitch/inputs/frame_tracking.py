@@ -26,21 +26,11 @@ _GRID = 16  # points a side by which areas are measured
 
 @dataclass(frozen=True)
 class FramePlaces:
-    """Where the frames of a video lie.
+    """Where the frames of a video lie."""
 
-    Attributes
-    ----------
-    size : ndarray of shape (2,)
-        Of a frame, pixels of its small version.
-    places : ndarray of shape (N, 3, 3)
-        From each frame to what all frames of its track have in common; affine.
-    track : ndarray of shape (N,), intp
-        Number of the track; one ends where a frame cannot be found again in the next.
-    """
-
-    size: FloatArray
-    places: FloatArray
-    track: NDArray[np.intp]
+    size: FloatArray  # (2,): of a frame, pixels of its small version
+    places: FloatArray  # (N, 3, 3): from each frame to what all frames of its track have in common; affine
+    track: NDArray[np.intp]  # (N,), intp: number of the track; one ends where a frame cannot be found again in the next
 
     def seen_by(self, frames: NDArray[np.intp], other: int) -> BoolArray:
         """Which points of a grid in some frames another frame shows, (M, P)."""

@@ -33,45 +33,26 @@ _HELD_UPRIGHT = 6
 
 @dataclass(frozen=True)
 class Source:
-    """One input image; its pixels are read when they are needed.
-
-    Attributes
-    ----------
-    path : Path
-    metadata : Metadata
-    camera : Camera
-        What is known of the camera before registration: size, centre, focal length, and λ where it was given.
-    mask : Path or None
-        Image that is dark where this one does not count.
-    mask_frame : int or None
-        How it is turned, see :func:`rdstitch.io.mask.mask_frame`.
-    attitude : (float, float) or None
-        (ψ, θ), radians, as a gimbal or an IMU has measured it.
-    frame : Frame or None
-        Its number and time in the sequence; the pixels, where they are no file.
-    decoded_images : DecodedImageCache
-        Where it is kept between two stages that both look at it.
-    guard : InputGuard
-        What notices changes of the file, and damage.
-    flat_field : FlatField or None
-        Illumination that is taken out of the pixels.
-    control : tuple of GroundControl
-        Points of known place that it shows.
-    """
+    """One input image; its pixels are read when they are needed."""
 
     path: Path
     metadata: Metadata
+    # what is known of the camera before registration: size, centre, focal length, and λ where it was given
     camera: Camera
-    mask: Path | None = None
-    mask_frame: int | None = None
-    attitude: tuple[float, float] | None = None
+    mask: Path | None = None  # image that is dark where this one does not count
+    mask_frame: int | None = None  # how it is turned, see :func:`rdstitch.io.mask.mask_frame`
+    attitude: tuple[float, float] | None = None  # (ψ, θ), radians, as a gimbal or an IMU has measured it
+    # its number and time in the sequence; the pixels, where they are no file
     frame: Frame | None = field(default=None, compare=False, repr=False)
+    # where it is kept between two stages that both look at it
     decoded_images: DecodedImageCache = field(
         default_factory=partial(DecodedImageCache, room=0), compare=False, repr=False
     )
+    # what notices changes of the file, and damage
     guard: InputGuard = field(default_factory=InputGuard, compare=False, repr=False)
+    # illumination that is taken out of the pixels
     flat_field: FlatField | None = field(default=None, compare=False, repr=False)
-    control: tuple[GroundControl, ...] = ()
+    control: tuple[GroundControl, ...] = ()  # points of known place that it shows
 
     @property
     def name(self) -> str:

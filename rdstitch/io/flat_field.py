@@ -16,18 +16,10 @@ from rdstitch.late_imports import tifffile
 
 @dataclass(frozen=True, eq=False)
 class FlatField:
-    """Illumination of all images of a camera: ``measured = gain * light + dark``.
+    """Illumination of all images of a camera: ``measured = gain * light + dark``."""
 
-    Attributes
-    ----------
-    gain : ndarray of shape (h, w, C), float32
-        Mean 1 in each channel.
-    dark : ndarray of shape (h, w, C) or (1, 1, C), float32
-        Samples without light.
-    """
-
-    gain: NDArray[np.float32]
-    dark: NDArray[np.float32]
+    gain: NDArray[np.float32]  # (h, w, C), float32: mean 1 in each channel
+    dark: NDArray[np.float32]  # (h, w, C) or (1, 1, C), float32: samples without light
 
     def corrected(self, pixels: NDArray[Any], reduction: int = 1) -> NDArray[Any]:
         """``(v - dark) / gain + dark`` of samples (h, w) or (h, w, C), reduced or not, in their type.

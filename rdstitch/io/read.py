@@ -82,22 +82,15 @@ Pixels = NDArray[Any]
 
 @dataclass(frozen=True)
 class DecodedImage:
-    """One image in memory.
+    """One image in memory."""
 
-    Attributes
-    ----------
-    pixels : ndarray of shape (height, width) or (height, width, channels)
-        uint8, uint16 or float32. Colour is in RGB order, never BGR. The EXIF orientation has been applied.
-    alpha : ndarray of shape (height, width), uint8, or None
-        255 where the image is opaque, 0 where it says nothing; None when it is opaque everywhere.
-    metadata : Metadata
-    damage : str
-        Why some of the pixels may be wrong: the complaint of a decoder that went on nevertheless. Empty without one.
-    """
-
+    # (height, width) or (height, width, channels): uint8, uint16 or float32. Colour is in RGB order, never BGR. The
+    # EXIF orientation has been applied
     pixels: Pixels
+    # (height, width), uint8: 255 where the image is opaque, 0 where it says nothing; None when it is opaque everywhere
     alpha: NDArray[np.uint8] | None
     metadata: Metadata
+    # why some of the pixels may be wrong: the complaint of a decoder that went on nevertheless. Empty without one
     damage: str = ""
 
     @property

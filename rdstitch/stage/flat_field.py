@@ -37,23 +37,12 @@ _BINS, _LEAST_BINS, _LEAST_IN_BIN = 24, 6, 16
 
 @dataclass(frozen=True)
 class Illumination:
-    """The flat field that tiles show, or why they do not.
+    """The flat field that tiles show, or why they do not."""
 
-    Attributes
-    ----------
-    field : FlatField or None
-        None where the tiles do not show it better than by half of what it is.
-    error : float
-        Its root mean square error, by how far two halves of the tiles differ.
-    shading : float
-        Largest share of the light that is missing.
-    dark : ndarray of shape (C,)
-    """
-
-    field: FlatField | None
-    error: float
-    shading: float
-    dark: FloatArray
+    field: FlatField | None  # none where the tiles do not show it better than by half of what it is
+    error: float  # its root mean square error, by how far two halves of the tiles differ
+    shading: float  # largest share of the light that is missing
+    dark: FloatArray  # (C,)
 
 
 class _Statistics:

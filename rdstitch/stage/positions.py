@@ -28,21 +28,12 @@ _HOW = (
 
 @dataclass(frozen=True)
 class StagePosition:
-    """The place of one tile.
-
-    Attributes
-    ----------
-    x, y : float
-    unit : float or None
-        Micrometres that these count; None for pixels.
-    pixel_size : float or None
-        Micrometres, where the file says it.
-    """
+    """The place of one tile."""
 
     x: float
     y: float
-    unit: float | None
-    pixel_size: float | None = None
+    unit: float | None  # micrometres that these count; None for pixels
+    pixel_size: float | None = None  # micrometres, where the file says it
 
 
 def grid_from_names(names: Sequence[str], pattern: str, overlap: float, size: tuple[int, int]) -> TileGrid:

@@ -56,28 +56,15 @@ _LEAST_BLOCK = 0.02
 
 @dataclass(frozen=True)
 class TileRegistration:
-    """The places of all tiles, and the matches that show them.
-
-    Attributes
-    ----------
-    grid : TileGrid
-    adjustment : Adjustment
-    links : LinkedPoints
-        Blocks of all pairs that show something.
-    compared : ndarray of shape (Q, 2), int
-        All pairs that were compared.
-    linked : ndarray of shape (N,), bool
-        Tiles that links hold; the others have the place that the model of the stage gives them.
-    groups : tuple of tuple of int
-        Tiles that links hold together, the largest group first.
-    """
+    """The places of all tiles, and the matches that show them."""
 
     grid: TileGrid
     adjustment: Adjustment
-    links: LinkedPoints
-    compared: IntArray
+    links: LinkedPoints  # blocks of all pairs that show something
+    compared: IntArray  # (Q, 2), int: all pairs that were compared
+    # (N,), bool: tiles that links hold; the others have the place that the model of the stage gives them
     linked: BoolArray
-    groups: tuple[tuple[int, ...], ...]
+    groups: tuple[tuple[int, ...], ...]  # tiles that links hold together, the largest group first
 
 
 def register_tiles(

@@ -20,20 +20,12 @@ _CORNERS = 64  # of an outline, at most
 
 @dataclass(frozen=True)
 class ViewedImage:
-    """What the page says of an image.
-
-    Attributes
-    ----------
-    name : str
-    outlines : sequence of ndarray of shape (K, 2)
-        At each of its places; pixels of the mosaic, centre of the top-left one at (0, 0).
-    facts : tuple of (str, str)
-        What is shown when the image is clicked.
-    """
+    """What the page says of an image."""
 
     name: str
+    # (K, 2): at each of its places; pixels of the mosaic, centre of the top-left one at (0, 0)
     outlines: Sequence[FloatArray]
-    facts: tuple[tuple[str, str], ...]
+    facts: tuple[tuple[str, str], ...]  # what is shown when the image is clicked
 
 
 def viewer_path(output: str | Path) -> Path | None:
