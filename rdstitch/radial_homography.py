@@ -92,7 +92,7 @@ def transfer(
 
 @dataclass(frozen=True)
 class TransferJacobian:
-    """Transferred points and their derivatives, for N points; all in normalized coordinates, and points last in memory."""
+    """N transferred points and their derivatives, all in normalized coordinates, the points last in memory."""
 
     points: FloatArray  # (N, 2): where the points of image 1 are measured in image 2
     by_image: FloatArray  # (2, 3, N): by ``z = H p``
