@@ -12,12 +12,12 @@ from rdstitch.camera import Camera
 from rdstitch.errors import RegistrationError
 from rdstitch.features import Features, Matcher
 from rdstitch.features.prepared_image import PreparedImage
+from rdstitch.inputs.corner_flow import CornerFlow, fitted_affine
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
 from rdstitch.radial_homography import from_plane
 from rdstitch.robust import PairMatches, estimate_radial_homographies
-from rdstitch.tracking.flow import CornerFlow, fitted_affine
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 
 _WINDOW = 48  # keyframes that are kept
