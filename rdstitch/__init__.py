@@ -8,31 +8,42 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rdstitch import errors, solvers, synthetic
-    from rdstitch.alignment import Alignment
-    from rdstitch.alignment.trajectory import Trajectory
-    from rdstitch.camera import Camera
-    from rdstitch.camera_files import load_camera, save_camera
-    from rdstitch.compositing import CompositeOptions
-    from rdstitch.doctor import Examination, examine
-    from rdstitch.errors import RdstitchError
-    from rdstitch.features import FeatureOptions
-    from rdstitch.messages import Message
-    from rdstitch.options import StitchOptions
-    from rdstitch.pipeline.apply_sidecar import apply
-    from rdstitch.pipeline.composer import Composer
-    from rdstitch.pipeline.follow import FollowedPoses, Pose, Tracker
-    from rdstitch.pipeline.layers import write_layers
-    from rdstitch.pipeline.recipes import calibrate, mosaic, mosaic_blocks, pano, trajectory
-    from rdstitch.pipeline.recomposition import Recomposition
-    from rdstitch.pipeline.stage_tiles import place_tiles, tiles
-    from rdstitch.pipeline.undistort_images import undistort
-    from rdstitch.radial_homography import RadialHomography
-    from rdstitch.registration import Registration
-    from rdstitch.report import write_report
-    from rdstitch.robust import estimate_radial_homography
-    from rdstitch.stage import TileOptions
-    from rdstitch.stitch_result import StitchResult
+    from rdstitch import errors as errors
+    from rdstitch import solvers as solvers
+    from rdstitch import synthetic as synthetic
+    from rdstitch.alignment import Alignment as Alignment
+    from rdstitch.alignment.trajectory import Trajectory as Trajectory
+    from rdstitch.camera import Camera as Camera
+    from rdstitch.camera_files import load_camera as load_camera
+    from rdstitch.camera_files import save_camera as save_camera
+    from rdstitch.compositing import CompositeOptions as CompositeOptions
+    from rdstitch.doctor import Examination as Examination
+    from rdstitch.doctor import examine as examine
+    from rdstitch.errors import RdstitchError as RdstitchError
+    from rdstitch.features import FeatureOptions as FeatureOptions
+    from rdstitch.messages import Message as Message
+    from rdstitch.options import StitchOptions as StitchOptions
+    from rdstitch.pipeline.apply_sidecar import apply as apply
+    from rdstitch.pipeline.composer import Composer as Composer
+    from rdstitch.pipeline.follow import FollowedPoses as FollowedPoses
+    from rdstitch.pipeline.follow import Pose as Pose
+    from rdstitch.pipeline.follow import Tracker as Tracker
+    from rdstitch.pipeline.layers import write_layers as write_layers
+    from rdstitch.pipeline.recipes import calibrate as calibrate
+    from rdstitch.pipeline.recipes import mosaic as mosaic
+    from rdstitch.pipeline.recipes import mosaic_blocks as mosaic_blocks
+    from rdstitch.pipeline.recipes import pano as pano
+    from rdstitch.pipeline.recipes import trajectory as trajectory
+    from rdstitch.pipeline.recomposition import Recomposition as Recomposition
+    from rdstitch.pipeline.stage_tiles import place_tiles as place_tiles
+    from rdstitch.pipeline.stage_tiles import tiles as tiles
+    from rdstitch.pipeline.undistort_images import undistort as undistort
+    from rdstitch.radial_homography import RadialHomography as RadialHomography
+    from rdstitch.registration import Registration as Registration
+    from rdstitch.report import write_report as write_report
+    from rdstitch.robust import estimate_radial_homography as estimate_radial_homography
+    from rdstitch.stage import TileOptions as TileOptions
+    from rdstitch.stitch_result import StitchResult as StitchResult
 
     __version__: str
 
@@ -68,44 +79,7 @@ _HOMES = {
     for name in names.split()
 }
 
-__all__ = [
-    "Alignment",
-    "Camera",
-    "Composer",
-    "CompositeOptions",
-    "Examination",
-    "FeatureOptions",
-    "FollowedPoses",
-    "Message",
-    "Pose",
-    "RadialHomography",
-    "RdstitchError",
-    "Recomposition",
-    "Registration",
-    "StitchOptions",
-    "StitchResult",
-    "TileOptions",
-    "Tracker",
-    "Trajectory",
-    "apply",
-    "calibrate",
-    "errors",
-    "estimate_radial_homography",
-    "examine",
-    "load_camera",
-    "mosaic",
-    "mosaic_blocks",
-    "pano",
-    "place_tiles",
-    "save_camera",
-    "solvers",
-    "synthetic",
-    "tiles",
-    "trajectory",
-    "undistort",
-    "write_layers",
-    "write_report",
-]
+__all__ = [*_HOMES]
 
 
 def __getattr__(name: str) -> Any:

@@ -33,23 +33,10 @@ _PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
 
 @dataclass(frozen=True)
 class Cache:
-    """Results on disk; several processes may share one.
+    """Results on disk; several processes may share one."""
 
-    Attributes
-    ----------
-    folder : Path or None
-        Without one nothing is kept, and everything is computed.
-    temporary : TemporaryFolder or None
-        Where the folder serves this run alone, what removes it.
-
-    Raises
-    ------
-    OutputError
-        When the folder cannot be made, or not be written to.
-    """
-
-    folder: Path | None = None
-    temporary: TemporaryFolder | None = None
+    folder: Path | None = None  # without one nothing is kept, and everything is computed
+    temporary: TemporaryFolder | None = None  # where the folder serves this run alone, what removes it
 
     @classmethod
     def at(cls, folder: Path | None) -> Self:
@@ -81,17 +68,7 @@ class Cache:
             raise OutputError(f"{self.folder}: no permission to write into the folder of the cache")
 
     def recall(self, stage: str, inputs: tuple[Any, ...], compute: Callable[[], Value]) -> Value:
-        """What a stage gives for its inputs: from an earlier run, else computed now and kept.
-
-        Parameters
-        ----------
-        stage : str
-            Name of the stage.
-        inputs : tuple
-            Everything that the result depends on, as :func:`rdstitch.io.packing.digest` takes it.
-        compute : callable
-            Gives the result.
-        """
+        """What a stage gives for its inputs: from an earlier run, else computed now and kept."""
         return self.recall_many(stage, [inputs], lambda _: [compute()])[0]
 
     def stored(self, stage: str, inputs: tuple[Any, ...], compute: Callable[[], Value]) -> Stored[Value]:
@@ -107,15 +84,7 @@ class Cache:
     def recall_many(
         self, stage: str, inputs: Sequence[tuple[Any, ...]], compute: Callable[[list[int]], list[Value]]
     ) -> list[Value]:
-        """As :meth:`recall` for a stage that computes several results at once.
-
-        Parameters
-        ----------
-        inputs : sequence of tuple
-            Of each result.
-        compute : callable
-            Gives the results of some of the inputs, called with their places.
-        """
+        """As :meth:`recall`, of several; ``compute`` is called with the places of the inputs without a result."""
         if self.folder is None:
             return compute(list(range(len(inputs))))
         files = [self._file(stage, own) for own in inputs]

@@ -403,13 +403,7 @@ class LensRecord(Struct, kw_only=True):
     focal_source: FocalSource | None = None
 
     def lens(self, size: tuple[int, int]) -> Camera:
-        """Give the lens on an image of a size; not how far it is determined.
-
-        Raises
-        ------
-        ValueError
-            When there is none, or it is impossible.
-        """
+        """Give the lens on an image of a size; not how far it is determined."""
         if self.center_px is None or (self.coefficients is None and self.lambda_ is None):
             raise ValueError(f"{'center_px' if self.center_px is None else 'lambda'} is missing")
         distortion, second, third = self.coefficients or (self.lambda_ or 0.0, self.lambda2, 0.0)

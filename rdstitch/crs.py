@@ -24,17 +24,7 @@ _NORTH, _SOUTH = 32600, 32700  # EPSG codes of UTM on WGS 84 are these and the z
 
 @dataclass(frozen=True)
 class Crs:
-    """A projected coordinate reference system in metres.
-
-    Parameters
-    ----------
-    epsg : int
-
-    Raises
-    ------
-    ArgumentError
-        When there is none of this code in metres, or when rasterio, which knows it, is not installed.
-    """
+    """A projected coordinate reference system in metres."""
 
     epsg: int
 

@@ -89,13 +89,6 @@ def distort(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = 
     For λ alone in closed form, ``x_d = 2 x_u / (1 + sqrt(1 - 4 λ |x_u|²))``, which is stable at λ = 0 and at the
     centre; otherwise by Newton's method on the radius, with bisection where a step leaves the domain.
 
-    Parameters
-    ----------
-    points : array_like of shape (..., 2)
-        Undistorted points, normalized with the centre at the origin.
-    distortion, higher
-        As in :func:`undistort`.
-
     Returns
     -------
     ndarray of shape (..., 2)
@@ -181,17 +174,10 @@ def _fold_radius(distortion: float, higher: tuple[float, ...]) -> float:
 
 
 def nearest_one_parameter(radius2: FloatArray, distortion: float, higher: Sequence[float] = ()) -> tuple[float, float]:
-    """The λ of the one-parameter model nearest to a lens, by least squares of measured radii.
+    """The λ of the one-parameter model nearest to a lens, by least squares of measured radii; these are given squared.
 
     The scale of the undistorted image is free, as no image of a plane shows it. So this is the λ that the
     estimation of one λ would find from points spread like those given.
-
-    Parameters
-    ----------
-    radius2 : ndarray of shape (N,)
-        Squared radii of measured points, normalized; in the domain of the lens.
-    distortion, higher
-        The lens.
 
     Returns
     -------

@@ -69,13 +69,7 @@ def local_file(path: str | Path) -> Path:
 
 
 def open_remote(path: str | Path) -> BufferedReader:
-    """Open a file for reading bytes at any place; a header is had without the rest, where the server allows that.
-
-    Raises
-    ------
-    OSError
-        When it cannot be opened. The text says what to install, where something is missing.
-    """
+    """Open a file for reading bytes at any place; a header is had without the rest, where the server allows that."""
     held = _held.get()
     if held is not None and held[0] == str(path):
         return BufferedReader(BytesIO(held[1]))
@@ -103,13 +97,7 @@ def held_in_memory(path: Path) -> Iterator[None]:
 
 
 def remote_status(path: str | Path) -> tuple[bool, int | None, str]:
-    """Whether it is a folder, its size in bytes where the server says that, and what changes with its content.
-
-    Raises
-    ------
-    OSError
-        As :func:`open_remote`.
-    """
+    """Whether it is a folder, its size in bytes where the server says that, and what changes with its content."""
     with _as_os_error():
         system, name = _filesystem(path)
         found = system.info(name)
@@ -117,13 +105,7 @@ def remote_status(path: str | Path) -> tuple[bool, int | None, str]:
 
 
 def remote_names(url: str) -> list[str]:
-    """URLs of the files in a folder, or of those that match a pattern; empty where the URL is neither.
-
-    Raises
-    ------
-    OSError
-        As :func:`open_remote`.
-    """
+    """URLs of the files in a folder, or of those that match a pattern; empty where the URL is neither."""
     with _as_os_error():
         system, name = _filesystem(url)
         if any(letter in url for letter in "*["):
@@ -158,13 +140,7 @@ def _as_os_error() -> Iterator[None]:
 
 
 def open_regular(path: str | Path) -> BufferedReader:
-    """Open a regular file for reading bytes, at once whatever lies there; or one that a URL names.
-
-    Raises
-    ------
-    OSError
-        When it cannot be opened, or is no regular file.
-    """
+    """Open a regular file for reading bytes, at once whatever lies there; or one that a URL names."""
     if is_url(path):
         return open_remote(path)
     # Opening a pipe would wait for a writer.
@@ -178,13 +154,7 @@ def open_regular(path: str | Path) -> BufferedReader:
 
 
 def read_limited(path: str | Path, most: int, *, regular: bool = True) -> bytes:
-    """The content of a file of at most so many bytes; of a regular one, unless pipes are allowed.
-
-    Raises
-    ------
-    OSError
-        When it cannot be opened, is no regular file, or is larger.
-    """
+    """The content of a file of at most so many bytes; of a regular one, unless pipes are allowed."""
     left, blocks = most + 1, []
     with open_regular(path) if regular else Path(path).open("rb") as stream:
         # What a stream is asked for is allocated, however small the file.
@@ -203,11 +173,6 @@ def read_text(path: str | Path, *, regular: bool = True) -> str:
     ----------
     regular : bool
         Refuse pipes and devices, of which reading may not come to an end.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read.
     """
     try:
         # Names of files that are not UTF-8 are written as they are, and come back as they were.

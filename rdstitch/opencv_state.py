@@ -11,13 +11,7 @@ _SILENT = 0  # the log level of that name
 
 
 class _SharedSetting:
-    """A number of the process that blocks of code hold at another value: the last block to end restores it.
-
-    Parameters
-    ----------
-    held : int
-        Value inside the blocks.
-    """
+    """A number of the process that blocks of code hold at another value: the last block to end restores it."""
 
     def __init__(self, read: Callable[[], int], write: Callable[[int], object], held: int) -> None:
         self._read, self._write, self._held = read, write, held

@@ -39,24 +39,7 @@ def check_output(
     inputs: Iterable[str | Path] = (),
     suffixes: Iterable[str] = IMAGE_SUFFIXES,
 ) -> Path:
-    """Find out before long work whether a file can be written; nothing is created.
-
-    Parameters
-    ----------
-    path
-        File to be written later.
-    overwrite
-        Whether an existing file may be replaced.
-    inputs
-        Files that must never be written over, whatever ``overwrite`` says.
-    suffixes
-        Known file name endings, lower case; empty for any.
-
-    Raises
-    ------
-    OutputError
-        With what to do about it.
-    """
+    """Find out before long work whether a file can be written, over none of the inputs; nothing is created."""
     file, known = Path(path), tuple(suffixes)
     if known and file.suffix.lower() not in known:
         what = f"unknown file type '{file.suffix}'" if file.suffix else "no file type in the name"
@@ -98,13 +81,7 @@ def _check_place(file: Path, overwrite: bool, inputs: Iterable[str | Path]) -> N
 
 
 def check_not_read(files: Iterable[Path], inputs: Iterable[str | Path]) -> None:
-    """Refuse to write over what is read, by whatever name.
-
-    Raises
-    ------
-    OutputError
-        When one of the files is one of the inputs.
-    """
+    """Refuse to write over what is read, by whatever name."""
     read = {_identity(local_file(Path(path))) for path in inputs} - {None}
     for file in files:
         if _identity(file) in read:
@@ -112,13 +89,7 @@ def check_not_read(files: Iterable[Path], inputs: Iterable[str | Path]) -> None:
 
 
 def check_distinct(paths: Iterable[str | Path]) -> None:
-    """Find out before long work whether two outputs would be written into one file.
-
-    Raises
-    ------
-    OutputError
-        When two of the names lead to the same place.
-    """
+    """Find out before long work whether two outputs would be written into one file."""
     seen: set[tuple[str, str]] = set()
     for file in map(Path, paths):
         place = os.path.realpath(file.parent), file.name
@@ -137,13 +108,7 @@ def _identity(file: Path) -> tuple[int, int] | None:
 
 
 def write_bytes_atomic(path: str | Path, data: bytes, overwrite: bool = True) -> None:
-    """Write a file, whole or not at all.
-
-    Raises
-    ------
-    OutputError
-        When the file system refuses.
-    """
+    """Write a file, whole or not at all."""
     with Outputs(overwrite) as outputs:
         outputs.write(path, data)
 
@@ -169,13 +134,7 @@ def tiles_folder(path: Path) -> Path:
 
 
 def check_tiles_folder(folder: Path, overwrite: bool) -> None:
-    """Refuse to replace a folder that is to be kept, or in which anything is no tile.
-
-    Raises
-    ------
-    OutputError
-        With what to do about it.
-    """
+    """Refuse to replace a folder that is to be kept, or in which anything is no tile."""
     if not folder.exists():
         return
     if not overwrite:
@@ -198,29 +157,16 @@ def holds_only_tiles(folder: Path) -> bool:
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """What an image's files come to.
+    """What an image's files come to."""
 
-    Attributes
-    ----------
-    size : int
-        Bytes of all files.
-    sha256 : str
-        Of the file; of a Deep Zoom image that of the list of its files, as ``sha256sum`` prints it (digest, two
-        spaces, name), in order of names, the description first as ``.dzi``.
-    """
-
-    size: int
+    size: int  # bytes of all files
+    # of the file; of a Deep Zoom image that of the list of its files, as ``sha256sum`` prints it (digest, two spaces,
+    # name), in order of names, the description first as ``.dzi``
     sha256: str
 
 
 def fingerprint(image: Path, tiles: Path | None = None) -> Fingerprint:
-    """The fingerprint of an image, and of the tiles that belong to it.
-
-    Raises
-    ------
-    OSError
-        When a file cannot be read.
-    """
+    """The fingerprint of an image, and of the tiles that belong to it."""
     if tiles is None:
         return Fingerprint(image.stat().st_size, _sha256(image))
     found = sorted(path for path in tiles.rglob("*") if path.is_file())
@@ -235,20 +181,7 @@ def _sha256(file: Path) -> str:
 
 
 class StagingFolder:
-    """A hidden folder that exists until it is closed, or until a later one in its place finds its process dead.
-
-    Parameters
-    ----------
-    parent : Path
-        Where it is made. Renaming from it into ``parent`` stays within one file system.
-    prefix : str
-        Of its name.
-
-    Raises
-    ------
-    OSError
-        When it cannot be made.
-    """
+    """A hidden folder that exists until it is closed, or until a later one in its place finds its process dead."""
 
     def __init__(self, parent: Path, prefix: str = ".rdstitch-") -> None:
         _remove_dead(parent, prefix)
@@ -312,16 +245,6 @@ class Outputs:
     """Outputs that are put in their places when the block ends without an error; after an error none is.
 
     A symbolic link as an output stays; what it leads to is replaced.
-
-    Parameters
-    ----------
-    overwrite : bool
-        Replace what exists. Without it, also a file that appears during the run is kept.
-
-    Raises
-    ------
-    OutputError
-        For any failure of the file system; every file is whole, the old one or the new one.
     """
 
     def __init__(self, overwrite: bool) -> None:

@@ -62,24 +62,12 @@ def turned_tilt(tilt: tuple[float, float], turning: FloatArray) -> tuple[float, 
 
 @dataclass(frozen=True)
 class PlanarMotion:
-    """Motion between two images of one camera over one plane.
+    """Motion between two images of one camera over one plane."""
 
-    Attributes
-    ----------
-    tilt : (float, float)
-        (ψ, θ), radians, of the camera to the plane, the same in both images.
-    yaw : float
-        φ, radians.
-    translation : (float, float)
-        (tx, ty) in units of the first image's height above the plane.
-    height : float
-        Height of the second image in units of the first's; 1 for planar motion.
-    """
-
-    tilt: tuple[float, float]
-    yaw: float
-    translation: tuple[float, float]
-    height: float = 1.0
+    tilt: tuple[float, float]  # (ψ, θ), radians, of the camera to the plane, the same in both images
+    yaw: float  # φ, radians
+    translation: tuple[float, float]  # (tx, ty) in units of the first image's height above the plane
+    height: float = 1.0  # height of the second image in units of the first's; 1 for planar motion
 
     def homography(self) -> FloatArray:
         """``H = R Rz(φ) diag(1, 1, height) T R'``, shape (3, 3), focal-normalized; its determinant is ``height``."""
@@ -93,11 +81,6 @@ class PlanarMotion:
         The plane normal is a left eigenvector, ``H' n = height n``, because the motion keeps the distances from the
         plane. For φ = 0 and equal heights the eigenvalue is threefold; then ``H - I = -R t n'`` has rank one, and n
         spans its row space. Of all these candidates the one that reproduces H best is taken.
-
-        Parameters
-        ----------
-        homography : array_like of shape (3, 3)
-            In focal-normalized coordinates, of any scale and sign.
         """
         h = np.array(homography, dtype=np.float64)
         return cls._of_row(motions_from_homographies(h[None])[0])
@@ -114,15 +97,7 @@ class PlanarMotion:
 
 
 def motions_from_homographies(homography: FloatArray, normal: FloatArray | None = None) -> FloatArray:
-    """Rows (ψ, θ, φ, tx, ty, height) of the planar motions that homographies describe, or come close to, (B, 6).
-
-    Parameters
-    ----------
-    homography : ndarray of shape (B, 3, 3)
-        In focal-normalized coordinates, of any scale and sign.
-    normal : ndarray of shape (B, 3), optional
-        Plane normals, of any length and sign; found as :meth:`PlanarMotion.from_homography` says if not given.
-    """
+    """Rows (ψ, θ, φ, tx, ty, height), (B, 6), of planar motions nearest to focal-normalized homographies (B, 3, 3)."""
     if normal is not None:
         return _motions_for_normals(homography, normal)
     h = homography / np.linalg.norm(homography, axis=(1, 2), keepdims=True)

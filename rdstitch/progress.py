@@ -12,13 +12,7 @@ def silent(stage: str, done: int, total: int) -> None:
 
 
 class StageTimer:
-    """A progress that passes everything on, and records how long each stage took.
-
-    Parameters
-    ----------
-    progress : callable
-        What the calls are passed on to.
-    """
+    """A progress that passes everything on, and records how long each stage took."""
 
     def __init__(self, progress: Progress = silent) -> None:
         self._progress = progress

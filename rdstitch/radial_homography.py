@@ -98,31 +98,17 @@ def transfer(
 
 @dataclass(frozen=True)
 class TransferJacobian:
-    """Transferred points and their derivatives, for N points; all in normalized coordinates, and points last in memory.
+    """N transferred points and their derivatives, all in normalized coordinates, the points last in memory."""
 
-    Attributes
-    ----------
-    points : ndarray of shape (N, 2)
-        Where the points of image 1 are measured in image 2.
-    by_image : ndarray of shape (2, 3, N)
-        By ``z = H p``.
-    lifted : ndarray of shape (3, N)
-        ``p``.
-    by_point : ndarray of shape (N, 2, 2)
-        By the point in image 1.
-    by_divisor, by_own_divisor : ndarray of shape (N, 2)
-        By ``g`` of the lens at the point in image 1, and by that at the point in image 2.
-    radius2, own_radius2 : ndarray of shape (N,)
-        Squared radii of those.
-    """
-
-    points: FloatArray
-    by_image: FloatArray
-    lifted: FloatArray
-    by_point: FloatArray
+    points: FloatArray  # (N, 2): where the points of image 1 are measured in image 2
+    by_image: FloatArray  # (2, 3, N): by ``z = H p``
+    lifted: FloatArray  # (3, N): ``p``
+    by_point: FloatArray  # (N, 2, 2): by the point in image 1
+    # by_divisor, by_own_divisor: (N, 2): by ``g`` of the lens at the point in image 1, and by that at the point in
+    # image 2
     by_divisor: FloatArray
     by_own_divisor: FloatArray
-    radius2: FloatArray
+    radius2: FloatArray  # radius2, own_radius2: (N,): squared radii of those
     own_radius2: FloatArray
 
     @property

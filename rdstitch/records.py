@@ -28,13 +28,7 @@ Matrix = Annotated[tuple[Triple, Triple, Triple], Meta(description="3 x 3, row b
 
 
 def parse_json(text: str, file: str) -> Any:
-    """JSON text as plain values; ``file`` is what messages call it.
-
-    Raises
-    ------
-    InputError
-        When it is no JSON, is too deep to be walked through, or holds numbers that JSON cannot express.
-    """
+    """JSON text as plain values; ``file`` is what messages call it."""
     try:
         value = json.loads(text)
     except json.JSONDecodeError as error:
@@ -66,13 +60,7 @@ def parse_yaml(text: str, file: str) -> Any:
 
 
 def parse_xml(text: str, file: str) -> ElementTree.Element:
-    """The root of XML text whose tags are without their namespaces.
-
-    Raises
-    ------
-    InputError
-        When it is no XML, or defines entities, which can grow without end.
-    """
+    """The root of XML text whose tags are without their namespaces."""
     if "<!ENTITY" in text:
         raise InputError(f"{file}: defines entities, which are not read; remove them")
     try:
@@ -85,22 +73,7 @@ def parse_xml(text: str, file: str) -> ElementTree.Element:
 
 
 def convert(value: Any, kind: Callable[..., Kind], file: str, field: str = "", *, strict: bool = True) -> Kind:
-    """Plain values as a record.
-
-    Parameters
-    ----------
-    kind : type
-        A msgspec struct or dataclass; further fields are ignored.
-    field : str
-        Where in the file the value is, such as ``images[2].size``; empty for the whole.
-    strict : bool
-        Refuse texts as numbers.
-
-    Raises
-    ------
-    InputError
-        When a field is missing or wrong; the text names it.
-    """
+    """Plain values as a record; ``field`` is where in the file they are; unless ``strict``, texts are numbers too."""
     try:
         return msgspec.convert(value, kind, strict=strict)  # type: ignore[no-any-return]
     except msgspec.ValidationError as error:
@@ -114,13 +87,7 @@ def convert(value: Any, kind: Callable[..., Kind], file: str, field: str = "", *
 
 
 def check_invertible(matrix: tuple[Triple, Triple, Triple], name: str) -> None:
-    """Refuse a matrix that has no inverse, or of which products are no numbers.
-
-    Raises
-    ------
-    ValueError
-        Which makes the record that it belongs to a wrong one.
-    """
+    """Refuse a matrix that has no inverse, or of which products are no numbers."""
     largest = float(np.abs(matrix).max())
     if not (_MIN_ENTRY <= largest <= _MAX_ENTRY and np.linalg.cond(np.array(matrix) / largest) < 1e12):
         raise ValueError(f"{name} is singular, or not of reasonable size")

@@ -46,13 +46,6 @@ class OutputImage:
         """The image (H, W) or (H, W, C), channels in the order that was chosen for arrays; 0 where there is none.
 
         An image that went to a file is read from there.
-
-        Raises
-        ------
-        ArgumentError
-            When there is none: after a dry run, or where it is a pyramid of Deep Zoom tiles.
-        InputError
-            When the file cannot be read any more.
         """
         return in_order(self._samples()[0], self.image_order)
 

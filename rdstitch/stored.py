@@ -25,13 +25,6 @@ class TemporaryFolder:
     """A folder that is removed when nobody refers to it any more, and at the end of the process at the latest.
 
     Copies in other processes name it, but do not own it; back in the process that made it, they are the folder itself.
-
-    Parameters
-    ----------
-    path : Path, optional
-        That of another process; a new one if not given.
-    parent : Path, optional
-        Where a new one is made; among the system's temporary files if not given.
     """
 
     def __init__(self, path: Path | None = None, *, parent: Path | None = None) -> None:
@@ -58,30 +51,14 @@ def _folder(path: Path) -> TemporaryFolder:
 
 @dataclass(frozen=True)
 class Stored(Generic[Value]):
-    """A result that is read when it is needed; one that could not be kept on disk stays in memory.
+    """A result that is read when it is needed; one that could not be kept on disk stays in memory."""
 
-    Attributes
-    ----------
-    file : Path or None
-        Entry of a cache.
-    value : Value or None
-        The result itself, without a file.
-    folder : TemporaryFolder or None
-        What must not be removed before.
-    """
-
-    file: Path | None = None
-    value: Value | None = None
-    folder: TemporaryFolder | None = field(default=None, compare=False, repr=False)
+    file: Path | None = None  # entry of a cache
+    value: Value | None = None  # the result itself, without a file
+    folder: TemporaryFolder | None = field(default=None, compare=False, repr=False)  # what must not be removed before
 
     def load(self) -> Value:
-        """The result; those used recently are still in memory.
-
-        Raises
-        ------
-        InputError
-            When the file has vanished or is damaged.
-        """
+        """The result; those used recently are still in memory."""
         if self.file is None:
             return cast(Value, self.value)
         return cast(Value, _recent.recall(self.file))
@@ -104,13 +81,7 @@ def entry_name(file: Path) -> str:
 
 
 def read_entry(file: Path) -> tuple[Any, int]:
-    """The result that a file holds, and the file's size, bytes.
-
-    Raises
-    ------
-    InputError
-        When the file has vanished, is damaged, or holds the result of another name.
-    """
+    """The result that a file holds, and the file's size, bytes."""
     try:
         data = read_limited(file, _MAX_ENTRY)
         name, value = unpack(data)

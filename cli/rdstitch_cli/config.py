@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from rdstitch.errors import InputError
-from rdstitch_cli.parameter_types import ANGLE, BYTES, EPSG
+from rdstitch_cli.option_texts import TEXTS
 
 COMMON = "common"
 """The table that holds for every command."""
@@ -23,29 +23,16 @@ def config_option() -> click.Option:
     return click.Option(
         ["--config"],
         type=click.Path(path_type=Path, readable=False),
-        metavar="FILE",
+        metavar=TEXTS["--config"].called,
         is_eager=True,
         expose_value=False,
         callback=_apply,
-        help="Take options from this TOML file; those on the command line win.",
+        help=TEXTS["--config"].text,
     )
 
 
 def read_config(path: Path, commands: Mapping[str, click.Command], running: str) -> dict[str, Any]:
-    """The defaults that a file gives a command, by parameter name; all tables are checked.
-
-    Parameters
-    ----------
-    path : Path
-        TOML with a table for each command, and one that holds for all of them. Keys are long options without dashes.
-    running : str
-        Name of the command that runs.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, is no TOML, names an unknown command or option, or gives one a wrong value.
-    """
+    """The defaults that a file gives a command, by parameter name; all tables are checked."""
     tables = _parse(path)
     known = {name: _options(command) for name, command in commands.items()}
     known[COMMON] = {key: option for options in known.values() for key, option in options.items()}
@@ -93,29 +80,19 @@ def _options(command: click.Command) -> dict[str, click.Option]:
 
 
 def _converted(option: click.Option, value: Any, where: str) -> Any:
-    """The value as the command line would have it; a wrong type is not bent into a right one."""
-    if option.multiple:
-        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise InputError(f"{where}: expected a list of texts, not {value!r}")
-    elif option.is_flag:
-        if not isinstance(value, bool):
-            raise InputError(f"{where}: expected true or false, not {value!r}")
-    elif isinstance(option.type, (click.types.IntParamType, click.types.FloatParamType)):
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise InputError(f"{where}: expected a number, not {value!r}")
-        if isinstance(option.type, click.types.IntParamType) and not isinstance(value, int):
-            raise InputError(f"{where}: expected a whole number, not {value!r}")
-    elif isinstance(value, (int, float)) and not isinstance(value, bool) and option.type in (ANGLE, BYTES, EPSG):
-        value = str(value)  # no unit is needed: degrees, or bytes
-    elif not isinstance(value, str):
-        raise InputError(f"{where}: expected a text, not {value!r}")
+    """The value as the command line would have it; it goes through the option's checks, which here name the place."""
+    texts = value if option.multiple else [value]
+    kinds = (bool,) if option.is_flag else (str,) if option.multiple else (str, int, float)
+    if not isinstance(texts, list) or any(type(text) not in kinds for text in texts):
+        expected = "true or false" if option.is_flag else "a list of texts" if option.multiple else "a text or a number"
+        raise InputError(f"{where}: expected {expected}, not {value!r}")
+    converted = value if option.is_flag or option.multiple else str(value)
     try:
-        # A text goes through the option's own checks when the command line is read; here they only name the place.
-        option.type_cast_value(click.Context(click.Command("config")), value)
+        option.type_cast_value(click.Context(click.Command("config")), converted)
     except (click.BadParameter, ValueError, OverflowError) as error:
         problem = error.message if isinstance(error, click.BadParameter) else error
         raise InputError(f"{where}: {problem}") from error
-    return value
+    return converted
 
 
 def _suggestion(name: str, known: Iterable[str]) -> str:

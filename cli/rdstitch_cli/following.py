@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rdstitch_cli import options
-from rdstitch_cli.parameter_types import RealNumber
 from rdstitch_cli.stitching import warn_of
 from rdstitch_cli.terminal import Reporter
 
@@ -19,32 +17,6 @@ if TYPE_CHECKING:
     from rdstitch.options import StitchOptions
     from rdstitch.pipeline.follow import FollowedPoses
     from rdstitch.registration import Registration
-
-follow = options.together(
-    click.option(
-        "--follow",
-        "following",
-        is_flag=True,
-        help="Register frames as they arrive, and print a line of JSON for each: INPUT is a folder that grows, - for "
-        "names on standard input, a video, the index of a camera, or a stream. All are registered together at the end: "
-        "of the video or the names, after --idle, or with Ctrl-C.",
-    ),
-    click.option(
-        "--idle",
-        type=RealNumber(0.0, min_open=True),
-        metavar="SECONDS",
-        help="With --follow: end when no frame has come for so long; otherwise a folder is followed until Ctrl-C.",
-    ),
-)
-
-refresh = click.option(
-    "--refresh",
-    type=RealNumber(0.0),
-    default=5.0,
-    show_default=True,
-    metavar="SECONDS",
-    help="With --follow: refresh the image of what has been seen, OUTPUT with .preview.jpg, so often; 0: none.",
-)
 
 
 @contextmanager

@@ -8,32 +8,8 @@ from typing import Any
 
 import click
 
-_FIRST = "Options that matter first"
-_GROUPS = {
-    _FIRST: (
-        "output overwrite images preview reference camera focal mask scale report layout image_format frame height "
-        "view quiet"
-    ),
-    "Places": "grid overlap positions positions_offset gcp positions_only pixel_size search",
-    "Tiles": "channel flat_field save_flat_field",
-    "Input": "following idle refresh every exclude include_only match topic timestamps",
-    "Camera": "distortion lens tilt attitude attitude_std save_camera",
-    "Features and registration": (
-        "features aliked_model lightglue_model max_features work_megapixels solver model threshold"
-    ),
-    "Output": (
-        "gsd epsg north_up rotate straighten rectangle level yaw pitch roll crop projection max_stretch max_size "
-        "local_alignment exposure seam blend interpolation background quality layers whole_layers all_blocks poses "
-        "hugin_project plot as_json"
-    ),
-    "Control": "strict force dry_run cache max_memory workers scheduler seed verbose config help help_all",
-}
-_OTHERS = "Other options"
-_BRIEF = (
-    "output overwrite images preview camera distortion focal mask exclude every following reference scale gsd crop "
-    "max_size exposure report cache workers quiet config help help_all grid overlap positions positions_only "
-    "pixel_size search channel flat_field save_flat_field"
-)
+from rdstitch_cli.option_texts import PLACES, TEXTS
+
 _FEW = 25  # options that are shown all at once
 _ALL = "rdstitch_cli.help_all"
 
@@ -62,39 +38,30 @@ class GroupedCommand(click.Command):
                     is_eager=True,
                     expose_value=False,
                     callback=_show_all,
-                    help="Show all options.",
+                    help=TEXTS["--help-all"].text,
                 )
             )
 
     def format_options(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the groups in their order, each with the options that this command has of it."""
-        rows: dict[str, list[tuple[int, tuple[str, str]]]] = {group: [] for group in (*_GROUPS, _OTHERS)}
+        rows: dict[str, dict[int, tuple[str, str]]] = {entry.group: {} for entry in PLACES.values()}
         brief = any(parameter.name == "help_all" for parameter in self.params) and not context.meta.get(_ALL)
         left = 0
         for parameter in self.get_params(context):
             record = parameter.get_help_record(context)
             if record is not None and isinstance(parameter, click.Option):
-                name = "help" if "--help" in parameter.opts else parameter.name or ""
-                group, rank = place_of(name)
-                if not brief or name in _BRIEF.split():
-                    rows[group].append((rank, record))
+                entry = PLACES[max(parameter.opts, key=len)]
+                if entry.first or not brief:
+                    rows[entry.group][entry.rank] = record
                 else:
                     left += 1
         for group, found in rows.items():
             if found:
                 with formatter.section(group):
-                    formatter.write_dl([record for _, record in sorted(found)])
+                    formatter.write_dl([record for _, record in sorted(found.items())])
         if left:
             formatter.write_paragraph()
             formatter.write_text(f"{left} more options: {context.command_path} --help-all")
-
-
-def place_of(name: str) -> tuple[str, int]:
-    """The group of an option, and its rank there."""
-    for group, names in _GROUPS.items():
-        if name in names.split():
-            return group, names.split().index(name)
-    return _OTHERS, 0
 
 
 @click.command(

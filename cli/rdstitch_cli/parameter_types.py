@@ -79,13 +79,7 @@ class FileOr(UserPath):
 
 
 class Parsed(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
-    """What a function makes of the text; it raises ValueError with what is wrong.
-
-    Parameters
-    ----------
-    name : str
-        How it is called in help pages.
-    """
+    """What a function makes of the text; it raises ValueError with what is wrong."""
 
     def __init__(self, name: str, parse: Callable[[str], Any]) -> None:
         self.name, self.parse = name, parse

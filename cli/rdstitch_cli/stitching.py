@@ -81,9 +81,7 @@ def stitch_options(
         given |= {name: value for name, value in quick.items() if not is_given(name)}
         max_features = max_features if is_given("max_features") else 1500
         work_megapixels = work_megapixels if is_given("work_megapixels") else 0.5
-    composite = {
-        name: given.pop(name) for name in CompositeOptions.__dataclass_fields__ if name in given and name != "workers"
-    }
+    composite = composite_fields(given)
     return StitchOptions(
         camera=read_lens(camera, reporter),
         features=FeatureOptions(
@@ -98,6 +96,14 @@ def stitch_options(
     )
 
 
+def composite_fields(given: dict[str, Any]) -> dict[str, Any]:
+    """Take what is an option of compositing out of a command's flags; workers are those of the whole run."""
+    from rdstitch.compositing import CompositeOptions
+
+    fields = CompositeOptions.__dataclass_fields__.keys() - {"workers"}
+    return {name: given.pop(name) for name in list(given) if name in fields}
+
+
 def _check_written(read: Iterable[Path | None]) -> None:
     """Refuse to write over a file that an option names to be read, or over the configuration."""
     from rdstitch.outputs import check_not_read
@@ -110,17 +116,7 @@ def _check_written(read: Iterable[Path | None]) -> None:
 
 
 class Report:
-    """The report of a run: the progress that measures its stages, and the file that is written with the image.
-
-    Parameters
-    ----------
-    file : Path or None
-        None writes nothing.
-    inputs : sequence of Path
-        Files that it must not be written over.
-    output : Path, optional
-        Image that is made, beside which there may be a page.
-    """
+    """The report of a run: the progress that measures its stages, and the file that is written with the image."""
 
     def __init__(
         self, file: Path | None, reporter: Reporter, inputs: Sequence[Path], overwrite: bool, output: Path | None = None
@@ -187,28 +183,22 @@ def staged_beside(
         make_folder(layers)
 
     def stage(outputs: "Outputs", result: "StitchResult") -> None:
-        report.stage(outputs, result)
-        for file, text in texts.items():
-            if file is not None and result.plan is None:
-                write_text = partial(_write_text, outputs, file, text, result)
-                for message in outputs.attempt(file, write_text):
-                    reporter.warn(str(message))
-        if (folder := layers) is None:
-            return
+        from rdstitch.outputs import text_bytes
         from rdstitch.pipeline.layers import write_layers
 
-        overwrite = result.options.overwrite
-        write = partial(write_layers, result, folder, whole=whole_layers, overwrite=overwrite, outputs=outputs)
-        for message in outputs.attempt(folder, write):
-            reporter.warn(str(message))
+        report.stage(outputs, result)
+        writing: dict[Path, Callable[[], object]] = {}
+        for file, text in texts.items():
+            if file is not None and result.plan is None:
+                writing[file] = partial(lambda file, text: outputs.write(file, text_bytes(text(result))), file, text)
+        if layers is not None:
+            how: dict[str, Any] = {"whole": whole_layers, "overwrite": result.options.overwrite, "outputs": outputs}
+            writing[layers] = partial(write_layers, result, layers, **how)
+        for place, write in writing.items():
+            for message in outputs.attempt(place, write):
+                reporter.warn(str(message))
 
     return stage
-
-
-def _write_text(outputs: "Outputs", file: Path, text: Callable[["StitchResult"], str], result: "StitchResult") -> None:
-    from rdstitch.outputs import text_bytes
-
-    outputs.write(file, text_bytes(text(result)))
 
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:

@@ -59,11 +59,6 @@ class Reporter:
 
     It is the ``progress`` callable of the library: called with a stage's name, how much is done and how much there is
     to do.
-
-    Parameters
-    ----------
-    verbosity : int
-        -1 says nothing but errors, 0 warnings and, on a terminal, bars; 1 and above also the log.
     """
 
     def __init__(self, verbosity: int) -> None:

@@ -23,8 +23,9 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.io.read import read_image
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
-from rdstitch.synthetic import Sequence, correspondences
+from rdstitch.synthetic import Sequence
 from tests.acceptance.rendered import geometry
+from tests.correspondences import correspondences
 from tests.floor_drives import floor_drive
 
 MATCHES = 300

@@ -18,7 +18,7 @@ from examples.benchmarks.driver import run
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
-from rdstitch.synthetic import Instances, PlanarInstances, general_instances, planar_instances, rotation_instances
+from tests.instances import Instances, PlanarInstances, general_instances, planar_instances, rotation_instances
 
 INSTANCES = 20_000
 BATCH = 4096

@@ -22,7 +22,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.inputs.source import read_sources
 from rdstitch.pipeline.flat_field import with_flat_field
 from rdstitch.stage import TileGrid, register_tiles
-from rdstitch.synthetic.stage import Specimen, StageGrid
+from tests.stage_grid import Specimen, StageGrid
 
 _PEERS = r"""
 import json, sys, time, warnings

@@ -10,7 +10,7 @@ from examples.paper.common.plots import histograms
 from examples.paper.common.report import Report, Table
 from examples.paper.common.settings import Settings
 from rdstitch.arrays import FloatArray
-from rdstitch.synthetic import planar_instances
+from tests.instances import planar_instances
 
 _MISSED = 1e-2
 

@@ -6,7 +6,7 @@ from examples.paper.common.noise import WITNESSES, sweep
 from examples.paper.common.peers import absent
 from examples.paper.common.report import Report
 from examples.paper.common.settings import Settings
-from rdstitch.synthetic import PlanarInstances, planar_instances
+from tests.instances import PlanarInstances, planar_instances
 
 
 def run(settings: Settings) -> Report:

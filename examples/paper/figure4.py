@@ -10,7 +10,7 @@ from examples.paper.common.settings import Settings
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
-from rdstitch.synthetic import PlanarInstances, planar_instances
+from tests.instances import PlanarInstances, planar_instances
 
 _WRONG_BY = 1.0  # degrees
 

@@ -9,7 +9,7 @@ from examples.paper.common.contenders import HOMLIB, Contender, known_tilt, own_
 from examples.paper.common.peers import absent, optional_module
 from examples.paper.common.report import Report, Table
 from examples.paper.common.settings import Settings
-from rdstitch.synthetic import PlanarInstances, planar_instances
+from tests.instances import PlanarInstances, planar_instances
 
 _SINGLES = 40
 _REPETITIONS = 5

@@ -10,7 +10,6 @@
 ``cameras.txt``                      COLMAP
 ``cameras.json``                     OpenDroneMap
 ``*.pto``                            Hugin
-``*.xml``                            lensfun
 ===================================  ==========================================================
 
 What is written follows from the name, as above; what is read is known by its content.
@@ -27,7 +26,6 @@ from rdstitch.camera_files import writing
 from rdstitch.camera_files.hugin import hugin_project, is_hugin, read_hugin
 from rdstitch.camera_files.lens_fit import CameraFile
 from rdstitch.camera_files.lens_models import LensFit
-from rdstitch.camera_files.lensfun import lensfun_xml, read_lensfun
 from rdstitch.camera_files.reading import (
     ImageSize,
     colmap_cameras,
@@ -46,7 +44,7 @@ __all__ = ["CAMERA_SUFFIXES", "CameraFile", "LensFit", "export_note", "load_came
 
 Value = TypeVar("Value")
 
-CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt", ".xml")
+CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt")
 """How names of camera files end, lower case."""
 
 _STATED = re.compile(r"(?<!lambda_)fit_largest_px\"?: ([-+.\de]+)")
@@ -60,7 +58,7 @@ def load_camera(path: str | Path, image_size: tuple[int, int] | None = None) -> 
     ----------
     path : path
     image_size : (int, int), optional
-        Width and height of the images, pixels, for a file of OpenCV or lensfun that does not say them.
+        Width and height of the images, pixels, for a file of OpenCV that does not say them.
 
     Returns
     -------
@@ -78,17 +76,6 @@ def read_camera_file(path: str | Path, image_size: ImageSize | None = None) -> C
     """Read a camera file of any known format.
 
     A file that rdstitch wrote gives back λ exactly; to the lens model of any other, λ is fitted.
-
-    Parameters
-    ----------
-    path : path
-    image_size : callable, optional
-        Gives width and height of the images, pixels, for a file of OpenCV or lensfun that does not say them.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, is no camera file, or tells of a lens that λ cannot describe.
     """
     text, file = read_text(path), str(path)
     try:
@@ -97,8 +84,6 @@ def read_camera_file(path: str | Path, image_size: ImageSize | None = None) -> C
         own = next((line for line in text.splitlines() if line.startswith(writing.OWN_COMMENT)), None)
         if own is not None:
             return _own(parse_json(own.removeprefix(writing.OWN_COMMENT), file), file)
-        if text.lstrip().startswith("<"):
-            return read_lensfun(text, file, image_size)
         if is_hugin(text):
             return read_hugin(text, file)
         if cameras := colmap_cameras(text):
@@ -153,13 +138,7 @@ def save_camera(camera: Camera, path: str | Path) -> None:
 
 
 def camera_file_text(camera: Camera, path: str | Path) -> str:
-    """Give what :func:`save_camera` writes into a file of this name.
-
-    Raises
-    ------
-    OutputError
-        When the name says no format.
-    """
+    """Give what :func:`save_camera` writes into a file of this name."""
     file = Path(path)
     name = file.name.lower().removesuffix(".yml")
     name += ".yaml" if name != file.name.lower() else ""
@@ -170,13 +149,7 @@ def camera_file_text(camera: Camera, path: str | Path) -> str:
 
 
 def export_note(camera: Camera, path: str | Path) -> tuple[str, ...]:
-    """Say what the model of a camera file of others costs, in one sentence; nothing for rdstitch's own.
-
-    Parameters
-    ----------
-    path : path
-        As :func:`save_camera` takes it.
-    """
+    """Say what the model of a camera file of others costs, in one sentence; nothing for rdstitch's own."""
     largest = _STATED.findall(camera_file_text(camera, path))
     return tuple(f"{path}: its lens model is at most {float(value):.3f} pixels from the lens" for value in largest[-1:])
 
@@ -193,6 +166,5 @@ _WRITERS: dict[str, Callable[[Camera], str]] = {
     "?*.yaml": writing.opencv_yaml,
     "cameras.txt": writing.colmap_text,
     "?*.pto": hugin_project,
-    "?*.xml": lensfun_xml,
 }
 """By the name of the file, the first that fits; ``.yml`` is ``.yaml``."""

@@ -21,23 +21,12 @@ _SQUARE = 0.005  # calibrations give focal lengths along x and y that differ by 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """A camera as a file tells it.
-
-    Attributes
-    ----------
-    camera : Camera
-    kind : str
-        Whose format it is: "rdstitch", "OpenCV", "COLMAP", "Kalibr", "OpenDroneMap", "Hugin" or "lensfun".
-    fit : LensFit or None
-        How well λ agrees with the file's own lens model; None where the file gives λ itself.
-    cause : str
-        What of the file's model λ cannot describe; empty where it is only the curve of the lens.
-    """
+    """A camera as a file tells it."""
 
     camera: Camera
-    kind: str
-    fit: LensFit | None = None
-    cause: str = ""
+    kind: str  # whose format it is: "rdstitch", "OpenCV", "COLMAP", "Kalibr", "OpenDroneMap" or "Hugin"
+    fit: LensFit | None = None  # how well λ agrees with the file's own lens model; None where the file gives λ itself
+    cause: str = ""  # what of the file's model λ cannot describe; empty where it is only the curve of the lens
 
 
 def fitted_camera(
@@ -49,13 +38,7 @@ def fitted_camera(
     field: str = "",
     cause: str = "",
 ) -> CameraFile:
-    """Fit λ to the lens model of a file.
-
-    Raises
-    ------
-    ArgumentError
-        When that is impossible; ``field`` begins and ``cause`` ends the text.
-    """
+    """Fit λ to the lens model of a file."""
     camera = Camera(size, center=center, focal=focal, focal_source="file")
     try:
         lens, fit = fit_lens(forward, camera)
@@ -65,13 +48,7 @@ def fitted_camera(
 
 
 def fitted_lens(lens: LensModel, kind: str, size: tuple[int, int], field: str = "") -> CameraFile:
-    """Fit λ to a lens model that several formats share, and say what of it λ cannot describe.
-
-    Raises
-    ------
-    ArgumentError
-        As :func:`fitted_camera`, and for focal lengths that are none.
-    """
+    """Fit λ to a lens model that several formats share, and say what of it λ cannot describe."""
     if not min(lens.focal) > 0.0:
         raise ArgumentError(f"expected positive focal lengths, not {lens.focal[0]:g} and {lens.focal[1]:g}")
     stretch = lens.focal[0] / lens.focal[1] - 1.0
@@ -84,22 +61,10 @@ def fitted_lens(lens: LensModel, kind: str, size: tuple[int, int], field: str = 
 def fit_lens(forward: Forward, camera: Camera) -> tuple[Camera, LensFit]:
     """Fit the division model to another lens model: with λ alone where that is enough, else with μ, else with ν too.
 
-    Parameters
-    ----------
-    forward : callable
-        The other model: pixels without distortion (N, 2) to measured pixels (N, 2).
-    camera : Camera
-        Size, distortion centre and focal length.
-
     Returns
     -------
     Camera, LensFit
         The camera with the lens, and what it costs.
-
-    Raises
-    ------
-    ArgumentError
-        When the other model folds the image, or is far from every division model.
     """
     straight, measured, weights = _rays(forward, camera)
     flat, bent = camera.normalize(straight), camera.normalize(measured)

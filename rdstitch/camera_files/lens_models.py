@@ -23,36 +23,20 @@ CLOSE = 0.1
 
 @dataclass(frozen=True)
 class LensFit:
-    """How well a fitted lens model agrees with the one it was fitted to.
+    """How well a fitted lens model agrees with the one it was fitted to."""
 
-    Attributes
-    ----------
-    rms, largest : float
-        Of the distances between the pixels that both models give, over the whole image, pixels.
-    """
-
-    rms: float
+    rms: float  # rms, largest: of the distances between the pixels that both models give, over the whole image, pixels
     largest: float
 
 
 @dataclass(frozen=True)
 class LensModel:
-    """A lens as OpenCV has it: Brown's model, with its rational denominator, or the one of ``cv2.fisheye``.
+    """A lens as OpenCV has it: Brown's model, with its rational denominator, or the one of ``cv2.fisheye``."""
 
-    Attributes
-    ----------
-    focal : (float, float)
-        Along x and y, pixels.
-    center : (float, float)
-        Pixels.
-    coefficients : tuple of float
-        In OpenCV's order: up to 8 of k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye up to 4 of k1, k2, k3, k4, for which
-        a ray at angle θ from the axis is measured ``f (θ + k1 θ³ + k2 θ⁵ + k3 θ⁷ + k4 θ⁹)`` from the centre.
-    fisheye : bool
-    """
-
-    focal: tuple[float, float]
-    center: tuple[float, float]
+    focal: tuple[float, float]  # along x and y, pixels
+    center: tuple[float, float]  # pixels
+    # in OpenCV's order: up to 8 of k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye up to 4 of k1, k2, k3, k4, for which a
+    # ray at angle θ from the axis is measured ``f (θ + k1 θ³ + k2 θ⁵ + k3 θ⁷ + k4 θ⁹)`` from the centre
     coefficients: tuple[float, ...]
     fisheye: bool = False
 
@@ -117,19 +101,11 @@ def least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class LensSamples:
-    """Radii of points all over what is drawn of an image, N of them.
+    """Radii of points all over what is drawn of an image, N of them."""
 
-    Attributes
-    ----------
-    straight, bent : ndarray of shape (N,)
-        From the distortion centre, undistorted and measured, focal lengths.
-    focal : float
-        Pixels; guessed where the camera has none.
-    """
-
-    straight: FloatArray
+    straight: FloatArray  # straight, bent: (N,): from the distortion centre, undistorted and measured, focal lengths
     bent: FloatArray
-    focal: float
+    focal: float  # pixels; guessed where the camera has none
 
     @classmethod
     def of(cls, camera: Camera) -> Self:

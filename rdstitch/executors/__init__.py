@@ -48,18 +48,7 @@ Result = TypeVar("Result")
 
 
 def in_order(executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Generator[Result]:
-    """The result of each task, in their order; tasks are taken as they are needed.
-
-    Parameters
-    ----------
-    function : callable
-        Of one task.
-
-    Raises
-    ------
-    Exception
-        What the first task that fails raises; those not yet begun are then cancelled.
-    """
+    """The result of each task, in their order; tasks are taken as they are needed."""
     under_way: deque[Future[Result]] = deque()
     try:
         for task in tasks:

@@ -25,20 +25,6 @@ class DaskExecutor(Executor):
     """Tasks on the workers of a Dask cluster.
 
     A worker that dies costs its tasks, which others take over. Leaving the ``with`` block ends what was started for it.
-
-    Parameters
-    ----------
-    address : str
-        Of a scheduler, as ``tcp://host:8786``; or :data:`LOCAL`.
-    workers : int
-        Worker processes of a local cluster.
-    store : Path or None
-        Folder of features and matches, which all machines must see by the same name; None where there is one machine.
-
-    Raises
-    ------
-    ArgumentError
-        When Dask is not installed, no scheduler answers, or a worker does not see the store or has other software.
     """
 
     def __init__(self, address: str, workers: int, store: Path | None) -> None:

@@ -49,29 +49,14 @@ class Residual:
 
 @dataclass(frozen=True)
 class Georeference:
-    """A similarity from pixels of the output to map coordinates.
-
-    Attributes
-    ----------
-    crs : Crs
-    scale : complex
-        Metres per pixel times the turn: easting + i northing = ``scale`` (x - i y) + ``origin``.
-    origin : complex
-        Easting + i northing of the centre of the top-left pixel, m.
-    rms : float
-        Root mean square distance of the positions used from where the images put them, m.
-    source : str
-        What the positions are.
-    residuals : tuple of Residual
-        Of every position.
-    """
+    """A similarity from pixels of the output to map coordinates."""
 
     crs: Crs
-    scale: complex
-    origin: complex
-    rms: float
-    source: str = _GPS
-    residuals: tuple[Residual, ...] = ()
+    scale: complex  # metres per pixel times the turn: easting + i northing = ``scale`` (x - i y) + ``origin``
+    origin: complex  # easting + i northing of the centre of the top-left pixel, m
+    rms: float  # root mean square distance of the positions used from where the images put them, m
+    source: str = _GPS  # what the positions are
+    residuals: tuple[Residual, ...] = ()  # of every position
 
     @property
     def used(self) -> int:
@@ -198,11 +183,6 @@ def georeference(
     -------
     Georeference or None, str
         And the reason where there is none.
-
-    Raises
-    ------
-    ArgumentError
-        When the coordinate system cannot be used; see :class:`rdstitch.crs.Crs`.
     """
     source, std = (_CONTROL, _CONTROL_STD) if any(control) else (_GPS, POSITION_STD)
     if source == _GPS:

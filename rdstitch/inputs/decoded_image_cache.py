@@ -12,11 +12,6 @@ class DecodedImageCache:
     """Keeps images until they are taken; those for which there is no room are not kept.
 
     It saves time and never changes a result.
-
-    Parameters
-    ----------
-    room : int
-        Bytes.
     """
 
     def __init__(self, room: int = _CAPACITY) -> None:

@@ -29,24 +29,13 @@ IMAGE_SUFFIXES = frozenset(
 
 @dataclass(frozen=True)
 class FoundImages:
-    """What the user's arguments stand for.
+    """What the user's arguments stand for."""
 
-    Attributes
-    ----------
-    frames : list of Frame
-        In natural order within a folder or pattern.
-    outputs : list of Path
-        Images in folders and patterns that rdstitch wrote, by the sidecars beside them, and that are no input.
-    containers : tuple of Path
-        The ``@list`` files, videos and bags that frames come from.
-    notes : tuple of Message
-        On videos of which not every frame was taken.
-    """
-
-    frames: list[Frame]
+    frames: list[Frame]  # in natural order within a folder or pattern
+    # images in folders and patterns that rdstitch wrote, by the sidecars beside them, and that are no input
     outputs: list[Path]
-    containers: tuple[Path, ...] = ()
-    notes: tuple[Message, ...] = ()
+    containers: tuple[Path, ...] = ()  # the ``@list`` files, videos and bags that frames come from
+    notes: tuple[Message, ...] = ()  # on videos of which not every frame was taken
 
     @property
     def files(self) -> list[Path]:
@@ -110,11 +99,6 @@ def find_images(
         :mod:`rdstitch.inputs.keyframes`.
     topic : str, optional
         Topic of the images in ROS bags; without one, the only topic of images.
-
-    Raises
-    ------
-    InputError
-        When an argument names nothing.
     """
     unwanted = {_entry(Path(path)) for path in exclude}
     frames: list[Frame] = []
@@ -219,13 +203,7 @@ class _Clip:
         return [Frame(*frame) for frame in extract_frames(self.path, self.folder(), wanted.__contains__)]
 
     def among(self, images: int) -> Message:
-        """Why it is not used beside images.
-
-        Raises
-        ------
-        InputError
-            When these are too few to be what was meant.
-        """
+        """Why it is not used beside images."""
         remedy = "give it alone, or --every N to use every N-th of its frames too"
         if images < 2:
             raise InputError(f"{self.path}: is a video beside one image; {remedy}")
@@ -266,13 +244,7 @@ def names_in(text: str) -> list[str]:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """The images of a folder in natural order, and those that nobody here can read: who reads them will say so.
-
-    Raises
-    ------
-    InputError
-        When the folder cannot be read.
-    """
+    """The images of a folder in natural order, and those that nobody here can read: who reads them will say so."""
     try:
         entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:

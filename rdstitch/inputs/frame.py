@@ -21,24 +21,12 @@ ChannelOrder = Literal["bgr", "rgb"]
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One input image.
+    """One input image."""
 
-    Attributes
-    ----------
-    path : Path
-        Its file; for an array in memory the name that stands for it.
-    number : int or None
-        Its number in the video, bag or list of arrays that it comes from, from 0.
-    timestamp : float or None
-        When it was taken, s, where its video or bag knows that.
-    image : DecodedImage or None
-        The image itself where it is no file.
-    """
-
-    path: Path
-    number: int | None = None
-    timestamp: float | None = None
-    image: DecodedImage | None = None
+    path: Path  # its file; for an array in memory the name that stands for it
+    number: int | None = None  # its number in the video, bag or list of arrays that it comes from, from 0
+    timestamp: float | None = None  # when it was taken, s, where its video or bag knows that
+    image: DecodedImage | None = None  # the image itself where it is no file
 
 
 Image = str | os.PathLike[str] | NDArray[Any] | PIL.Image.Image
@@ -62,11 +50,6 @@ def as_inputs(images: Images, channel_order: ChannelOrder = "bgr") -> list[Named
         with its EXIF. The i-th input, if it is an array or such an image, is called ``image_000i``.
     channel_order : str
         "bgr" or "rgb": order of the channels of colour arrays; that of five bands and more stays.
-
-    Raises
-    ------
-    ArgumentError
-        When an input is neither a path nor such an array.
     """
     if channel_order not in get_args(ChannelOrder):
         raise ArgumentError(f"channel_order must be 'bgr' or 'rgb', not {channel_order!r}")

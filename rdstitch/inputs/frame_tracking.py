@@ -12,35 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.features.prepared_image import PreparedImage
+from rdstitch.inputs.corner_flow import CornerFlow, fitted_affine
 
 _SIDE = 320  # pixels of the longer side that frames are tracked at
-_CORNERS, _QUALITY, _APART = 120, 0.01, 8.0
-_WINDOW = (15, 15)  # pixels, in which a corner is found again
 _MIN_CORNERS = 12  # corners that a motion is believed by
 _AGREEING = 0.4  # share of the corners that must agree
 _ERROR = 0.02  # of a motion, in sides: lenses and tilts are not affine
-_STILL, _MOVED = 0.5, 3.0  # pixels: what stays in the image, such as a robot's body, and what moves with the ground
 _WORN = 0.5  # share of the corners, or of the side that they have come, after which new ones are taken
 _GRID = 16  # points a side by which areas are measured
 
 
 @dataclass(frozen=True)
 class FramePlaces:
-    """Where the frames of a video lie.
+    """Where the frames of a video lie."""
 
-    Attributes
-    ----------
-    size : ndarray of shape (2,)
-        Of a frame, pixels of its small version.
-    places : ndarray of shape (N, 3, 3)
-        From each frame to what all frames of its track have in common; affine.
-    track : ndarray of shape (N,), intp
-        Number of the track; one ends where a frame cannot be found again in the next.
-    """
-
-    size: FloatArray
-    places: FloatArray
-    track: NDArray[np.intp]
+    size: FloatArray  # (2,): of a frame, pixels of its small version
+    places: FloatArray  # (N, 3, 3): from each frame to what all frames of its track have in common; affine
+    track: NDArray[np.intp]  # (N,), intp: number of the track; one ends where a frame cannot be found again in the next
 
     def seen_by(self, frames: NDArray[np.intp], other: int) -> BoolArray:
         """Which points of a grid in some frames another frame shows, (M, P)."""
@@ -60,60 +49,28 @@ def tracked(frames: Iterable[NDArray[np.uint8]]) -> FramePlaces:
     """Follow the frames of a video, grey (H, W), from the first to the last."""
     places: list[FloatArray] = []
     track: list[int] = []
-    size = np.ones(2)
-    corners: _Corners | None = None
+    size, flow, begun_at = (1, 1), CornerFlow(), np.eye(3)
     for frame in frames:
         small = _small(frame)
-        size = np.array(small.shape[::-1], dtype=np.float64)
-        motion = None if corners is None else corners.follow(small)
-        if corners is None or motion is None:
-            track.append(track[-1] + 1 if track else 0)
-            places.append(np.eye(3))
-        else:
-            track.append(track[-1])
-            places.append(corners.place @ np.linalg.inv(motion))
-        if corners is None or motion is None or corners.worn:
-            corners = _Corners(small, places[-1])
-    return FramePlaces(size, np.array(places).reshape(-1, 3, 3), np.array(track, dtype=np.intp))
+        size = small.shape[1], small.shape[0]
+        image = PreparedImage(small, None, np.ones(2), size)
+        matched = flow.follow(image)
+        motion, worn = (None, True) if matched is None else _motion(*matched, max(size), flow.count)
+        track.append((track[-1] + (motion is None)) if track else 0)
+        places.append(np.eye(3) if motion is None else begun_at @ motion)
+        if worn:
+            flow.begin(image)
+            begun_at = places[-1]
+    return FramePlaces(np.array(size, dtype=np.float64), np.array(places).reshape(-1, 3, 3), np.array(track, np.intp))
 
 
-class _Corners:
-    """Corners of one frame, followed through the next ones."""
-
-    def __init__(self, image: NDArray[np.uint8], place: FloatArray) -> None:
-        found = cv2.goodFeaturesToTrack(image, _CORNERS, _QUALITY, _APART)
-        self._from = np.empty((0, 1, 2), dtype=np.float32) if found is None else found
-        self._at, self._last, self._count = self._from, image, len(self._from)
-        self.place = place
-        self.worn = False
-
-    def follow(self, image: NDArray[np.uint8]) -> FloatArray | None:
-        """The motion (3, 3) from the frame of the corners to the next one; None where it is not known."""
-        if image.shape != self._last.shape or len(self._at) < _MIN_CORNERS:
-            return None
-        at, status, _ = cv2.calcOpticalFlowPyrLK(self._last, image, self._at, np.empty_like(self._at), winSize=_WINDOW)
-        self._last = image
-        inside = (at >= 0.0).all(axis=(1, 2)) & (at[:, 0] < image.shape[::-1]).all(axis=1)
-        kept = (status[:, 0] > 0) & inside
-        self._from, self._at = self._from[kept], at[kept]
-        way = np.linalg.norm(self._at - self._from, axis=2)[:, 0]
-        ground = np.ones(len(way), dtype=np.bool_)
-        if (way > _MOVED).sum() >= _MIN_CORNERS:
-            ground = way > _STILL
-        if ground.sum() < _MIN_CORNERS:
-            return None
-        side = max(image.shape)
-        motion, agree = cv2.estimateAffine2D(
-            self._from[ground], self._at[ground], method=cv2.RANSAC, ransacReprojThreshold=_ERROR * side
-        )
-        if (
-            motion is None
-            or agree.sum() < max(_MIN_CORNERS, _AGREEING * len(agree))
-            or np.linalg.det(motion[:, :2]) <= 0.0
-        ):
-            return None
-        self.worn = bool(len(self._at) < _WORN * self._count or np.median(way) > _WORN * side / 2)
-        return np.vstack([motion, [0.0, 0.0, 1.0]])
+def _motion(before: FloatArray, now: FloatArray, side: int, count: int) -> tuple[FloatArray | None, bool]:
+    """The motion (3, 3) of points back to where they were, None where it is not known; and whether to begin anew."""
+    motion, agree = fitted_affine(before, now, _ERROR * side)
+    if motion is None or agree.sum() < max(_MIN_CORNERS, _AGREEING * len(agree)) or np.linalg.det(motion[:, :2]) <= 0.0:
+        return None, True
+    way = float(np.median(np.linalg.norm(now - before, axis=1)))
+    return np.vstack([motion, [0.0, 0.0, 1.0]]), len(now) < _WORN * count or way > _WORN * side / 2
 
 
 def _small(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

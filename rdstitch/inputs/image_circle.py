@@ -44,15 +44,7 @@ class Circle:
 def with_image_circle(
     sources: Sequence[Source], executor: Executor, store: Cache, megapixels: float | None
 ) -> list[Source]:
-    """Give the cameras their image circle where the images show one; given lenses stay.
-
-    Parameters
-    ----------
-    store : Cache
-        Where the circle lies.
-    megapixels : float or None
-        Of detection, which reads the same images next.
-    """
+    """Give the cameras their image circle where the images show one; given lenses stay."""
     given = any(any(source.camera.coefficients) or source.camera.image_circle for source in sources)
     size = Counter(source.camera.image_size for source in sources).most_common(1)[0][0]
     alike = [source for source in sources if source.camera.image_size == size]

@@ -1,70 +1,46 @@
 """Files that change during a run, or whose pixels a decoder has doubts about: noticed once for all who read them."""
 
-import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Lock
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import is_url, open_regular, remote_status
+from rdstitch.file_access import is_url, remote_status
 from rdstitch.io.read import DecodedImage
 from rdstitch.messages import Message
 
-_BLOCK_BYTES = 2**20
-_DIGITS = 16
+_Stamp = tuple[int | None, int, int | str]
 
-_Stamp = tuple[int, int, int, int]
-
-GuardNotes = tuple[dict[Path, _Stamp | None], dict[Path, int], dict[Path, str]]
-"""Stamps and checksums of files, and why they may be damaged."""
+GuardNotes = tuple[dict[Path, _Stamp | None], dict[Path, str]]
+"""Stamps of files, and why they may be damaged."""
 
 
 class InputGuard:
-    """What is known of the input files of one run; shared by its sources, and by threads.
+    """What is known of the input files of one run; shared by its sources, and by threads; if strict, damage is refused.
 
-    Parameters
-    ----------
-    strict : bool
-        Refuse a damaged image, rather than warn of it.
+    A file is unchanged while its size, and the time of its last change, are.
     """
 
     def __init__(self, strict: bool = False) -> None:
         self._strict = strict
         self._stamps: dict[Path, _Stamp | None] = {}
-        self._checksums: dict[Path, int] = {}
         self._damaged: dict[Path, str] = {}
-        self._lock = Lock()
 
     @contextmanager
     def reading(self, path: Path) -> Iterator[None]:
-        """Read a file inside the block; its content must be what it was before.
-
-        Raises
-        ------
-        InputError
-            When it has changed since it was read for the first time, or changes meanwhile.
-        """
+        """Read a file inside the block; it must be what it was before."""
         before = _stamp(path)
+        self._note(path, before)
         yield
-        # One after the other: of two that read a file first, both would take it for unknown.
-        with self._lock:
-            if path not in self._checksums or before != self._stamps[path]:
-                checksum = _checksum(path)
-                if self._checksums.setdefault(path, checksum) != checksum:
-                    raise InputError(f"{path}: its content has changed during the run; run again")
-            self._stamps[path] = before
         if _stamp(path) != before:
             raise InputError(f"{path}: is being written to; run again when that has ended")
 
-    def check(self, path: Path, image: DecodedImage) -> None:
-        """Take note of an image that may be damaged.
+    def _note(self, path: Path, stamp: _Stamp | None) -> None:
+        if self._stamps.setdefault(path, stamp) != stamp:
+            raise InputError(f"{path}: has changed during the run; run again")
 
-        Raises
-        ------
-        InputError
-            When damaged images are refused.
-        """
+    def check(self, path: Path, image: DecodedImage) -> None:
+        """Take note of an image that may be damaged, or refuse it."""
         if not image.damage:
             return
         reason = f"is damaged, and parts of it may be wrong ({image.damage}); copy it again from its source"
@@ -79,28 +55,18 @@ class InputGuard:
 
     def notes_on(self, paths: Iterable[Path]) -> GuardNotes:
         """What was noticed of some files, for the guard of another process."""
-        known = [path for path in paths if path in self._checksums]
+        known = [path for path in paths if path in self._stamps]
         return (
             {path: self._stamps[path] for path in known},
-            {path: self._checksums[path] for path in known},
             {path: self._damaged[path] for path in known if path in self._damaged},
         )
 
     def learn(self, notes: GuardNotes) -> None:
-        """Take over what a guard in another process has noticed.
-
-        Raises
-        ------
-        InputError
-            When a file had another content there.
-        """
-        stamps, checksums, damaged = notes
-        with self._lock:
-            for path, checksum in checksums.items():
-                if self._checksums.setdefault(path, checksum) != checksum:
-                    raise InputError(f"{path}: its content has changed during the run; run again")
-                self._stamps.setdefault(path, stamps[path])
-            self._damaged |= damaged
+        """Take over what a guard in another process has noticed, where files must have been the same."""
+        stamps, damaged = notes
+        for path, stamp in stamps.items():
+            self._note(path, stamp)
+        self._damaged |= damaged
 
     def __reduce__(self) -> tuple[type["InputGuard"], tuple[bool]]:
         """Copies and other processes begin anew."""
@@ -108,23 +74,12 @@ class InputGuard:
 
 
 def _stamp(path: Path) -> _Stamp | None:
-    """What changes with every change of a file, and is cheap to see; None where there is none."""
+    """What changes with a file and is the same on every machine that sees it; None where it is gone."""
     try:
         if is_url(path):
-            return int(remote_status(path)[2][:_DIGITS], 16), 0, 0, 0
+            _, size, key = remote_status(path)
+            return size, 0, key
         status = path.stat()
     except OSError:
         return None
-    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
-
-
-def _checksum(path: Path) -> int:
-    """CRC-32 of the content: against accidents, not against forgers."""
-    value = 0
-    try:
-        with open_regular(path) as stream:
-            while piece := stream.read(_BLOCK_BYTES):
-                value = zlib.crc32(piece, value)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read any more: {error.strerror}; run again") from error
-    return value
+    return status.st_size, status.st_mtime_ns, 0

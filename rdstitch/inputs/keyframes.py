@@ -22,21 +22,11 @@ _UNSEEN = 0.03  # share of a frame that none of the chosen ones around it need s
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which frames of a video are wanted.
+    """Which frames of a video are wanted."""
 
-    Attributes
-    ----------
-    every : int
-        Every n-th one, unless they are chosen one by one.
-    chosen : frozenset of int or None
-        Their numbers.
-    total : int
-        Frames of the video, where they are chosen.
-    """
-
-    every: int = 1
-    chosen: frozenset[int] | None = None
-    total: int = 0
+    every: int = 1  # every n-th one, unless they are chosen one by one
+    chosen: frozenset[int] | None = None  # their numbers
+    total: int = 0  # frames of the video, where they are chosen
 
     def __contains__(self, number: int) -> bool:
         """Whether a frame, by its number from 0, is wanted."""

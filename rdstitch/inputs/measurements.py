@@ -35,12 +35,6 @@ def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list
         The text :data:`XMP`: what drones write into images, see :mod:`rdstitch.io.attitude`; the plane is then taken
         to be level. Or a CSV file with a header that names the columns ``name`` (of the image's file), ``psi`` and
         ``theta``, degrees; others are ignored.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, is no such table, or has no line for an image; when an image's XMP has no
-        attitude of the camera, or one that is far from looking down.
     """
     if wanted is None:
         return list(sources)
@@ -126,11 +120,6 @@ def timestamps_of(sources: Sequence[Source], file: str | Path | None = None) -> 
         CSV with a header that names the columns ``name`` and ``timestamp``; or lines ``TIMESTAMP NAME`` as in the lists
         of the TUM benchmark; or one time a line, the n-th for the n-th image or frame of the video, as KITTI's
         ``times.txt``. Lines that begin with ``#`` are ignored.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, or has no time for an image.
     """
     if file is None:
         own = [(None if source.frame is None else source.frame.timestamp) for source in sources]

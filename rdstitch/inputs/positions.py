@@ -48,22 +48,7 @@ _Rows = Iterable[tuple[str, Mapping[str, str]]]
 def with_positions(
     sources: Sequence[Source], file: str | Path | None, epsg: int | None = None, offset: float = 0.0
 ) -> list[Source]:
-    """The sources with the positions of a file, if there is one, instead of those of EXIF.
-
-    Parameters
-    ----------
-    epsg : int, optional
-        Code of the coordinate system of x and y.
-    offset : float
-        Seconds to add to the times of the images for those of a track, which are in UTC.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, is none of those above, or has no position of any of the images.
-    ArgumentError
-        When the coordinate system cannot be used.
-    """
+    """The sources with the positions of a file, if there is one, instead of those of EXIF."""
     if file is None:
         return list(sources)
     text, name = read_text(file), str(file)
@@ -219,13 +204,6 @@ def with_ground_control(sources: Sequence[Source], file: str | Path | None) -> l
 
     Its first line names the coordinate system, each other one is ``X Y Z PX PY IMAGE [NAME]``: pixels of the upright
     image, the centre of the top-left one at (0, 0).
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, a line is wrong, or none is of any of the images.
-    ArgumentError
-        When the coordinate system cannot be used.
     """
     if file is None:
         return list(sources)

@@ -50,24 +50,10 @@ def extract_images(
 ) -> tuple[list[Frame], Wanted]:
     """Write images of a topic to a folder, losslessly, with number and time stamp (s) of the header.
 
-    Parameters
-    ----------
-    path : Path
-        File of ROS 1, folder of ROS 2 or a file in it.
-    every : int or None
-        Every n-th image; None: those that show new ground.
-    topic : str, optional
-        Without one, the only topic of images.
-
     Returns
     -------
     list of Frame, Wanted
         The images, and which they are.
-
-    Raises
-    ------
-    InputError
-        When ``rosbags`` is missing, the bag cannot be read, or there is not one such topic.
     """
     try:
         from rosbags.highlevel import AnyReader

@@ -14,18 +14,7 @@ from rdstitch.io.mask import mask_frame
 
 
 def selected(frames: Sequence[Frame], exclude: Sequence[str], include_only: Sequence[str]) -> list[Frame]:
-    """The images that ``include_only`` names, all if it names none, without those that ``exclude`` names.
-
-    Parameters
-    ----------
-    exclude, include_only : sequence of str
-        File names or whole paths, or patterns of them (``*``, ``?``, ``[...]``).
-
-    Raises
-    ------
-    ArgumentError
-        When one of them fits no image: it is misspelt.
-    """
+    """The images that ``include_only`` names, all if it names none, without those that ``exclude`` names."""
     for option, patterns in (("exclude", exclude), ("include-only", include_only)):
         for pattern in patterns:
             if not any(_fits(frame, pattern) for frame in frames):
@@ -57,12 +46,6 @@ def with_masks(sources: Sequence[Source], masks: str | Path | None) -> list[Sour
     masks : path or None
         An image: the mask of all images, such as of a camera that sees its own vehicle. Or a folder with a mask for
         each image, or for some, of the image's name; the suffix may differ.
-
-    Raises
-    ------
-    InputError
-        When there is no such file or folder, nothing in the folder is the mask of an image, or a mask has another
-        shape than its image.
     """
     if masks is None:
         return list(sources)

@@ -33,45 +33,26 @@ _HELD_UPRIGHT = 6
 
 @dataclass(frozen=True)
 class Source:
-    """One input image; its pixels are read when they are needed.
-
-    Attributes
-    ----------
-    path : Path
-    metadata : Metadata
-    camera : Camera
-        What is known of the camera before registration: size, centre, focal length, and λ where it was given.
-    mask : Path or None
-        Image that is dark where this one does not count.
-    mask_frame : int or None
-        How it is turned, see :func:`rdstitch.io.mask.mask_frame`.
-    attitude : (float, float) or None
-        (ψ, θ), radians, as a gimbal or an IMU has measured it.
-    frame : Frame or None
-        Its number and time in the sequence; the pixels, where they are no file.
-    decoded_images : DecodedImageCache
-        Where it is kept between two stages that both look at it.
-    guard : InputGuard
-        What notices changes of the file, and damage.
-    flat_field : FlatField or None
-        Illumination that is taken out of the pixels.
-    control : tuple of GroundControl
-        Points of known place that it shows.
-    """
+    """One input image; its pixels are read when they are needed."""
 
     path: Path
     metadata: Metadata
+    # what is known of the camera before registration: size, centre, focal length, and λ where it was given
     camera: Camera
-    mask: Path | None = None
-    mask_frame: int | None = None
-    attitude: tuple[float, float] | None = None
+    mask: Path | None = None  # image that is dark where this one does not count
+    mask_frame: int | None = None  # how it is turned, see :func:`rdstitch.io.mask.mask_frame`
+    attitude: tuple[float, float] | None = None  # (ψ, θ), radians, as a gimbal or an IMU has measured it
+    # its number and time in the sequence; the pixels, where they are no file
     frame: Frame | None = field(default=None, compare=False, repr=False)
+    # where it is kept between two stages that both look at it
     decoded_images: DecodedImageCache = field(
         default_factory=partial(DecodedImageCache, room=0), compare=False, repr=False
     )
+    # what notices changes of the file, and damage
     guard: InputGuard = field(default_factory=InputGuard, compare=False, repr=False)
+    # illumination that is taken out of the pixels
     flat_field: FlatField | None = field(default=None, compare=False, repr=False)
-    control: tuple[GroundControl, ...] = ()
+    control: tuple[GroundControl, ...] = ()  # points of known place that it shows
 
     @property
     def name(self) -> str:
@@ -112,18 +93,7 @@ class Source:
         return 1 if megapixels is None else fitting_reduction(halving(self.camera.image_size, megapixels))
 
     def read(self, reduction: int = 1, *, keep: bool = False) -> DecodedImage:
-        """The pixels, of blocks of so many pixels a side; what the mask excludes is transparent.
-
-        Parameters
-        ----------
-        keep : bool
-            It will be looked at again, so that the file need not be decoded once more.
-
-        Raises
-        ------
-        InputError
-            When the file cannot be read, or is no longer what it was.
-        """
+        """The pixels, of blocks of so many pixels a side; what the mask excludes is transparent."""
         # Smaller ones are made from one size, whether that is at hand or not: the same comes out.
         usual = self.reduction(WORK_MEGAPIXELS)
         if reduction % usual:
@@ -186,30 +156,7 @@ def read_sources(
     guard: InputGuard | None = None,
     max_memory: int | None = None,
 ) -> tuple[list[Source], list[Message]]:
-    """Read the headers of the images; a file named twice counts once.
-
-    Parameters
-    ----------
-    camera : Camera, optional
-        Known camera; adapted to the size of each image.
-    focal : float, optional
-        Known focal length, pixels.
-    distortion : float, optional
-        Known λ, half-diagonal frame.
-    skip_bad : bool
-        Leave out files that cannot be read, with the reason, instead of raising.
-    guard : InputGuard, optional
-        What notices changes of the files, and damage.
-    max_memory : int or None
-        Bytes that an image may take while it is decoded.
-
-    Raises
-    ------
-    InputError
-        When a file cannot be read.
-    LimitError
-        When an image needs more memory.
-    """
+    """Read the headers of the images; a file named twice counts once."""
     guard = guard or InputGuard()
     sources: list[Source] = []
     unread: list[Message] = []

@@ -38,13 +38,7 @@ def xmp_text(image: Image.Image) -> str:
 
 
 def xmp_number(xmp: str, name: str) -> float | None:
-    """Finite number of a property, written as attribute or as element; None where there is none.
-
-    Parameters
-    ----------
-    name : str
-        With the customary prefix of its namespace, or without for any.
-    """
+    """Finite number of a property, written as attribute or as element; None where there is none."""
     # A search rather than an XML parser: drones write XMP that no parser accepts.
     # Repetitions are bounded, so that it takes time in proportion to the text, whatever that is.
     gap, value = rf"\s{{0,{_MAX_NUMBER_LENGTH}}}", rf"{{0,{_MAX_NUMBER_LENGTH}}}"

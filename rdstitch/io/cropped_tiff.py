@@ -14,19 +14,7 @@ _RATIONAL, _LONG = 5, 4
 def write_cropped_tiff(
     path: Path, pixels: NDArray[Any], alpha: NDArray[np.uint8] | None, offset: tuple[int, int], size: tuple[int, int]
 ) -> None:
-    """Write a part of a canvas.
-
-    Parameters
-    ----------
-    pixels : ndarray of shape (h, w) or (h, w, C)
-        uint8, uint16 or float32.
-    alpha : ndarray of shape (h, w), optional
-        255 where it is opaque; scaled to the range of the samples.
-    offset : (int, int)
-        Of its first pixel on the canvas.
-    size : (int, int)
-        Of the canvas.
-    """
+    """Write a part (h, w) or (h, w, C) of a canvas of ``size``, its first pixel at ``offset``; alpha is 0 or 255."""
     import tifffile
 
     samples = pixels[..., None] if pixels.ndim == 2 else pixels

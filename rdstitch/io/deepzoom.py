@@ -33,15 +33,7 @@ _DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Iterable[Strip]) -> None:
-    """Write the description and the tiles of an image; transparency becomes the background, 16 bits become 8.
-
-    Parameters
-    ----------
-    description : Path
-        The ``.dzi`` file.
-    folder : Path
-        Empty folder for the tiles.
-    """
+    """Write the description and the tiles of an image; transparency becomes the background, 16 bits become 8."""
     width, height = layout.size
     # The profile belongs to the pixels, and so into every tile; EXIF does not.
     kept = layout.metadata.icc_profile if len(layout.metadata.icc_profile) <= MAX_TILE_PROFILE else b""
@@ -56,13 +48,7 @@ def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Ite
 
 
 def read_deep_zoom(path: Path, size: tuple[int, int], side: int) -> NDArray[np.uint8]:
-    """Read the smallest level whose longer side has ``side`` pixels, or else the largest, of an image of ``size``.
-
-    Raises
-    ------
-    InputError
-        When tiles cannot be read.
-    """
+    """Read the smallest level whose longer side has ``side`` pixels, or else the largest, of an image of ``size``."""
     sizes = _sizes(size)
     level = next((k for k, level_size in enumerate(sizes) if max(level_size) >= side), len(sizes) - 1)
     columns, rows = (range(-(-n // TILE)) for n in sizes[level])
@@ -96,13 +82,7 @@ def _levels(folder: Path, layout: Layout) -> "_Level":
 
 @dataclass
 class _Level:
-    """One size of the image, which is cut into tiles as its rows come.
-
-    Parameters
-    ----------
-    smaller : _Level or None
-        The level of half the size.
-    """
+    """One size of the image, which is cut into tiles as its rows come."""
 
     folder: Path
     layout: Layout

@@ -16,18 +16,10 @@ from rdstitch.late_imports import tifffile
 
 @dataclass(frozen=True, eq=False)
 class FlatField:
-    """Illumination of all images of a camera: ``measured = gain * light + dark``.
+    """Illumination of all images of a camera: ``measured = gain * light + dark``."""
 
-    Attributes
-    ----------
-    gain : ndarray of shape (h, w, C), float32
-        Mean 1 in each channel.
-    dark : ndarray of shape (h, w, C) or (1, 1, C), float32
-        Samples without light.
-    """
-
-    gain: NDArray[np.float32]
-    dark: NDArray[np.float32]
+    gain: NDArray[np.float32]  # (h, w, C), float32: mean 1 in each channel
+    dark: NDArray[np.float32]  # (h, w, C) or (1, 1, C), float32: samples without light
 
     def corrected(self, pixels: NDArray[Any], reduction: int = 1) -> NDArray[Any]:
         """``(v - dark) / gain + dark`` of samples (h, w) or (h, w, C), reduced or not, in their type.
@@ -51,13 +43,7 @@ class FlatField:
 
 
 def read_flat_field(file: str | Path, size: tuple[int, int], channels: int) -> FlatField:
-    """The flat field of an image file, and the dark field where it has a second page.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read, has another size than the images, or is not positive.
-    """
+    """The flat field of an image file, and the dark field where it has a second page."""
     path = Path(file)
     check_readable(path)
     read: Callable[[Any], NDArray[np.float32]] = lambda page: np.asarray(page.asarray(), dtype=np.float32)  # noqa: E731

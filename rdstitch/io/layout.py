@@ -20,38 +20,15 @@ STRIP_ROWS = 256
 
 @dataclass(frozen=True)
 class Layout:
-    """The form of an image that comes in strips.
+    """The form of an image that comes in strips."""
 
-    Attributes
-    ----------
-    size : (int, int)
-        Width and height, pixels.
-    channels : int
-        Colour channels, without alpha.
-    dtype : dtype
-        uint8, uint16 or float32.
-    transparent : bool
-        Whether there is an alpha channel, if the format can hold one.
-    metadata : Metadata
-        Colour profile, EXIF and resolution to keep.
-    quality : int
-        Of JPEG and WebP, 1 to 100.
-    background : int
-        Grey (0 to 255) of what is transparent, in a format without transparency.
-
-    Raises
-    ------
-    ArgumentError
-        When a value has no meaning.
-    """
-
-    size: tuple[int, int]
-    channels: int
-    dtype: np.dtype[Any]
-    transparent: bool = False
-    metadata: Metadata = field(default_factory=lambda: Metadata((1, 1)))
-    quality: int = 95
-    background: int = 0
+    size: tuple[int, int]  # width and height, pixels
+    channels: int  # colour channels, without alpha
+    dtype: np.dtype[Any]  # uint8, uint16 or float32
+    transparent: bool = False  # whether there is an alpha channel, if the format can hold one
+    metadata: Metadata = field(default_factory=lambda: Metadata((1, 1)))  # colour profile, EXIF and resolution to keep
+    quality: int = 95  # of JPEG and WebP, 1 to 100
+    background: int = 0  # grey (0 to 255) of what is transparent, in a format without transparency
 
     def __post_init__(self) -> None:
         if min(self.size) < 1 or self.channels < 1:
@@ -68,13 +45,7 @@ class Layout:
 
 
 def check_strips(layout: Layout, strips: Iterable[Strip]) -> Iterator[Strip]:
-    """The strips, when they are what the layout says.
-
-    Raises
-    ------
-    ArgumentError
-        When a strip has another shape or type, or rows are missing.
-    """
+    """The strips, when they are what the layout says."""
     width, height = layout.size
     rows = 0
     for samples, alpha in strips:

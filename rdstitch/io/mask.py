@@ -21,26 +21,10 @@ def mask_frame(
     What the camera sees in every image belongs to the stored frame, as its lens does; the mask of one image is as
     that looks. Where a mask fits in one of the two only, it belongs there.
 
-    Parameters
-    ----------
-    path, image : path
-        The mask, and the image that it is for.
-    size : (int, int)
-        Width and height of the image, upright, pixels.
-    orientation : int
-        EXIF orientation of the image.
-    of_camera : bool
-        Whether it is the mask of all images.
-
     Returns
     -------
     int or None
         The orientation by which it is to be turned from how its file stores it; None where it is used as it looks.
-
-    Raises
-    ------
-    InputError
-        When the mask cannot be read, or has another shape than the image; the text names it.
     """
     own, (width, height) = read_metadata(path), size
     stored = turned_size(turned_size(own.size, inverse(own.orientation)), orientation)
@@ -61,22 +45,10 @@ def read_mask(path: str | Path, size: tuple[int, int], frame: int | None = None)
     What is darker than half of the mask's brightest value is excluded, so that masks of 0 and 1, masks of 0 and 255,
     and lossily compressed ones all mean what they show. What is transparent in the mask is excluded, too.
 
-    Parameters
-    ----------
-    size : (int, int)
-        Width and height, pixels, that the mask is brought to; nearest pixels.
-    frame : int or None
-        As :func:`mask_frame` gives it.
-
     Returns
     -------
     ndarray of shape (height, width), uint8
         255 where the image counts, 0 where it is excluded.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read.
     """
     mask = read_image(path)
     light = mask.pixels if mask.pixels.ndim == 2 else mask.pixels.max(axis=2)

@@ -65,65 +65,31 @@ class GroundControl:
 
 @dataclass(frozen=True)
 class Metadata:
-    """Everything known of an image file beside its pixels.
+    """Everything known of an image file beside its pixels."""
 
-    Attributes
-    ----------
-    size : (int, int)
-        Width and height, pixels, after the EXIF orientation is applied.
-    bit_depth : int
-        Bits per sample.
-    channels : int
-        Samples per pixel, with alpha.
-    orientation : int
-        EXIF orientation (1 to 8) stored in the file; readers of this project have applied it already.
-    focal_px : float or None
-        Focal length, pixels, where the file tells it.
-    focal_source : str or None
-        Tag that ``focal_px`` comes from.
-    gps : GpsPosition or None
-    attitude : Attitude or None
-    make, model, serial : str
-        Of the camera; empty where not known.
-    dpi : (float, float) or None
-    exposure : float or None
-        Exposure time x sensitivity / f-number²: what the samples' light is proportional to, for the same scene.
-    timestamp : float or None
-        When it was taken, s since 1970; where EXIF has no time zone, its local time is taken for UTC.
-    exif : bytes
-        EXIF block with orientation 1, without maker note and thumbnail; empty where there is none.
-    icc_profile : bytes
-        Colour profile; empty where there is none.
-    xmp : bytes
-        XMP packet that is to be written; what files have is not kept.
-    profile_lost : str
-        Why the file's colour profile is not kept; empty where it is, or where there is none.
-    pixel_size : float or None
-        Micrometres, where OME-XML says it.
-    planes : bool
-        Whether the channels are those of a microscope, on pages of their own, and no colours.
-    """
-
-    size: tuple[int, int]
-    bit_depth: int = 8
+    size: tuple[int, int]  # width and height, pixels, after the EXIF orientation is applied
+    bit_depth: int = 8  # bits per sample
+    # EXIF orientation (1 to 8) stored in the file; readers of this project have applied it already
     orientation: int = 1
-    focal_px: float | None = None
-    focal_source: str | None = None
+    focal_px: float | None = None  # focal length, pixels, where the file tells it
+    focal_source: str | None = None  # tag that ``focal_px`` comes from
     gps: GpsPosition | None = None
     attitude: Attitude | None = None
-    make: str = ""
+    make: str = ""  # make, model, serial: of the camera; empty where not known
     model: str = ""
     serial: str = ""
     dpi: tuple[float, float] | None = None
+    # exposure time x sensitivity / f-number²: what the samples' light is proportional to, for the same scene
     exposure: float | None = None
+    # when it was taken, s since 1970; where EXIF has no time zone, its local time is taken for UTC
     timestamp: float | None = None
-    exif: bytes = b""
-    icc_profile: bytes = b""
-    xmp: bytes = b""
-    profile_lost: str = ""
-    channels: int = 3
-    pixel_size: float | None = None
-    planes: bool = False
+    exif: bytes = b""  # EXIF block with orientation 1, without maker note and thumbnail; empty where there is none
+    icc_profile: bytes = b""  # colour profile; empty where there is none
+    xmp: bytes = b""  # XMP packet that is to be written; what files have is not kept
+    profile_lost: str = ""  # why the file's colour profile is not kept; empty where it is, or where there is none
+    channels: int = 3  # samples per pixel, with alpha
+    pixel_size: float | None = None  # micrometres, where OME-XML says it
+    planes: bool = False  # whether the channels are those of a microscope, on pages of their own, and no colours
 
     @property
     def nadir(self) -> tuple[float, float, float] | None:
@@ -144,13 +110,7 @@ class Metadata:
 
 
 def read_metadata(path: str | Path) -> Metadata:
-    """Read an image file's header; no pixel is decoded.
-
-    Raises
-    ------
-    InputError
-        When the file is missing, unreadable, or no image.
-    """
+    """Read an image file's header; no pixel is decoded."""
     file = Path(path)
     check_readable(file)
     with decoding(file):
@@ -267,8 +227,6 @@ def _colour_profile(image: Image.Image) -> tuple[bytes, str]:
         return b"", f"its colour profile of {len(profile) / 1e6:.1f} MB is too large for PNG readers"
     if profile[_COLOUR_SPACE] == b"CMYK":
         return b"", "" if ink_transform(profile) else "its colour profile of inks (CMYK) cannot be used"
-    if profile[_COLOUR_SPACE] == b"Lab ":
-        return b"", ""
     return profile, ""
 
 

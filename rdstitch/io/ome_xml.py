@@ -9,24 +9,12 @@ MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm
 
 @dataclass(frozen=True)
 class OmeImage:
-    """What OME-XML says of the only or first image of a file.
+    """What OME-XML says of the only or first image of a file."""
 
-    Attributes
-    ----------
-    channels : int
-        Pages that are channels of one plane; 1 where there are several planes or times.
-    pixel_size : float or None
-        Micrometres.
-    position : (float, float) or None
-        Of the first plane.
-    unit : float or None
-        Micrometres that the position counts; None for pixels ("reference frame").
-    """
-
-    channels: int
-    pixel_size: float | None
-    position: tuple[float, float] | None
-    unit: float | None
+    channels: int  # pages that are channels of one plane; 1 where there are several planes or times
+    pixel_size: float | None  # micrometres
+    position: tuple[float, float] | None  # of the first plane
+    unit: float | None  # micrometres that the position counts; None for pixels ("reference frame")
 
 
 def read_ome(text: str | None) -> OmeImage | None:

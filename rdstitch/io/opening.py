@@ -75,13 +75,7 @@ _PNG_METADATA = (b"eXIf", b"tEXt", b"zTXt", b"iTXt")
 
 
 def check_readable(path: Path) -> None:
-    """Refuse what cannot be an image file, before a decoder blocks or stumbles on it.
-
-    Raises
-    ------
-    InputError
-        When the path is missing, no regular file, empty, or not readable.
-    """
+    """Refuse what cannot be an image file, before a decoder blocks or stumbles on it."""
     if is_url(path):
         _check_remote(path)
         return
@@ -154,16 +148,7 @@ def decoding(path: Path) -> Iterator[None]:
 
 @contextmanager
 def opened_image(file: Path) -> Iterator[ImageFile.ImageFile]:
-    """An image whose header has been read.
-
-    Raises
-    ------
-    InputError
-        When it is none of these formats, or larger than any camera's.
-    OSError, SyntaxError, …
-        What :func:`rdstitch.io.opening.decoding` makes an InputError of: the file is missing, no regular one, or
-        damaged.
-    """
+    """An image whose header has been read."""
     with open_regular(file) as stream, _factory(file, stream)(stream, str(file)) as image:
         check_megapixels(file, image.size)
         yield image
@@ -189,13 +174,7 @@ def has_late_metadata(file: Path) -> bool:
 
 
 def check_megapixels(file: Path, size: tuple[int, int]) -> None:
-    """Refuse what claims to be larger than any camera's image.
-
-    Raises
-    ------
-    InputError
-        The text says what to do.
-    """
+    """Refuse what claims to be larger than any camera's image."""
     megapixels = size[0] * size[1] / 1e6
     if megapixels > _MAX_MEGAPIXELS:
         raise InputError(

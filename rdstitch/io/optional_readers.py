@@ -31,13 +31,7 @@ _KEPT_BLOCKS = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
 
 
 def check_reader(path: Path) -> None:
-    """Refuse a file whose reader is not installed.
-
-    Raises
-    ------
-    InputError
-        It names the extra to install.
-    """
+    """Refuse a file whose reader is not installed."""
     suffix = path.suffix.lower()
     if suffix in HEIF_SUFFIXES:
         _package("pillow_heif", path)

@@ -26,13 +26,7 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(data: bytes) -> Any:
-    """The value that :func:`pack` made bytes of; nothing in them can name other code to be run.
-
-    Raises
-    ------
-    InputError
-        When the bytes are damaged, or hold something else.
-    """
+    """The value that :func:`pack` made bytes of; nothing in them can name other code to be run."""
     body = memoryview(data)[_HEAD:]
     if data[:_HEAD] != _MAGIC + hashlib.sha256(body).digest():
         raise InputError("damaged: it is not what was written")
@@ -54,19 +48,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def digest(value: Any) -> str:
-    """A short text that stands for a value: equal for equal values only.
-
-    Parameters
-    ----------
-    value
-        None, bool, int, float, str, Path, a numeric array, or a tuple, list, dict with text keys, or dataclass of
-        these.
-
-    Raises
-    ------
-    ArgumentError
-        When there is anything else in it.
-    """
+    """A short text that stands for a value: equal for equal values only."""
     content = hashlib.sha256()
     _add(content, value)
     return content.hexdigest()

@@ -17,15 +17,7 @@ _OVERVIEW_FROM = 60_000_000  # pixels; of larger TIFF files an overview is read
 
 
 def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
-    """Samples and alpha of an image that rdstitch wrote, at least ``side`` pixels long where it is that large.
-
-    Parameters
-    ----------
-    size : (int, int)
-        Width and height of the image, pixels.
-    side : int
-        Of images that are stored in several sizes, the smallest that is no shorter is read.
-    """
+    """Samples and alpha of an image that rdstitch wrote, at least ``side`` pixels long where it is that large."""
     suffix = path.suffix.lower()
     if suffix == ".dzi":
         return read_deep_zoom(path, size, side), None

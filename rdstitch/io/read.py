@@ -16,7 +16,7 @@ from PIL import Image
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import open_regular
-from rdstitch.io.colour import srgb_of_lab, without_inks
+from rdstitch.io.colour import without_inks
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
 from rdstitch.io.ome_xml import read_ome
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, opened_image
@@ -43,17 +43,10 @@ _GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 
 
 def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> tuple[NDArray[Any] | None, str]:
-    """Samples (h, w) or (h, w, 3) in RGB order as stored, not turned upright, and what is wrong with the file.
+    """Samples of 1/``factor`` of the size, (h, w) or (h, w, 3) in RGB order as stored, and what is wrong with the file.
 
     What Pillow would decode, bit for bit, in less time and memory. Pillow has the last word on files about which
     the decoder has any complaint: it refuses some, and decodes others without a word, whatever comes out.
-
-    Parameters
-    ----------
-    size : (int, int)
-        Width and height of the whole image, pixels.
-    factor : int
-        1, 2, 4 or 8; so many pixels a side become one.
 
     Returns
     -------
@@ -89,22 +82,15 @@ Pixels = NDArray[Any]
 
 @dataclass(frozen=True)
 class DecodedImage:
-    """One image in memory.
+    """One image in memory."""
 
-    Attributes
-    ----------
-    pixels : ndarray of shape (height, width) or (height, width, channels)
-        uint8, uint16 or float32. Colour is in RGB order, never BGR. The EXIF orientation has been applied.
-    alpha : ndarray of shape (height, width), uint8, or None
-        255 where the image is opaque, 0 where it says nothing; None when it is opaque everywhere.
-    metadata : Metadata
-    damage : str
-        Why some of the pixels may be wrong: the complaint of a decoder that went on nevertheless. Empty without one.
-    """
-
+    # (height, width) or (height, width, channels): uint8, uint16 or float32. Colour is in RGB order, never BGR. The
+    # EXIF orientation has been applied
     pixels: Pixels
+    # (height, width), uint8: 255 where the image is opaque, 0 where it says nothing; None when it is opaque everywhere
     alpha: NDArray[np.uint8] | None
     metadata: Metadata
+    # why some of the pixels may be wrong: the complaint of a decoder that went on nevertheless. Empty without one
     damage: str = ""
 
     @property
@@ -118,7 +104,7 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
 
     JPEG, PNG, TIFF, WebP and whatever else Pillow reads, with 8 or 16 bit or floating-point samples; with optional
     packages also HEIC, and raw files, which become 16-bit sRGB. Of an animated or multi-page file the first image
-    counts. CMYK (by its profile), CIELAB and palette colours become RGB. NaN or infinite samples of a floating-point
+    counts. CMYK (by its profile) and palette colours become RGB. NaN or infinite samples of a floating-point
     file become transparent zeros.
 
     Parameters
@@ -130,11 +116,6 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
     metadata : Metadata, optional
         What :func:`read_metadata` has found in the file, which is not looked for again: of a small JPEG file that takes
         as long as its pixels.
-
-    Raises
-    ------
-    InputError
-        When the file is missing, unreadable, no image, or damaged; the text names the file.
     """
     file = Path(path)
     check_readable(file)
@@ -268,10 +249,11 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
         if (planes := _channel_planes(tiff)) is not None:
             return planes, None
         kind = page.photometric
-        plain = kind in _PLAIN or kind in _LAB
+        if kind in _LAB:
+            raise InputError(f"{file}: has the colours of CIELAB, which are not read; convert it to RGB")
         has_alpha = any(extra in (1, 2) for extra in page.extrasamples)
         try:
-            samples = page.asarray() if plain else None
+            samples = page.asarray() if kind in _PLAIN else None
         except ValueError as error:
             if "imagecodecs" not in str(error):
                 raise
@@ -293,11 +275,6 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
         raise ValueError(f"unexpected axes {axes}")
     if kind == tifffile.PHOTOMETRIC.MINISWHITE:
         samples = ~samples
-    if kind in _LAB:
-        if samples.dtype not in (np.uint8, np.uint16):
-            raise ValueError(f"CIELAB of type {samples.dtype}")
-        samples = samples.copy()
-        samples[..., :3] = srgb_of_lab(samples[..., :3], signed=kind == tifffile.PHOTOMETRIC.CIELAB)
     if samples.dtype == np.bool_:
         samples = samples.astype(np.uint8) * _OPAQUE
     if axes == "YXS" and has_alpha:
@@ -317,22 +294,7 @@ def _channel_planes(tiff: "tifffile.TiffFile") -> Pixels | None:
 
 
 def as_image(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadata) -> DecodedImage:
-    """An image from samples as stored: upright, in one of the three sample types, contiguous, and without NaN.
-
-    Parameters
-    ----------
-    file : Path
-        For messages.
-    samples : ndarray of shape (h, w) or (h, w, C)
-        Colour in RGB order.
-    alpha : ndarray of shape (h, w), or None
-        Of any sample type; full where the image is opaque.
-
-    Raises
-    ------
-    InputError
-        When there are no pixels.
-    """
+    """An image from samples as stored: upright, in one of the three sample types, contiguous, and without NaN."""
     if samples.size == 0:
         raise InputError(f"{file}: has no pixels")
     opaque = None if alpha is None else _as_uint8(alpha)

@@ -41,15 +41,7 @@ ExtraTag = tuple[int, int, int, Any, bool]
 
 
 def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
-    """Write a TIFF file whose first page is the image and whose other pages are its overviews.
-
-    Parameters
-    ----------
-    path : Path
-        Temporary files for the overviews are made, and removed, in the same folder.
-    extra_tags
-        Further tags of the first page, for example of a GeoTIFF.
-    """
+    """Write a TIFF file whose first page is the image and whose other pages are its overviews."""
     sizes = [layout.size, *overview_sizes(layout.size)]
     total = sum(w * h for w, h in sizes) * layout.samples_per_pixel * layout.dtype.itemsize
     joined: Iterable[NDArray[Any]] = (with_alpha(*strip) if layout.transparent else strip[0] for strip in strips)

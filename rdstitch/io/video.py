@@ -28,13 +28,7 @@ class VideoFrame(NamedTuple):
 
 
 def grey_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
-    """All frames of a video, (H, W); black where one cannot be decoded.
-
-    Raises
-    ------
-    InputError
-        When the video cannot be read.
-    """
+    """All frames of a video, (H, W); black where one cannot be decoded."""
     black = np.zeros((1, 1), dtype=np.uint8)
     for _, _, capture in _grabbed(path):
         decoded, frame = capture.retrieve()
@@ -42,15 +36,7 @@ def grey_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
 
 
 def extract_frames(path: Path, folder: Path, wanted: Callable[[int], bool]) -> list[VideoFrame]:
-    """Write frames of a video, those whose numbers are wanted, to a folder as PNG, named by video and frame number.
-
-    Raises
-    ------
-    InputError
-        When the video cannot be read, or has no frame.
-    OutputError
-        When a frame cannot be written.
-    """
+    """Write frames of a video, those whose numbers are wanted, to a folder as PNG, named by video and frame number."""
     written: list[VideoFrame] = []
     for number, timestamp, capture in _grabbed(path):
         decoded, frame = capture.retrieve() if wanted(number) else (False, None)
@@ -92,13 +78,7 @@ def opened_capture(source: str | int) -> Iterator[cv2.VideoCapture]:
 
 
 def write_frame(file: Path, frame: cv2.typing.MatLike) -> Path:
-    """Write a frame in BGR order as PNG, losslessly and quickly.
-
-    Raises
-    ------
-    OutputError
-        When it cannot be written.
-    """
+    """Write a frame in BGR order as PNG, losslessly and quickly."""
     encoded, data = cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not encoded:
         raise OutputError(f"{file}: cannot encode the frame")

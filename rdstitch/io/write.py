@@ -65,15 +65,6 @@ def write_image(
         Grey of what is transparent, in a format without transparency: 0 black, 255 white.
     overwrite : bool
         Replace an existing file.
-
-    Raises
-    ------
-    ArgumentError
-        When the arrays do not fit together.
-    LimitError
-        When the image is too large for the format; the text names one that holds it.
-    OutputError
-        When the format cannot hold such samples, or the file system refuses; nothing is left behind.
     """
     if pixels.ndim not in (2, 3):
         raise ArgumentError(f"expected pixels of shape (H, W) or (H, W, C), not {pixels.shape}")
@@ -94,17 +85,6 @@ def write_strips(
     outputs: Outputs | None = None,
 ) -> Fingerprint:
     """Write an image that comes in strips; see :func:`write_image`.
-
-    Parameters
-    ----------
-    path
-        The format follows the suffix.
-    strips : iterable of (samples, alpha)
-        From top to bottom; all but the last have a multiple of 256 rows.
-    extra_tags
-        Further tags of a TIFF file.
-    outputs : Outputs, optional
-        Where the image is staged, to be published with what belongs to it; without, it replaces what is there.
 
     Returns
     -------
@@ -153,13 +133,7 @@ def _write_file(
 
 
 def check_format(path: str | Path, layout: Layout) -> None:
-    """Find out before long work whether the format of ``path`` can hold an image.
-
-    Raises
-    ------
-    LimitError, OutputError
-        The text names a format that can.
-    """
+    """Find out before long work whether the format of ``path`` can hold an image."""
     suffix = Path(path).suffix.lower()
     if suffix not in IMAGE_SUFFIXES:
         raise OutputError(f"{path}: unknown file type '{suffix}'; use one of {' '.join(IMAGE_SUFFIXES)}")
@@ -173,13 +147,7 @@ def check_format(path: str | Path, layout: Layout) -> None:
 
 
 def check_size(path: str | Path, size: tuple[int, int]) -> None:
-    """Refuse an image of ``size`` (width, height) that the format of ``path`` cannot hold.
-
-    Raises
-    ------
-    LimitError
-        The text names a format that holds it.
-    """
+    """Refuse an image of ``size`` (width, height) that the format of ``path`` cannot hold."""
     suffix = Path(path).suffix.lower()
     limit = SIDE_LIMITS.get(suffix)
     if limit is not None and max(size) > limit:
@@ -190,13 +158,7 @@ def check_size(path: str | Path, size: tuple[int, int]) -> None:
 
 
 def check_memory(path: str | Path, size: tuple[int, int], max_memory: int | None) -> None:
-    """Refuse an image that the format of ``path`` needs whole in memory, where that is limited.
-
-    Raises
-    ------
-    LimitError
-        The text names a format that is written in strips.
-    """
+    """Refuse an image that the format of ``path`` needs whole in memory, where that is limited."""
     need = size[0] * size[1] * _WEBP_BYTES_PER_PIXEL
     if Path(path).suffix.lower() == ".webp" and max_memory is not None and need > max_memory:
         raise LimitError(

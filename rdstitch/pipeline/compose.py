@@ -277,7 +277,7 @@ def compose_block(task: BlockTask) -> tuple[list[Stored[OutputStrip]], GuardNote
     """Compute a block; and what was noticed of its files."""
     strips = task.block.compute(task.store)
     if not task.sources:
-        return strips, ({}, {}, {})
+        return strips, ({}, {})
     # All have one guard, which travels with them.
     return strips, task.sources[0].guard.notes_on([source.path for source in task.sources])
 
@@ -286,14 +286,13 @@ def write_page(
     outputs: Outputs, output: str | Path, composed: Composed, images: Callable[[], Sequence[ViewedImage]]
 ) -> list[Message]:
     """Write the page of a ``.dzi`` output; others have none. A warning, where it cannot be written."""
-    page, written = viewer_path(output), composed.written
-    if page is None or written is None:
+    page = viewer_path(output)
+    if page is None or composed.written is None:
         return []
-
     gsd = None if composed.place is None else composed.place.gsd
 
     def stage() -> None:
-        text = viewer_page(output, composed.canvas.size, images(), written.seams, written.origin, gsd)
+        text = viewer_page(output, composed.canvas.size, images(), gsd)
         # Names of files need not be UTF-8.
         outputs.write(page, text.encode("utf-8", "backslashreplace"))
 

@@ -1,21 +1,20 @@
-"""The image that came out, with the outlines of the images in it, and what local alignment moved."""
+"""The image that came out, with the outlines of the images in it, its place, and what local alignment moved."""
 
 from pathlib import Path
 
 import numpy as np
 
-from rdstitch.local_alignment import DisplacementField
+from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.compositing.panorama_canvas import seen_directions
+from rdstitch.export.trajectory_files import path_as_svg
+from rdstitch.registration import Registration
 from rdstitch.report.geometry import of_mosaic
-from rdstitch.report.svg import BLUE, GREY, YELLOW, drawing, element, joined, label, line, path, section, table
+from rdstitch.report.svg import YELLOW, Markup, drawing, element, label, path, section, table
 from rdstitch.stitch_result import StitchResult
 from rdstitch.viewer import viewer_path
 
 _MOSAIC_SIDE = 1200
-_MAX_NAMES, _MAX_RESIDUALS = 12, 20
-_WIDTH, _COLUMNS, _GAP, _TEXT = 940.0, 4, 12.0, 18.0
-_ARROWS = 9  # along the longer side of an image
-_LONGEST = 0.8  # of the distance between arrows, for the largest displacement of all images
-_MAX_IMAGES = 60
+_MAX_NAMES, _MAX_ROWS = 12, 20
 
 
 def mosaic(result: StitchResult, staged: Path | None = None) -> str:
@@ -27,8 +26,7 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
     name = "" if result.output is None else f"{result.output.name}, "
     width, height = result.canvas.size
     scale = _MOSAIC_SIDE / max(width, height)
-    used = np.flatnonzero(result.registration.alignment.used)
-    names = [result.registration.sources[index].name for index in used]
+    names = result.registration.used_names
     parts = [element("image", href=image, width=width * scale, height=height * scale)]
     for text, outlines in zip(names, result.canvas.outlines, strict=True):
         places = [(outline + 0.5) * scale for outline in outlines]
@@ -49,54 +47,49 @@ def place(result: StitchResult) -> str:
     found = result.georeference
     if found is None:
         return ""
-    residuals = sorted(found.residuals, key=lambda residual: -residual.off)[:_MAX_RESIDUALS]
+    residuals = sorted(found.residuals, key=lambda residual: -residual.off)[:_MAX_ROWS]
     rows = [(r.name, f"{r.east:+.3f}", f"{r.north:+.3f}", "" if r.used else "not used") for r in residuals]
     explanation = f"{found.summary}. Where the output has them less where they were measured to be, the largest first:"
     return section("Place on the Earth", explanation, table([("", "east, m", "north, m", ""), *rows]))
 
 
 def local_alignment(result: StitchResult) -> str:
-    """A section with the displacement field of each image, and how much all of them mended."""
+    """How much local alignment mended, and the images that it moved farthest."""
     local = result.local_alignment
-    title = "Local alignment"
     if not local.fields:
-        return section(title, f"Images are where the alignment puts them: {local.reason}.")
-    used = np.flatnonzero(result.registration.alignment.used)
-    names = [result.registration.sources[index].name for index in used]
-    # The largest first: they are what one wants to look at.
-    order = sorted(range(len(names)), key=lambda k: -local.fields[k].largest)[:_MAX_IMAGES]
-    largest = max(max(field.largest for field in local.fields), 1e-9)
-    side = (_WIDTH - (_COLUMNS - 1) * _GAP) / _COLUMNS
-    row = side + _TEXT + _GAP
-    corners = [(k % _COLUMNS * (side + _GAP), k // _COLUMNS * row) for k in range(len(order))]
-    parts = [
-        _image(local.fields[k], names[k], *corner, side, largest) for k, corner in zip(order, corners, strict=True)
-    ]
-    hidden = f" {len(names) - len(order)} images with smaller ones are not drawn." if len(order) < len(names) else ""
+        return section("Local alignment", f"Images are where the alignment puts them: {local.reason}.")
     spread = ""
     if local.before is not None and local.after is not None:
         spread = f" (95 %: {local.before.percentile95:.2f} and {local.after.percentile95:.2f} pixels)"
+    moved = zip(result.registration.used_names, local.fields, strict=True)
+    farthest = sorted(moved, key=lambda image: -image[1].largest)[:_MAX_ROWS]
     return section(
-        title,
-        f"The ground is not quite a plane, so that each image's content is moved a little; {local.reason}{spread}. "
-        f"The longest arrow of all stands for {largest:.1f} pixels.{hidden}",
-        drawing(_WIDTH, -(-len(order) // _COLUMNS) * row, parts, "displacement of each image"),
+        "Local alignment",
+        f"The ground is not quite a plane, so that each image's content is moved a little; {local.reason}{spread}.",
+        table((name, f"up to {field.largest:.1f} pixels") for name, field in farthest),
     )
 
 
-def _image(field: DisplacementField, name: str, x: float, y: float, side: float, largest: float) -> str:
-    """One image's arrows in a square of ``side`` with its top-left corner at x, y."""
-    width, height = field.image_size
-    scale = side / max(width, height)
-    spacing = max(width, height) / _ARROWS
-    u, v = (np.arange(0.5, max(1, round(n / spacing))) * n / max(1, round(n / spacing)) for n in (width, height))
-    places = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    moved = field(places)
-    tips = moved * (_LONGEST * spacing / largest)
-    frame = element("rect", x=x, y=y, width=width * scale, height=height * scale, fill="none", stroke=GREY)
-    arrows = []
-    for start, end, by in zip((x, y) + places * scale, (x, y) + (places + tips) * scale, moved, strict=True):
-        title = element("title", f"{np.linalg.norm(by):.2f} pixels")
-        arrows.append(line(start, end, title, stroke=BLUE, stroke_width=1.5))
-        arrows.append(element("circle", cx=float(start[0]), cy=float(start[1]), r=1.2, fill=BLUE))
-    return joined(frame, arrows, label(x, y + height * scale + 13.0, f"{name}: up to {field.largest:.1f} pixels"))
+def trajectory(registration: Registration) -> str:
+    """The path of the camera over the plane, where the model has metric poses; how far it looked, if it only turned."""
+    alignment = registration.alignment
+    if alignment.on_sphere:
+        used = np.flatnonzero(alignment.used).tolist()
+        view = seen_directions([alignment.cameras[k] for k in used], alignment.homographies[used])
+        across, down = np.degrees(view.extent)
+        focal = registration.camera.focal
+        return section(
+            "Directions",
+            f"The camera turned on the spot. Its {len(used)} images show {across:.0f} x {down:.0f} degrees around it."
+            + ("" if focal is None else f" The focal length is {focal:.1f} pixels."),
+        )
+    if alignment.poses is None:
+        return section("Trajectory", "The general model has a homography for each image, but no poses.")
+    trail = Trajectory.from_alignment(alignment)
+    length = float(np.linalg.norm(np.diff(trail.position, axis=0), axis=1).sum())
+    return section(
+        "Trajectory",
+        f"{len(trail)} positions in the order of the images, {length:.2f} heights of the first one long; the green "
+        "dot is the first, arrows point to the upper side of the image.",
+        Markup(path_as_svg(trail)),
+    )

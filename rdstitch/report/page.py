@@ -6,9 +6,8 @@ from pathlib import Path
 
 from rdstitch.outputs import Outputs
 from rdstitch.registration import Registration
-from rdstitch.report.camera_path import path_over_plane
-from rdstitch.report.lens import grid, lens_curve, votes
-from rdstitch.report.output import local_alignment, mosaic, place
+from rdstitch.report.lens import lens_curve, votes
+from rdstitch.report.output import local_alignment, mosaic, place, trajectory
 from rdstitch.report.pairs import match_graph, matched, residual_map
 from rdstitch.report.stage import stage
 from rdstitch.report.summary import notices, run, summary, timings
@@ -26,7 +25,6 @@ h3 { font-size: 1em; }
 p, li, td { overflow-wrap: anywhere; } table { border-collapse: collapse; }
 td, th { padding: 0.2em 1em 0.2em 0; vertical-align: top; text-align: left; } td:first-child { white-space: nowrap; }
 img, svg { display: block; width: 100%; height: auto; }
-.beside { display: flex; flex-wrap: wrap; gap: 1em; } .beside > * { flex: 1 1 20em; }
 .thumbnails { display: flex; flex-wrap: wrap; gap: 1em; } figure { margin: 0; flex: 0 1 12em; }
 figcaption { font-size: 0.9em; overflow-wrap: anywhere; }
 @media (max-width: 600px) {
@@ -90,12 +88,11 @@ def report_page(
         "" if stitched is None else place(stitched),
         match_graph(registration),
         votes(registration),
-        grid(registration),
         lens_curve(registration),
         matched(registration),
         residual_map(registration),
         "" if stitched is None or stitched.plan is not None else local_alignment(stitched),
-        path_over_plane(registration),
+        trajectory(registration),
         timings(stages),
         run(None if stitched is None else stitched.options, command),
     ]

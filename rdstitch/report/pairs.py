@@ -26,7 +26,7 @@ from rdstitch.report.svg import (
 )
 
 _GRAPH_SIDE, _GRAPH_MARGIN = 900.0, 20.0
-_LINE_HEIGHT = 11.0  # height of a name
+_MAX_NAMES = 12  # images whose names are written
 _IMAGE_WIDTH, _IMAGE_GAP = 440.0, 10.0
 _MAX_LINES = 150
 _FADED = 0.6  # opacity of the images, so that lines can be seen on them
@@ -54,17 +54,12 @@ def match_graph(registration: Registration) -> str:
         start, end = ((centers[k] + shift) * scale for k in (fit.image1, fit.image2))
         thickness = float(np.clip(np.log10(fit.inliers + 1.0), 0.5, 4.0))
         parts.append(line(start, end, title, stroke=_mixed(share), stroke_width=thickness))
-    named: list[tuple[float, float, float]] = []  # left, baseline, width
     for index, center in centers.items():
-        x, y = (center + shift) * scale
-        fill = RED if index == alignment.reference else GREY
-        parts.append(element("circle", cx=float(x), cy=float(y), r=4, fill=fill))
-        name = registration.sources[index].name
-        # A name that would lie on another one is left out; the image's own line has it as its title.
-        box = (float(x) + 6, float(y) - 6, 5.6 * len(name))
-        if not any(_overlap(box, other) for other in named):
-            named.append(box)
-            parts.append(label(box[0], box[1], name, font_size=10))
+        x, y = ((center + shift) * scale).tolist()
+        name, fill = registration.sources[index].name, RED if index == alignment.reference else GREY
+        parts.append(element("circle", element("title", name), cx=x, cy=y, r=4, fill=fill))
+        if len(used) <= _MAX_NAMES:
+            parts.append(label(x + 6, y - 6, name, font_size=10))
     return section(
         "Match graph",
         f"{counted(len(links), 'pair')} over the outlines of {counted(len(used), 'image')}. Thicker lines have more "
@@ -72,12 +67,6 @@ def match_graph(registration: Registration) -> str:
         "fit well into the whole, red ones badly. The red dot is the reference image.",
         drawing(width, height, parts, "match graph"),
     )
-
-
-def _overlap(first: tuple[float, float, float], second: tuple[float, float, float]) -> bool:
-    """Whether two names (left, baseline, width) lie on one another."""
-    apart = first[0] > second[0] + second[2] or second[0] > first[0] + first[2]
-    return not apart and abs(first[1] - second[1]) <= _LINE_HEIGHT
 
 
 def _mixed(share: float) -> str:

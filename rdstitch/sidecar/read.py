@@ -24,75 +24,36 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SavedImage:
-    """One image of a saved registration.
+    """One image of a saved registration."""
 
-    Attributes
-    ----------
-    name, path : str
-        As they were then.
-    camera : Camera or None
-        With everything that was estimated; None where the image could not be read.
-    to_plane : ndarray of shape (3, 3), or None
-        From undistorted coordinates, in half diagonals from the distortion centre, to the plane; None where the image
-        was left out.
-    reason : str
-        Why it was left out; empty where it was used.
-    displacement : DisplacementField or None
-        What local alignment found; None where the image was not aligned locally.
-    """
-
-    name: str
+    name: str  # name, path: as they were then
     path: str
-    camera: Camera | None
+    camera: Camera | None  # with everything that was estimated; None where the image could not be read
+    # (3, 3): from undistorted coordinates, in half diagonals from the distortion centre, to the plane; None where the
+    # image was left out
     to_plane: FloatArray | None
-    reason: str
+    reason: str  # why it was left out; empty where it was used
+    # what local alignment found; None where the image was not aligned locally
     displacement: DisplacementField | None = None
 
 
 @dataclass(frozen=True)
 class SavedRegistration:
-    """A registration as its sidecar tells it.
+    """A registration as its sidecar tells it."""
 
-    Attributes
-    ----------
-    path : Path
-        Of the sidecar.
-    images : tuple of SavedImage
-    reference : int
-        The image whose resolution the output has.
-    distortion : float
-        λ in the half-diagonal frame.
-    turned : bool
-        Whether the camera turned on the spot, so that ``to_plane`` leads to directions.
-    composite : CompositeOptions
-        What the image was composited with.
-    orientation : ndarray of shape (3, 3), or None
-        What the registered images were turned by to be at ``to_plane``.
-    place : Georeference or None
-        Of the plane, where the output was georeferenced.
-    content : dict
-        The whole sidecar.
-    """
-
-    path: Path
+    path: Path  # of the sidecar
     images: tuple[SavedImage, ...]
-    reference: int
-    distortion: float
-    turned: bool
-    composite: CompositeOptions
-    orientation: FloatArray | None
-    place: Georeference | None
-    content: dict[str, Any]
+    reference: int  # the image whose resolution the output has
+    distortion: float  # λ in the half-diagonal frame
+    turned: bool  # whether the camera turned on the spot, so that ``to_plane`` leads to directions
+    composite: CompositeOptions  # what the image was composited with
+    orientation: FloatArray | None  # (3, 3): what the registered images were turned by to be at ``to_plane``
+    place: Georeference | None  # of the plane, where the output was georeferenced
+    content: dict[str, Any]  # the whole sidecar
 
 
 def read_sidecar(path: str | Path) -> SavedRegistration:
-    """Read a sidecar; every field that is there is checked.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, is no sidecar, or a field is not what it should be; the text names both.
-    """
+    """Read a sidecar; every field that is there is checked."""
     # Imported late: no other command should wait for it.
     from rdstitch.records import convert, parse_json
     from rdstitch.sidecar.schema import SidecarRecord

@@ -37,76 +37,40 @@ _LENS_STD = 0.5
 
 @dataclass(frozen=True)
 class LinkedPoints:
-    """Matches of all pairs, block by block.
+    """Matches of all pairs, block by block."""
 
-    Attributes
-    ----------
-    pair : ndarray of shape (M,), int
-        Pair of each block.
-    tiles : ndarray of shape (P, 2), int
-        Tiles of each pair.
-    points1, points2 : ndarray of shape (M, 2)
-        Measured pixels of the two tiles.
-    information : ndarray of shape (M, 2, 2)
-    """
-
-    pair: IntArray
-    tiles: IntArray
-    points1: FloatArray
+    pair: IntArray  # (M,), int: pair of each block
+    tiles: IntArray  # (P, 2), int: tiles of each pair
+    points1: FloatArray  # points1, points2: (M, 2): measured pixels of the two tiles
     points2: FloatArray
-    information: FloatArray
+    information: FloatArray  # (M, 2, 2)
 
 
 @dataclass(frozen=True)
 class StageModel:
-    """Errors of the stage.
+    """Errors of the stage."""
 
-    Attributes
-    ----------
-    matrix : ndarray of shape (2, 2)
-        From pixels of the nominal places to pixels of the camera.
-    rows, columns : ndarray of shape (R, 2) and (C, 2)
-        What each line is off as a whole, pixels.
-    row_std, column_std, std : float
-        Standard deviations of those and of what is left of each tile.
-    """
-
-    matrix: FloatArray
-    rows: FloatArray
+    matrix: FloatArray  # (2, 2): from pixels of the nominal places to pixels of the camera
+    rows: FloatArray  # rows, columns: (R, 2) and (C, 2): what each line is off as a whole, pixels
     columns: FloatArray
-    row_std: float
+    row_std: float  # row_std, column_std, std: standard deviations of those and of what is left of each tile
     column_std: float
     std: float
 
 
 @dataclass(frozen=True)
 class Adjustment:
-    """All places.
+    """All places."""
 
-    Attributes
-    ----------
-    places : ndarray of shape (N, 2)
-        Of the undistorted tiles, pixels.
-    distortion, distortion_std : float
-        λ in the half-diagonal frame, and its standard deviation; inf where nothing shows it, 0 where it was given.
-    weights : ndarray of shape (P,)
-        Of each pair, 0 for one that contradicts the others, 1 for one that agrees.
-    residuals : ndarray of shape (M, 2)
-        Undistorted pixels.
-    squared : ndarray of shape (M,)
-        Squared errors of the blocks, in variances by their information.
-    noise : float
-        How much larger they are in the median than by that.
-    stage : StageModel
-    """
-
-    places: FloatArray
+    places: FloatArray  # (N, 2): of the undistorted tiles, pixels
+    # distortion, distortion_std: λ in the half-diagonal frame, and its standard deviation; inf where nothing shows it,
+    # 0 where it was given
     distortion: float
     distortion_std: float
-    weights: FloatArray
-    residuals: FloatArray
-    squared: FloatArray
-    noise: float
+    weights: FloatArray  # (P,): of each pair, 0 for one that contradicts the others, 1 for one that agrees
+    residuals: FloatArray  # (M, 2): undistorted pixels
+    squared: FloatArray  # (M,): squared errors of the blocks, in variances by their information
+    noise: float  # how much larger they are in the median than by that
     stage: StageModel
 
     def cost(self, noise: float) -> float:
@@ -118,17 +82,7 @@ class Adjustment:
 def adjust(
     grid: TileGrid, links: LinkedPoints, stage_std: float, distortion: float = 0.0, *, free_lens: bool = False
 ) -> Adjustment:
-    """Adjust all places.
-
-    Parameters
-    ----------
-    stage_std : float
-        How far a tile may be from where it should be, to begin with, pixels.
-    distortion : float
-        λ to begin with, or to keep.
-    free_lens : bool
-        Estimate λ.
-    """
+    """Adjust all places; to begin with a tile may be ``stage_std`` pixels off."""
     problem = _Problem(grid, links, free_lens)
     state = problem.start(distortion)
     variances = np.array([stage_std**2] * 3)

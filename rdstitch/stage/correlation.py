@@ -31,14 +31,10 @@ _BETTER = 3.0
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Correlation of each block over all displacements within a radius.
+    """Correlation of each block over all displacements within a radius."""
 
-    Attributes
-    ----------
-    values : ndarray of shape (K, 2 P + 1, 2 P + 1), float16
-        Rows are displacements in y, from -P on; columns in x. Noise has the standard deviation 1 in their sum.
-    """
-
+    # (K, 2 P + 1, 2 P + 1), float16: rows are displacements in y, from -P on; columns in x. Noise has the standard
+    # deviation 1 in their sum
     values: NDArray[np.float16]
 
     @property

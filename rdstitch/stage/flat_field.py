@@ -37,23 +37,12 @@ _BINS, _LEAST_BINS, _LEAST_IN_BIN = 24, 6, 16
 
 @dataclass(frozen=True)
 class Illumination:
-    """The flat field that tiles show, or why they do not.
+    """The flat field that tiles show, or why they do not."""
 
-    Attributes
-    ----------
-    field : FlatField or None
-        None where the tiles do not show it better than by half of what it is.
-    error : float
-        Its root mean square error, by how far two halves of the tiles differ.
-    shading : float
-        Largest share of the light that is missing.
-    dark : ndarray of shape (C,)
-    """
-
-    field: FlatField | None
-    error: float
-    shading: float
-    dark: FloatArray
+    field: FlatField | None  # none where the tiles do not show it better than by half of what it is
+    error: float  # its root mean square error, by how far two halves of the tiles differ
+    shading: float  # largest share of the light that is missing
+    dark: FloatArray  # (C,)
 
 
 class _Statistics:
@@ -103,15 +92,7 @@ def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
 
 
 def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
-    """Estimate the flat field and the dark level of tiles.
-
-    Parameters
-    ----------
-    read : callable
-        Gives a tile (h, w) or (h, w, C).
-    count : int
-        Number of tiles.
-    """
+    """Estimate the flat field and the dark level of tiles."""
     first = read(0)
     shown = _Statistics(read(index) for index in range(count))
     channels = shown.ground.shape[3]

@@ -17,24 +17,12 @@ _MIN_OVERLAP = 0.3
 
 @dataclass(frozen=True)
 class TileGrid:
-    """Nominal places of tiles of one size.
+    """Nominal places of tiles of one size."""
 
-    Attributes
-    ----------
-    places : ndarray of shape (N, 2)
-        Of the first pixel of each tile, pixels; x to the right, y down.
-    size : (int, int)
-        Width and height of a tile, pixels.
-    pixel_size : float or None
-        Micrometres, where it is known.
-    source : str
-        Where the places come from, for reports.
-    """
-
-    places: FloatArray
-    size: tuple[int, int]
-    pixel_size: float | None = None
-    source: str = ""
+    places: FloatArray  # (N, 2): of the first pixel of each tile, pixels; x to the right, y down
+    size: tuple[int, int]  # width and height of a tile, pixels
+    pixel_size: float | None = None  # micrometres, where it is known
+    source: str = ""  # where the places come from, for reports
 
     def __post_init__(self) -> None:
         if self.places.ndim != 2 or self.places.shape[1] != 2 or not np.isfinite(self.places).all():
@@ -55,13 +43,7 @@ class TileGrid:
         return _lines(self.places[:, 0], _SAME_LINE * self.size[0])
 
     def neighbours(self, reach: float) -> NDArray[np.intp]:
-        """Pairs of tiles that overlap along a good part of a side, or come so near that they may, (M, 2).
-
-        Parameters
-        ----------
-        reach : float
-            How much nearer to one another tiles may be than they were told, pixels.
-        """
+        """Pairs of tiles that overlap along a good part of a side, or come so near that they may, (M, 2)."""
         size = np.array(self.size, dtype=np.float64)
         order = np.argsort(self.places[:, 1], kind="stable")
         y = self.places[order, 1]

@@ -21,21 +21,12 @@ def _count(length: int, side: int) -> int:
 
 @dataclass(frozen=True)
 class Overlap:
-    """Two tiles and what they should have in common.
-
-    Attributes
-    ----------
-    first, second : int
-    offset : ndarray of shape (2,), int
-        Expected place of the second in the first, pixels.
-    blocks : ndarray of shape (K, 4), int
-        Boxes x0, y0, x1, y1 in the first tile, end exclusive.
-    """
+    """Two tiles and what they should have in common."""
 
     first: int
     second: int
-    offset: IntArray
-    blocks: IntArray
+    offset: IntArray  # (2,), int: expected place of the second in the first, pixels
+    blocks: IntArray  # (K, 4), int: boxes x0, y0, x1, y1 in the first tile, end exclusive
 
     @classmethod
     def expected(cls, first: int, second: int, offset: FloatArray, size: tuple[int, int], least: int) -> "Overlap":

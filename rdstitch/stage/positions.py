@@ -28,38 +28,16 @@ _HOW = (
 
 @dataclass(frozen=True)
 class StagePosition:
-    """The place of one tile.
-
-    Attributes
-    ----------
-    x, y : float
-    unit : float or None
-        Micrometres that these count; None for pixels.
-    pixel_size : float or None
-        Micrometres, where the file says it.
-    """
+    """The place of one tile."""
 
     x: float
     y: float
-    unit: float | None
-    pixel_size: float | None = None
+    unit: float | None  # micrometres that these count; None for pixels
+    pixel_size: float | None = None  # micrometres, where the file says it
 
 
 def grid_from_names(names: Sequence[str], pattern: str, overlap: float, size: tuple[int, int]) -> TileGrid:
-    """Places by rows and columns in file names.
-
-    Parameters
-    ----------
-    pattern : str
-        Part of a name in which ``{row}`` and ``{col}`` stand for numbers; ``*`` for anything.
-    overlap : float
-        Share of a tile that its neighbours show too.
-
-    Raises
-    ------
-    ArgumentError
-        When the pattern has no row or column, or a name does not fit.
-    """
+    """Places by rows and columns in file names."""
     if pattern.count("{row}") != 1 or pattern.count("{col}") != 1:
         raise ArgumentError(f"the grid '{pattern}' must have {{row}} and {{col}} once each, as in 'r{{row}}c{{col}}'")
     if not 0.0 <= overlap < 1.0:
@@ -82,13 +60,7 @@ def grid_from_names(names: Sequence[str], pattern: str, overlap: float, size: tu
 def grid_from_table(
     names: Sequence[str], file: str | Path, size: tuple[int, int], pixel_size: float | None
 ) -> TileGrid:
-    """Places by a CSV file with the columns ``name``, ``x`` and ``y``, pixels, or ``x_um`` and ``y_um``.
-
-    Raises
-    ------
-    InputError
-        When the file is no such table, or has no line for a tile.
-    """
+    """Places by a CSV file with the columns ``name``, ``x`` and ``y``, pixels, or ``x_um`` and ``y_um``."""
     lines = read_text(Path(file)).splitlines()
     header = [cell.strip().lower() for cell in next(csv.reader(lines[:1]), [])]
     name = next((column for column in _NAMES if column in header), None)
@@ -114,13 +86,7 @@ def grid_from_table(
 
 
 def grid_from_files(files: Sequence[Path], size: tuple[int, int], pixel_size: float | None) -> TileGrid:
-    """Places by what the files say: OME-XML, Micro-Manager's tags, or its ``metadata.txt`` beside them.
-
-    Raises
-    ------
-    InputError
-        When a file says nothing.
-    """
+    """Places by what the files say: OME-XML, Micro-Manager's tags, or its ``metadata.txt`` beside them."""
     beside: dict[Path, dict[str, StagePosition]] = {}
     positions = []
     for file in files:

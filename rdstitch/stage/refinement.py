@@ -32,19 +32,12 @@ Transfer = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class BlockMatches:
-    """Matches of the blocks of overlaps.
+    """Matches of the blocks of overlaps."""
 
-    Attributes
-    ----------
-    points1, points2 : ndarray of shape (M, 2)
-        Measured places of the same content in the first and the second tile, pixels.
-    information : ndarray of shape (M, 2, 2)
-        Inverse covariance of their difference, 1/pixels².
-    """
-
+    # points1, points2: (M, 2): measured places of the same content in the first and the second tile, pixels
     points1: FloatArray
     points2: FloatArray
-    information: FloatArray
+    information: FloatArray  # (M, 2, 2): inverse covariance of their difference, 1/pixels²
 
     def __len__(self) -> int:
         """Number of blocks."""

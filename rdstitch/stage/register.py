@@ -56,28 +56,15 @@ _LEAST_BLOCK = 0.02
 
 @dataclass(frozen=True)
 class TileRegistration:
-    """The places of all tiles, and the matches that show them.
-
-    Attributes
-    ----------
-    grid : TileGrid
-    adjustment : Adjustment
-    links : LinkedPoints
-        Blocks of all pairs that show something.
-    compared : ndarray of shape (Q, 2), int
-        All pairs that were compared.
-    linked : ndarray of shape (N,), bool
-        Tiles that links hold; the others have the place that the model of the stage gives them.
-    groups : tuple of tuple of int
-        Tiles that links hold together, the largest group first.
-    """
+    """The places of all tiles, and the matches that show them."""
 
     grid: TileGrid
     adjustment: Adjustment
-    links: LinkedPoints
-    compared: IntArray
+    links: LinkedPoints  # blocks of all pairs that show something
+    compared: IntArray  # (Q, 2), int: all pairs that were compared
+    # (N,), bool: tiles that links hold; the others have the place that the model of the stage gives them
     linked: BoolArray
-    groups: tuple[tuple[int, ...], ...]
+    groups: tuple[tuple[int, ...], ...]  # tiles that links hold together, the largest group first
 
 
 def register_tiles(
@@ -88,17 +75,7 @@ def register_tiles(
     distortion: float | None = None,
     progress: Progress = silent,
 ) -> TileRegistration:
-    """Find the places of all tiles.
-
-    Parameters
-    ----------
-    read : callable
-        Gives each tile (h, w); called twice for each, in their order.
-    search : float, optional
-        How far two neighbours may be from where they should be to each other, pixels.
-    distortion : float, optional
-        λ where it is known.
-    """
+    """Find the places of all tiles; ``search`` is how far neighbours may be off, pixels."""
     side = max(grid.size)
     search = _SEARCH * side if search is None else search
     pairs = grid.neighbours(search)
@@ -116,16 +93,17 @@ def register_tiles(
     for number, (one, two) in enumerate(_in_pairs(lambda k: _coarse(read(k), factor), pairs)):
         surfaces.append(correlate(one, two, overlaps[number], radius + spare))
         progress("correlating", number + 1, len(pairs))
-    lens = _Lens(grid, factor)
-    known = _best_lens(surfaces, overlaps, lens, radius) if distortion is None else distortion
-    peaks = [_peaks(s, o, lens.shifts(o, known), radius) for s, o in zip(surfaces, overlaps, strict=True)]
+    coarse = Camera((-(-grid.size[0] // factor), -(-grid.size[1] // factor)))
+    known = _best_lens(surfaces, overlaps, coarse, radius) if distortion is None else distortion
+    lens, coarse = Camera(grid.size, known), coarse.with_coefficients(known)
+    peaks = [_peaks(s, o, _shifts(o, coarse), radius) for s, o in zip(surfaces, overlaps, strict=True)]
     rough = _adjusted(grid, pairs, peaks, factor, search, known)
     # Again, nearer to where the stage as it has shown itself puts them.
     near = rough.places
     std = max(rough.stage.std, factor / 2.0)
     window = max(2, min(radius, math.ceil(_LARGEST_REACH * math.sqrt(2.0) * std / factor)))
     peaks = [
-        _peaks(s, o, lens.shifts(o, known), radius, ((near[p[1]] - near[p[0]]) / factor - o.offset, window)) + others
+        _peaks(s, o, _shifts(o, coarse), radius, ((near[p[1]] - near[p[0]]) / factor - o.offset, window)) + others
         for s, o, p, others in zip(surfaces, overlaps, pairs, peaks, strict=True)
     ]
     peaks = [list({tuple(peak): peak for peak in of_pair}.values()) for of_pair in peaks]
@@ -133,16 +111,15 @@ def register_tiles(
     if not shown:
         return _result(grid, pairs, [], rough)
     matches: dict[int, BlockMatches] = {}
-    exact = _Lens(grid, 1)
     for number, (one, two) in enumerate(_in_pairs(read, pairs[shown])):
         pair, overlap = pairs[shown[number]], overlaps[shown[number]]
         # Whitened spectra weigh all frequencies alike: of a repeated pattern a wrong period may be the highest peak.
         small = _coarse(one, factor), _coarse(two, factor)
-        offset = factor * best_place(*small, overlap, lens.shifts(overlap, known), peaks[shown[number]])
+        offset = factor * best_place(*small, overlap, _shifts(overlap, coarse), peaks[shown[number]])
         overlap = expected(pair, _moved(grid.places, pair, offset), 1)
         for cells in (overlap.cells(grid.size), overlap.whole):
             cut = replace(overlap, blocks=cells)
-            refined = refine(one, two, cells, exact.transfer(cut, offset, known), factor + 1.5)
+            refined = refine(one, two, cells, _transfer(cut, offset, lens), factor + 1.5)
             if len(refined):
                 matches[shown[number]] = refined
                 break
@@ -199,44 +176,31 @@ def _in_pairs(read: Reader, pairs: IntArray) -> Iterator[tuple[NDArray[Any], NDA
                 del held[tile]
 
 
-class _Lens:
-    """Displacements of blocks by a lens."""
-
-    def __init__(self, grid: TileGrid, factor: int) -> None:
-        self.size = grid.size
-        size = np.array(grid.size) / factor
-        self.center, self.scale = (size - 1.0) / 2.0, math.hypot(*size) / 2.0
-
-    def shifts(self, overlap: Overlap, distortion: float) -> FloatArray:
-        """Displacement of each block of an overlap (K, 2) by λ, mean 0."""
-        if distortion == 0.0:
-            return np.zeros((len(overlap.blocks), 2))
-        first = overlap.centers
-        bent = [self._bend(points, distortion) for points in (first, first - overlap.offset)]
-        shifts = bent[1] - bent[0]
-        return np.asarray(shifts - shifts.mean(axis=0))
-
-    def transfer(self, overlap: Overlap, offset: FloatArray, distortion: float) -> Transfer:
-        """Map points of the first tile to the second, whose blocks are off by an offset in the mean."""
-        if distortion == 0.0:
-            return lambda points: points - offset
-        camera = Camera(self.size, distortion)
-        middle = overlap.centers
-        between = (camera.undistort(middle) - camera.undistort(middle - offset)).mean(axis=0)
-        return lambda points: camera.distort(camera.undistort(points) - between)
-
-    def _bend(self, points: FloatArray, distortion: float) -> FloatArray:
-        away = (points - self.center) / self.scale
-        r2 = (away**2).sum(axis=1, keepdims=True)
-        return np.asarray(self.scale * away * (1.0 / (1.0 + distortion * r2) - 1.0))
+def _shifts(overlap: Overlap, camera: Camera) -> FloatArray:
+    """Displacement of each block of an overlap (K, 2) by the lens, mean 0."""
+    first = overlap.centers
+    bent = [camera.undistort(points) - points for points in (first, first - overlap.offset)]
+    shifts = bent[1] - bent[0]
+    return np.asarray(shifts - shifts.mean(axis=0))
 
 
-def _best_lens(surfaces: Sequence[Surfaces], overlaps: Sequence[Overlap], lens: _Lens, radius: int) -> float:
+def _transfer(overlap: Overlap, offset: FloatArray, camera: Camera) -> Transfer:
+    """Map points of the first tile to the second, whose blocks are off by an offset in the mean."""
+    if camera.distortion == 0.0:
+        return lambda points: points - offset
+    middle = overlap.centers
+    between = (camera.undistort(middle) - camera.undistort(middle - offset)).mean(axis=0)
+    return lambda points: camera.distort(camera.undistort(points) - between)
+
+
+def _best_lens(surfaces: Sequence[Surfaces], overlaps: Sequence[Overlap], camera: Camera, radius: int) -> float:
     """λ for which the blocks of all pairs agree best."""
     heights = np.zeros(len(_LENSES))
-    usual = len(_LENSES) // 2
+    usual, lenses = len(_LENSES) // 2, [camera.with_coefficients(value) for value in _LENSES]
     for surface, overlap in zip(surfaces, overlaps, strict=True):
-        tops = np.array([surface.total(lens.shifts(overlap, value), radius).max() for value in _LENSES])
+        tops = np.array(
+            [surface.total(_shifts(overlap, camera.with_coefficients(value)), radius).max() for value in _LENSES]
+        )
         if tops.max() > _threshold(surface.total(np.zeros((len(overlap.blocks), 2)), radius), radius):
             heights += tops
     return 0.0 if heights.max() <= heights[usual] else float(_LENSES[int(heights.argmax())])

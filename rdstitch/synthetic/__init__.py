@@ -1,15 +1,5 @@
-"""Ground truth: problem instances, matches and rendered image sequences, for tests, examples and benchmarks."""
+"""Ground truth: rendered image sequences, for tests, examples and benchmarks."""
 
-from rdstitch.synthetic.correspondences import SyntheticMatches, correspondences
-from rdstitch.synthetic.instances import (
-    HALF_SIZE,
-    Instances,
-    PlanarInstances,
-    RotationInstances,
-    general_instances,
-    planar_instances,
-    rotation_instances,
-)
 from rdstitch.synthetic.layouts import (
     drive_poses,
     grid_poses,
@@ -29,7 +19,6 @@ from rdstitch.synthetic.rendering import Photometry, Sequence, sequence_over
 from rdstitch.synthetic.textures import (
     EndlessTexture,
     ImageTexture,
-    LinedTexture,
     Texture,
     blank,
     gradient,
@@ -38,32 +27,24 @@ from rdstitch.synthetic.textures import (
 )
 
 __all__ = [
-    "HALF_SIZE",
     "RELIEFS",
     "BrownLens",
     "EndlessTexture",
     "FisheyeLens",
     "ImageTexture",
-    "Instances",
     "Lens",
-    "LinedTexture",
     "Photometry",
-    "PlanarInstances",
     "Poses",
     "Relief",
-    "RotationInstances",
     "Sequence",
-    "SyntheticMatches",
     "Texture",
     "TurningSequence",
     "best_division_model",
     "blank",
     "boxes",
     "camera_rotations",
-    "correspondences",
     "drive_poses",
     "fit_to_plane",
-    "general_instances",
     "gradient",
     "grid_poses",
     "ground",
@@ -73,10 +54,8 @@ __all__ = [
     "pair_poses",
     "panorama_rotations",
     "parking_poses",
-    "planar_instances",
     "repeated",
     "ridges",
-    "rotation_instances",
     "rotation_poses",
     "sequence_over",
     "survey_poses",

@@ -79,8 +79,6 @@ def grid_poses(
         Each image is turned by a random angle within ± this, radians.
     shift : float
         Each image is moved by a random share, within ± this, of the step to its neighbours.
-    seed : int
-        Of yaw and shift.
     """
     step = (1.0 - overlap) * _extent(lens, tilt, texels_per_pixel)
     j, i = np.meshgrid(np.arange(columns), np.arange(rows))
@@ -109,8 +107,6 @@ def parking_poses(lens: Lens, count: int, angle: float = 0.7, **options: Unpack[
     ----------
     angle : float
         How far it is turned in the middle of the S, radians.
-    options
-        As for :func:`drive_poses`.
     """
     bend = _phases(count - 1, (0.0, 0.4), (1.0, 0.25), (-1.0, 0.25), (0.0, 0.1))
     forward = _phases(count - 1, (1.0, 0.4), (-1.0, 0.5), (1.0, 0.1))
@@ -181,8 +177,6 @@ def survey_poses(
         Each height is changed by a random share within ± this.
     attitude_jitter, yaw_jitter : float
         ψ, θ and the yaw are changed by random angles within ± this, radians.
-    seed : int
-        Of the jitter.
     """
     extent = _extent(lens, tilt, texels_per_pixel)
     side, ahead = (1.0 - side_overlap) * extent[0], (1.0 - forward_overlap) * extent[1]

@@ -158,13 +158,7 @@ class BrownLens(_FixedFocalLens):
 
 
 def focal_length(lens: Lens) -> float:
-    """Focal length of a lens, pixels.
-
-    Raises
-    ------
-    ArgumentError
-        When it is not known: nothing can be rendered without it.
-    """
+    """Focal length of a lens, pixels."""
     if lens.focal is None:
         raise ArgumentError("a camera needs a focal length before anything can be rendered with it")
     return lens.focal

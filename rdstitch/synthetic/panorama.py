@@ -146,12 +146,8 @@ def turning_sequence(
         Of the texture and the noise.
     texels_per_pixel : float
         Texels at the horizon for each pixel at the image's centre.
-    channels : int
-        1 for grey, 3 for RGB.
     position : array_like of shape (N, 3), optional
         Of each camera's centre, in radii of the sphere; all at its centre if not given.
-    near : array_like of shape (K, 4)
-        See :class:`TurningSequence`.
     """
     circumference = round(2 * np.pi * focal_length(lens) * texels_per_pixel)
     texture = ground((circumference, circumference // 2), seed=seed, channels=channels)

@@ -72,13 +72,7 @@ class Poses:
         return rotation_from_tilt(self.tilt) @ to_camera
 
     def motion(self, first: int, second: int) -> PlanarMotion:
-        """Planar motion between two images of the same tilt.
-
-        Raises
-        ------
-        ArgumentError
-            When the tilts differ.
-        """
+        """Planar motion between two images of the same tilt."""
         if not np.array_equal(self.tilt[first], self.tilt[second]):
             raise ArgumentError(f"images {first} and {second} have different tilts: that is no planar motion")
         c, s = np.cos(self.yaw[first]), np.sin(self.yaw[first])
@@ -96,8 +90,6 @@ class Poses:
 
         Parameters
         ----------
-        seed : int
-            Equal seeds give equal jitter.
         position : float
             ± texels on either coordinate.
         height : float
@@ -121,13 +113,7 @@ class Poses:
 
 
 def plane_outline(lens: Lens, from_plane: FloatArray, points_per_side: int = 32) -> FloatArray:
-    """Outer border of an image on the plane, texels, shape (4 points_per_side, 2); NaN beyond horizon and lens.
-
-    Parameters
-    ----------
-    from_plane : ndarray of shape (..., 3, 3)
-        See :meth:`Poses.from_plane`; leading axes are kept.
-    """
+    """Outer border of an image on the plane, texels, shape (4 points_per_side, 2); NaN beyond horizon and lens."""
     return texels_of_pixels(lens, from_plane, lens.outline(points_per_side))
 
 
@@ -154,11 +140,6 @@ def fit_to_plane(lens: Lens, poses: Poses, margin: int = 16) -> tuple[Poses, tup
     poses : Poses
     size : (int, int)
         Width and height in texels of the plane that holds all images with the margin on every side.
-
-    Raises
-    ------
-    ArgumentError
-        When an image sees the horizon.
     """
     outlines = plane_outline(lens, poses.from_plane())
     if np.isnan(outlines).any():

@@ -67,11 +67,6 @@ class Relief:
             Of the camera above the plane, texels.
         foot : ndarray of shape (..., 2)
             Where the rays would meet the plane; NaN for rays that do not.
-
-        Raises
-        ------
-        ArgumentError
-            When the ground reaches up to the camera.
         """
         top, bottom = float(self.height.max()), float(self.height.min())
         if top >= height:
@@ -112,10 +107,6 @@ def hills(size: tuple[int, int], seed: int, *, height: float, width: int = 200) 
 
     Parameters
     ----------
-    size : (int, int)
-        Of the texture, texels.
-    seed : int
-        Equal seeds give equal ground.
     height : float
         Of the highest point above the lowest, which is on the plane, texels.
     width : int
@@ -138,8 +129,6 @@ def boxes(size: tuple[int, int], seed: int, *, height: float, width: int = 60, c
 
     Parameters
     ----------
-    size, seed, height
-        As for :func:`hills`.
     width : int
         Of the widest box, texels; the narrowest is a third of that.
     count : int, optional
@@ -159,8 +148,6 @@ def ridges(size: tuple[int, int], seed: int, *, height: float, width: int = 400)
 
     Parameters
     ----------
-    size, seed, height
-        As for :func:`hills`.
     width : int
         From ridge to ridge, texels.
     """

@@ -160,15 +160,8 @@ class Sequence:
 
         Parameters
         ----------
-        folder : path
-            Must exist.
         name : str
             Format of the file names, with the suffix of the file type.
-
-        Raises
-        ------
-        OutputError
-            When an image cannot be written.
         """
         paths = []
         for index in range(len(self)):
@@ -283,24 +276,17 @@ def sequence_over(
     seed: int = 0,
     margin: int = 16,
 ) -> Sequence:
-    """Images of a plane that is made as large as they need it.
+    """Images of a plane that is made as large as they need it; the poses may lie anywhere and are moved.
+
+    ``plane`` makes the plane for a given size, such as ``lambda size: ground(size, seed=1)``, or is a texture, on which
+    the poses are centred.
 
     Parameters
     ----------
-    plane : Texture or callable
-        What makes the plane for a given size, such as ``lambda size: ground(size, seed=1)``; or a texture, on which
-        the poses are centred.
-    lens, poses, photometry, seed
-        As in :class:`Sequence`; the poses may lie anywhere and are moved.
     relief : Relief or callable, optional
         Heights, or what makes them for the size of the plane, such as ``lambda size: hills(size, 1, height=40.0)``.
     margin : int
         Texels that are left around what the images show.
-
-    Raises
-    ------
-    ArgumentError
-        When an image sees the horizon, or when a given texture is too small.
     """
     moved, size = fit_to_plane(lens, poses, margin)
     settings = Photometry() if photometry is None else photometry

@@ -17,41 +17,21 @@ _SAMPLES = 5  # points of an image's outline, a side, by which two planes are br
 
 @dataclass(frozen=True)
 class CameraPose:
-    """The place and heading of the camera.
+    """The place and heading of the camera."""
 
-    Attributes
-    ----------
-    x, y : float
-        In units of the first keyframe's height, as the first keyframe sees them.
-    yaw : float
-        φ, radians.
-    height : float
-        In the same unit.
-    """
-
-    x: float
+    x: float  # x, y: in units of the first keyframe's height, as the first keyframe sees them
     y: float
-    yaw: float
-    height: float
+    yaw: float  # φ, radians
+    height: float  # in the same unit
 
 
 @dataclass(frozen=True)
 class Placement:
-    """An image on the plane.
+    """An image on the plane."""
 
-    Attributes
-    ----------
-    camera : Camera
-        With the λ that the homography belongs to.
-    homography : ndarray of shape (3, 3)
-        From undistorted normalized coordinates of the image to the plane.
-    focal : float or None
-        Focal length in half diagonals; None where the model has none.
-    """
-
-    camera: Camera
-    homography: FloatArray
-    focal: float | None
+    camera: Camera  # with the λ that the homography belongs to
+    homography: FloatArray  # (3, 3): from undistorted normalized coordinates of the image to the plane
+    focal: float | None  # focal length in half diagonals; None where the model has none
 
     def to_plane(self, points: FloatArray) -> FloatArray:
         """Map points (N, 2) of the image, pixels, to the plane."""

@@ -15,13 +15,7 @@ _OUTLINE = 8  # points a side of a frame's outline
 
 
 class Preview:
-    """Frames painted over one another at the place that each had when it came.
-
-    Parameters
-    ----------
-    side : int
-        Pixels of the longer side at most; what is painted is halved whenever it would become longer.
-    """
+    """Frames painted over one another at the place that each had when it came."""
 
     def __init__(self, side: int = 2000) -> None:
         self._side = side
@@ -41,13 +35,7 @@ class Preview:
         return self._painted
 
     def paint(self, image: NDArray[Any], placement: Placement) -> None:
-        """Paint a frame; one that lies beyond the horizon, or far off, is left out.
-
-        Parameters
-        ----------
-        image : ndarray of shape (H, W) or (H, W, C)
-            RGB or grey, of the whole frame at any size.
-        """
+        """Paint a frame; one that lies beyond the horizon, or far off, is left out."""
         outline = placement.to_plane(placement.camera.outline(_OUTLINE))
         if not np.isfinite(outline).all():
             return

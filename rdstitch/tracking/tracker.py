@@ -12,12 +12,12 @@ from rdstitch.camera import Camera
 from rdstitch.errors import RegistrationError
 from rdstitch.features import Features, Matcher
 from rdstitch.features.prepared_image import PreparedImage
+from rdstitch.inputs.corner_flow import CornerFlow, fitted_affine
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
 from rdstitch.radial_homography import from_plane
 from rdstitch.robust import PairMatches, estimate_radial_homographies
-from rdstitch.tracking.flow import CornerFlow, fitted_affine
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 
 _WINDOW = 48  # keyframes that are kept
@@ -41,52 +41,28 @@ _FLOW_AGREEING = 0.5  # share of the corners that must agree on it
 
 @dataclass(frozen=True)
 class TrackingOptions:
-    """Choices and knowledge of a tracker.
+    """Choices and knowledge of a tracker."""
 
-    Attributes
-    ----------
-    pair : PairOptions
-        With λ, where it is known.
-    alignment : AlignmentOptions
-        Of the windows of keyframes; λ is that of the cameras where ``pair`` has one.
-    """
-
-    pair: PairOptions = field(default_factory=PairOptions)
+    pair: PairOptions = field(default_factory=PairOptions)  # with λ, where it is known
+    # of the windows of keyframes; λ is that of the cameras where ``pair`` has one
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """The result of one frame.
+    """The result of one frame."""
 
-    Attributes
-    ----------
-    number : int
-        Of the frame, in the order of arrival.
-    placement : Placement or None
-        Where it lies on the plane of its map; None where that is not known.
-    distortion, distortion_std : float
-        λ by all frames up to this one, half-diagonal frame; NaN and inf where it cannot be seen.
-    distortion_known : bool
-        Whether λ was given, or is so certain that it is kept from now on.
-    map_number : int
-        Maps have no common plane: a new one begins where the track was lost.
-    keyframe : bool
-    inliers : int
-        Matches with the last keyframes that agree.
-    revised : bool
-        Whether the frame had come before and only now found its place.
-    """
-
-    number: int
-    placement: Placement | None
+    number: int  # of the frame, in the order of arrival
+    placement: Placement | None  # where it lies on the plane of its map; None where that is not known
+    # distortion, distortion_std: λ by all frames up to this one, half-diagonal frame; NaN and inf where it cannot be
+    # seen
     distortion: float
     distortion_std: float
-    distortion_known: bool
-    map_number: int
+    distortion_known: bool  # whether λ was given, or is so certain that it is kept from now on
+    map_number: int  # maps have no common plane: a new one begins where the track was lost
     keyframe: bool
-    inliers: int
-    revised: bool = False
+    inliers: int  # matches with the last keyframes that agree
+    revised: bool = False  # whether the frame had come before and only now found its place
 
     @property
     def pose(self) -> CameraPose | None:

@@ -1,7 +1,5 @@
 """The page: OpenSeadragon's released file, our script, and the data, all in one HTML file beside the tiles."""
 
-import base64
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,61 +10,22 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from PIL import Image
 
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.io.deepzoom import OVERLAP, TILE
 from rdstitch.outputs import tiles_folder
 
-_COLOUR = (0, 229, 255)
 _CORNERS = 64  # of an outline, at most
-
-
-def seam_image(
-    seams: SeamMap, origin: tuple[int, int], size: tuple[int, int]
-) -> tuple[bytes, tuple[float, float, float, float]]:
-    """Seams as PNG, and the box (x, y, width, height) that it fills, pixels of the mosaic from its corner.
-
-    Parameters
-    ----------
-    origin, size : (int, int)
-        Where the mosaic begins in the canvas of the seams, and how large it is, pixels.
-    """
-    labels, factor = seams.labels, seams.factor
-    left, top = origin[0] // factor, origin[1] // factor
-    right, bottom = -(-(origin[0] + size[0]) // factor), -(-(origin[1] + size[1]) // factor)
-    labels = labels[top:bottom, left:right]
-    meets = np.zeros(labels.shape, dtype=bool)
-    for axis in (0, 1):
-        first = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
-        second = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
-        # Where an image ends at nothing there is no seam.
-        meets[first] |= (labels[first] != labels[second]) & (labels[first] >= 0) & (labels[second] >= 0)
-    samples = np.zeros((*labels.shape, 4), dtype=np.uint8)
-    samples[meets] = (*_COLOUR, 255)
-    stream = io.BytesIO()
-    Image.fromarray(samples).save(stream, "PNG", optimize=True)
-    x, y = float(left * factor - origin[0]), float(top * factor - origin[1])
-    return stream.getvalue(), (x, y, float(labels.shape[1] * factor), float(labels.shape[0] * factor))
 
 
 @dataclass(frozen=True)
 class ViewedImage:
-    """What the page says of an image.
-
-    Attributes
-    ----------
-    name : str
-    outlines : sequence of ndarray of shape (K, 2)
-        At each of its places; pixels of the mosaic, centre of the top-left one at (0, 0).
-    facts : tuple of (str, str)
-        What is shown when the image is clicked.
-    """
+    """What the page says of an image."""
 
     name: str
+    # (K, 2): at each of its places; pixels of the mosaic, centre of the top-left one at (0, 0)
     outlines: Sequence[FloatArray]
-    facts: tuple[tuple[str, str], ...]
+    facts: tuple[tuple[str, str], ...]  # what is shown when the image is clicked
 
 
 def viewer_path(output: str | Path) -> Path | None:
@@ -76,26 +35,9 @@ def viewer_path(output: str | Path) -> Path | None:
 
 
 def viewer_page(
-    output: str | Path,
-    size: tuple[int, int],
-    images: Sequence[ViewedImage],
-    seams: SeamMap | None = None,
-    origin: tuple[int, int] = (0, 0),
-    gsd: float | None = None,
+    output: str | Path, size: tuple[int, int], images: Sequence[ViewedImage], gsd: float | None = None
 ) -> str:
-    """The page of a ``.dzi`` file, as HTML.
-
-    Parameters
-    ----------
-    output : path
-        The ``.dzi`` file.
-    size : (int, int)
-        Width and height of the mosaic, pixels.
-    origin : (int, int)
-        Where the mosaic begins in the canvas of the seams, pixels.
-    gsd : float, optional
-        Metres that a pixel takes, for the scale bar; without it that counts pixels.
-    """
+    """The page of a ``.dzi`` file, as HTML; its scale bar is in pixels without ``gsd``, metres that a pixel takes."""
     output = Path(output)
     data: dict[str, Any] = {
         "size": size,
@@ -113,20 +55,12 @@ def viewer_page(
         },
         "images": [_described(image) for image in images],
     }
-    if seams is not None:
-        shown, box = seam_image(seams, origin, size)
-        data["seams"] = "data:image/png;base64," + base64.b64encode(shown).decode("ascii")
-        data["seamsBox"] = box
     title = escape(output.name)
     # Inside a script, "</" would end it.
     text = json.dumps(data, ensure_ascii=True).replace("</", "<\\/")
     boxes = "".join(
-        f'<label><input type="checkbox" id="show-{name}"{checked}> {name}</label>'
-        for name, checked in (("outlines", " checked"), ("names", " checked"), ("seams", ""))
-        if name != "seams" or seams is not None
+        f'<label><input type="checkbox" id="show-{name}" checked> {name}</label>' for name in ("outlines", "names")
     )
-    if seams is None:
-        boxes += '<input type="checkbox" id="show-seams" hidden>'
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'

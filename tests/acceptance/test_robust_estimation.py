@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import rdstitch
-from rdstitch.synthetic import SyntheticMatches, correspondences
+from tests.correspondences import SyntheticMatches, correspondences
 
 PAIRS = 20
 

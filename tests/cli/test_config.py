@@ -35,10 +35,11 @@ def _written(folder: Path, text: str) -> Path:
 
 def test_the_documented_example_is_read(tmp_path: Path) -> None:
     file = _written(tmp_path, _example())
-    common = {"features": "sift", "work_megapixels": 2.5, "camera": "camera.json", "overwrite": True, "workers": 2}
+    common: dict[str, Any] = {"features": "sift", "work_megapixels": "2.5", "camera": "camera.json"}
+    common |= {"overwrite": True, "workers": "2"}
     assert read_config(file, cli.commands, "calibrate") == common
     # The parameter of --format is called otherwise.
-    assert read_config(file, cli.commands, "trajectory") == {**common, "layout": "tum", "height": 0.42}
+    assert read_config(file, cli.commands, "trajectory") == {**common, "layout": "tum", "height": "0.42"}
     assert read_config(file, cli.commands, "undistort") == {"camera": "camera.json", "overwrite": True}
 
 
@@ -85,8 +86,9 @@ def _plausible(option: click.Option) -> Any:
 def test_every_option_can_be_in_the_file(name: str, tmp_path: Path) -> None:
     options = [p for p in cli.commands[name].params if isinstance(p, click.Option) and p.expose_value]
     values = {p.name: [_plausible(p)] if p.multiple else _plausible(p) for p in options}
+    expected = {key: str(value) if type(value) is int else value for key, value in values.items()}
     lines = [f"{max(p.opts, key=len)[2:]} = {json.dumps(values[p.name])}" for p in options]
-    assert read_config(_written(tmp_path, "\n".join([f"[{name}]", *lines])), cli.commands, name) == values
+    assert read_config(_written(tmp_path, "\n".join([f"[{name}]", *lines])), cli.commands, name) == expected
 
 
 @settings(deadline=None)

@@ -28,7 +28,6 @@ def test_help_has_examples_exit_statuses_and_every_option(rdstitch: Run, name: s
     assert "RANGE" not in shown.out
     assert f"rdstitch {name} " in shown.out
     assert "Exit status:" in shown.out
-    assert "Other options" not in shown.out, "options without a group in help_pages.py"
     for option in _options(cli.commands[name]):
         assert option.help, option.name
         assert any(

@@ -16,7 +16,7 @@ from rdstitch.features import FeatureOptions
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.compose import viewed_images
 from rdstitch.pipeline.recipes import pano
-from rdstitch.report.camera_path import view_directions
+from rdstitch.report.pairs import match_graph
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.viewer import viewer_page
@@ -70,7 +70,7 @@ def test_outlines_are_where_the_images_are_at_both_ends_of_a_full_turn(around: l
     canvas, alignment = result.canvas, result.registration.alignment
     assert canvas.period is not None
     odd = tuple(replace(source, path=Path(f"<b>{source.path.name}")) for source in result.registration.sources)
-    assert "<title>&lt;b&gt;" in view_directions(replace(result.registration, sources=odd))
+    assert "<title>&lt;b&gt;" in match_graph(replace(result.registration, sources=odd))
     page = viewer_page("x.dzi", canvas.size, viewed_images(result))
     data = re.search(r'<script type="application/json" id="data">(.*?)</script>', page)
     assert data is not None

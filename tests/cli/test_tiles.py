@@ -10,8 +10,8 @@ import tifffile
 
 from rdstitch.io.flat_field import FlatField
 from rdstitch.report.stage import backlash
-from rdstitch.synthetic.stage import StageGrid
 from tests.cli.running import SIDECAR_SCHEMA, Run
+from tests.stage_grid import StageGrid
 
 STAGE = StageGrid(rows=3, columns=3, tile=256, overlap=0.15, content=0.8, backlash=4.0, seed=5)
 NAMED = ("--grid", "r{row}c{col}", "--overlap", "15")

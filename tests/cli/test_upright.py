@@ -14,11 +14,12 @@ from rdstitch.errors import ArgumentError
 from rdstitch.options import StitchOptions
 from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.radial_homography import to_plane
-from rdstitch.synthetic import LinedTexture, Photometry, Sequence, ground, sequence_over
+from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over
 from rdstitch.synthetic.poses import Poses
 from rdstitch.synthetic.textures import Texture
 from tests.cli.running import CACHED, Run
 from tests.drone_xmp import euler_angles, xmp_of
+from tests.lined_texture import LinedTexture
 
 LENS = Camera((400, 300), -0.1, focal=420.0, focal_source="option")
 TILT, ROLL = (0.4, 0.25), 0.08

@@ -12,7 +12,7 @@ from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
 from rdstitch.solvers import Solutions
-from rdstitch.synthetic import planar_instances
+from tests.instances import planar_instances
 from tests.planar_constraints import constraint_residuals
 
 seeds = st.integers(0, 10**6)

@@ -8,7 +8,8 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.stitching import show_plan
+from rdstitch_cli.options import option
+from rdstitch_cli.stitching import composite_fields, show_plan
 from rdstitch_cli.terminal import Reporter
 
 
@@ -23,25 +24,12 @@ Examples:
 """,
 )
 @click.argument("sidecar", type=options.IMAGE, metavar="SIDECAR")
-@click.option(
-    "--images",
-    type=options.IMAGE,
-    required=True,
-    multiple=True,
-    metavar="INPUT",
-    help="Images to compose: what 'rdstitch mosaic' takes; may be given several times.",
-)
+@option("--images", options.IMAGE, required=True, multiple=True)
 @options.output
 @options.overwrite
 @options.every_frame
 @options.topic
-@click.option(
-    "--match",
-    type=click.Choice(["auto", "name", "order"]),
-    default="auto",
-    show_default=True,
-    help="How images find their places: by name (the suffix may differ), by order, or by order if no name fits.",
-)
+@option("--match", ("auto", "name", "order"), "auto")
 @options.mask
 @options.flat_field("off")
 @options.compositing
@@ -52,17 +40,9 @@ def apply(
     sidecar: Path,
     images: tuple[Path, ...],
     output: Path,
-    overwrite: bool,
-    every: int | None,
-    topic: str | None,
     match: Literal["auto", "name", "order"],
-    mask: Path | None,
-    flat_field: str | Path,
-    workers: int,
-    strict: bool,
-    dry_run: bool,
     reporter: Reporter,
-    **compositing: Any,
+    **given: Any,
 ) -> None:
     """Compose images by the registration in a sidecar, without estimating anything.
 
@@ -74,28 +54,14 @@ def apply(
     from rdstitch.pipeline.apply_sidecar import apply as recipe
     from rdstitch.sidecar.read import read_sidecar
 
-    given = {name: value for name, value in compositing.items() if options.is_given(name)}
+    chosen = {name: value for name, value in composite_fields(given).items() if options.is_given(name)}
     # What is given takes the place of what the sidecar has for the same purpose.
-    if "scale" in given or "gsd" in given:
-        given = {"scale": 1.0, "gsd": None, **given}
-    if given.keys() & {"rectangle", "straighten", "level"}:
-        given = {"rectangle": None, "straighten": "off", "level": False, **given}
-    result = recipe(
-        sidecar,
-        options.resolve(images),
-        output,
-        replace(read_sidecar(sidecar).composite, **given),
-        match=match,
-        mask=mask,
-        flat_field=flat_field,
-        every=every,
-        topic=topic,
-        workers=workers,
-        overwrite=overwrite,
-        strict=strict,
-        dry_run=dry_run,
-        progress=reporter,
-    )
+    if "scale" in chosen or "gsd" in chosen:
+        chosen = {"scale": 1.0, "gsd": None, **chosen}
+    if chosen.keys() & {"rectangle", "straighten", "level"}:
+        chosen = {"rectangle": None, "straighten": "off", "level": False, **chosen}
+    composite = replace(read_sidecar(sidecar).composite, **chosen)
+    result = recipe(sidecar, options.resolve(images), output, composite, match=match, progress=reporter, **given)
     reporter.finish()
     for missing in told_once(result.left_out.values()):
         reporter.warn(str(missing))

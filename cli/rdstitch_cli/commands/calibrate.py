@@ -22,15 +22,7 @@ Examples:
 """,
 )
 @options.inputs
-@click.option(
-    "-o",
-    "--output",
-    type=options.IMAGE,
-    required=True,
-    metavar="FILE",
-    help="Camera file to write: .json, .yml and .fisheye.yml (OpenCV), .pto (Hugin), cameras.json (OpenDroneMap), "
-    "cameras.txt (COLMAP), camera_info.yaml (ROS), camchain.yaml (Kalibr), .xml (lensfun).",
-)
+@options.option("-o --output", options.IMAGE, of="calibrate", required=True)
 @options.every
 @options.topic
 @options.registration

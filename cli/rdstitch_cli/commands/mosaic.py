@@ -12,6 +12,8 @@ from rdstitch.messages import shortened
 from rdstitch_cli import following as live
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
+from rdstitch_cli.options import option
+from rdstitch_cli.parameter_types import RealNumber
 from rdstitch_cli.stitching import Report, staged_beside, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
 
@@ -35,28 +37,11 @@ Examples:
 @options.stitching
 @options.every
 @options.topic
-@click.option(
-    "--all-blocks",
-    is_flag=True,
-    help="Stitch what is left out again while it overlaps: the largest block of images becomes OUTPUT, the others "
-    "OUTPUT with -2, -3, … before its suffix.",
-)
-@click.option(
-    "--poses",
-    type=options.IMAGE,
-    metavar="FILE",
-    help="Write the pose of the camera for each image, with covariances: CSV, as 'rdstitch trajectory' does.",
-)
-@click.option(
-    "--frame",
-    type=click.Choice(["enu", "camera", "map"]),
-    default="enu",
-    show_default=True,
-    help="Axes of --poses. enu, camera: of the first image, in heights of it, as for 'rdstitch trajectory'. map: "
-    "easting, northing and height in metres, where the output is georeferenced.",
-)
-@live.follow
-@live.refresh
+@option("--all-blocks", bool)
+@option("--poses", options.IMAGE)
+@option("--frame", ("enu", "camera", "map"), "enu", of="mosaic")
+@options.follow
+@option("--refresh", RealNumber(0.0), 5.0)
 def mosaic(
     inputs: tuple[Path, ...],
     output: Path,

@@ -7,8 +7,9 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
+from rdstitch_cli.options import option
 from rdstitch_cli.parameter_types import RealNumber, WholeNumber
-from rdstitch_cli.stitching import Report, report_registration, summarize
+from rdstitch_cli.stitching import Report, composite_fields, report_registration, summarize
 from rdstitch_cli.terminal import Reporter
 
 
@@ -24,50 +25,17 @@ Examples:
 """,
 )
 @options.inputs
-@click.option("-o", "--output", type=options.IMAGE, help="Image to write: .ome.tif, .tif, .png, .jpg, .webp or .dzi.")
+@option("-o --output", options.IMAGE, of="tiles")
 @options.overwrite
-@click.option(
-    "--grid",
-    metavar="PATTERN",
-    help="Part of the file names, with {row} and {col} for numbers and * for anything, such as 'r{row}c{col}'.",
-)
-@click.option(
-    "--overlap",
-    type=RealNumber(0.0, 100.0),
-    default=10.0,
-    show_default=True,
-    metavar="PERCENT",
-    help="With --grid: what neighbours have in common.",
-)
-@click.option(
-    "--positions",
-    type=options.IMAGE,
-    metavar="FILE",
-    help="CSV with name,x,y (pixels) or name,x_um,y_um; otherwise what OME-TIFF or Micro-Manager say.",
-)
-@click.option(
-    "--positions-only",
-    type=options.IMAGE,
-    metavar="FILE",
-    help="Write the places of the tiles to this CSV file; without --output nothing is composed.",
-)
-@click.option("--pixel-size", type=RealNumber(0.0), metavar="UM", help="Micrometres a pixel, where no file says it.")
-@click.option(
-    "--search",
-    type=RealNumber(0.0),
-    metavar="PX",
-    help="How far neighbours may be from where they should be to each other.  [default: 5 % of a tile's side]",
-)
-@click.option(
-    "--channel", type=WholeNumber(0), metavar="N", help="Register this channel, from 0; otherwise the mean of all."
-)
+@option("--grid")
+@option("--overlap", RealNumber(0.0, 100.0), 10.0)
+@option("--positions", options.IMAGE, of="tiles")
+@option("--positions-only", options.IMAGE)
+@option("--pixel-size", RealNumber(0.0))
+@option("--search", RealNumber(0.0))
+@option("--channel", WholeNumber(0))
 @options.flat_field("auto")
-@click.option(
-    "--save-flat-field",
-    type=options.IMAGE,
-    metavar="FILE",
-    help="Write the flat field and the dark field to this TIFF file, for the next slide.",
-)
+@option("--save-flat-field", options.IMAGE)
 @options.distortion
 @options.cut
 @options.crop
@@ -102,14 +70,8 @@ def tiles(
 
     if output is None and positions_only is None:
         raise click.UsageError("nothing to write: give --output or --positions-only")
-    composite = {name: given.pop(name) for name in CompositeOptions.__dataclass_fields__ if name in given}
-    workers = composite.pop("workers")
-    chosen = TileOptions(
-        overlap=overlap / 100.0,
-        composite=CompositeOptions(exposure="none", seam="none", **composite),
-        workers=workers,
-        **given,
-    )
+    composite = CompositeOptions(exposure="none", seam="none", **composite_fields(given))
+    chosen = TileOptions(overlap=overlap / 100.0, composite=composite, **given)
     paths = options.resolve(inputs)
     page = Report(report, reporter, paths, chosen.overwrite, output)
     if output is None:

@@ -10,6 +10,7 @@ import click
 from rdstitch_cli import following as live
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
+from rdstitch_cli.options import option
 from rdstitch_cli.parameter_types import RealNumber
 from rdstitch_cli.stitching import report_registration, stitch_options
 from rdstitch_cli.terminal import Reporter
@@ -30,42 +31,16 @@ Examples:
 """,
 )
 @options.inputs
-@click.option("-o", "--output", type=options.IMAGE, required=True, metavar="FILE", help="File to write.")
-@click.option(
-    "--format",
-    "layout",
-    type=click.Choice(["csv", "tum", "kitti"]),
-    default="csv",
-    show_default=True,
-    help="csv: a table with names, time stamps, x, y, yaw_deg, height and their covariances. tum: time, position and "
-    "quaternion. kitti: matrices.",
-)
-@click.option(
-    "--frame",
-    type=click.Choice(["enu", "camera"]),
-    help="Axes of positions. enu: x to the right and y to the top of the first image, z up; default but for kitti. "
-    "camera: x to the right, y to the bottom, z down. yaw_deg is counterclockwise as seen from above in both.",
-)
-@click.option(
-    "--height",
-    type=RealNumber(),
-    metavar="H",
-    default=1.0,
-    show_default=True,
-    help="Height of the first frame above the plane, in the unit that positions shall have.",
-)
-@click.option(
-    "--timestamps",
-    type=options.IMAGE,
-    metavar="FILE",
-    help="Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; "
-    "otherwise those of the video, bag or EXIF.",
-)
-@click.option("--plot", type=options.IMAGE, metavar="FILE", help="Draw the path to FILE (SVG).")
+@option("-o --output", options.IMAGE, of="trajectory", required=True)
+@option("--format", ("csv", "tum", "kitti"), "csv", of="trajectory", dest="layout")
+@option("--frame", ("enu", "camera"), of="trajectory")
+@option("--height", RealNumber(), 1.0)
+@option("--timestamps", options.IMAGE)
+@option("--plot", options.IMAGE)
 @options.overwrite
 @options.every_frame
 @options.topic
-@live.follow
+@options.follow
 @options.known
 @options.estimation
 @options.trust
@@ -97,31 +72,20 @@ def trajectory(
     with ExitStack() as stack:
         stitch = stitch_options(reporter, **given)
         if following:
-            arrived = live.followed(
-                inputs,
-                stitch,
-                reporter,
-                output=output,
-                plot=plot,
-                every=every,
-                idle=idle,
-                poses=FollowedPoses(height, timestamps, frame or frame_of(layout)),
-            )
+            printed = FollowedPoses(height, timestamps, frame or frame_of(layout))
+            watched: dict[str, Any] = {"output": output, "plot": plot, "every": every, "idle": idle, "poses": printed}
+            arrived = live.followed(inputs, stitch, reporter, **watched)
             paths: Sequence[Named] = stack.enter_context(arrived)
         else:
             paths = options.resolve(inputs)
-        _, registration = recipe(
-            paths,
-            output,
-            stitch,
-            layout=layout,
-            timestamps=timestamps,
-            plot=plot,
-            height=height,
-            frame=frame,
-            every=every,
-            progress=reporter,
-        )
+        how: dict[str, Any] = {
+            "layout": layout,
+            "timestamps": timestamps,
+            "plot": plot,
+            "height": height,
+            "frame": frame,
+        }
+        _, registration = recipe(paths, output, stitch, every=every, progress=reporter, **how)
         if following:
             live.print_result(registration, reporter, output)
         else:

@@ -1,12 +1,13 @@
 """``rdstitch undistort``: straight lines become straight."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import click
 
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
+from rdstitch_cli.options import option
 from rdstitch_cli.stitching import read_lens
 from rdstitch_cli.terminal import Reporter
 
@@ -22,36 +23,13 @@ Examples:
 )
 @options.inputs
 @options.lens
-@click.option(
-    "-o", "--output", type=options.IMAGE, required=True, metavar="DIR", help="Folder to write to; made if missing."
-)
+@option("-o --output", options.IMAGE, of="undistort", required=True)
 @options.overwrite
 @options.topic
-@click.option(
-    "--view",
-    type=click.Choice(["same", "all", "valid"]),
-    default="same",
-    show_default=True,
-    help="What to show: the same scale and size as the image, all of it, or only where it has no empty border.",
-)
-@click.option(
-    "--format",
-    "image_format",
-    type=click.Choice(["jpg", "png", "tif", "webp"]),
-    help="Of the files written; that of each image, or png where that cannot be written, if not given.",
-)
+@option("--view", ("same", "all", "valid"), "same")
+@option("--format", ("jpg", "png", "tif", "webp"), of="undistort", dest="image_format")
 @options.verbosity
-def undistort(
-    inputs: tuple[Path, ...],
-    camera: Path | None,
-    distortion: float | None,
-    output: Path,
-    overwrite: bool,
-    topic: str | None,
-    view: Literal["same", "all", "valid"],
-    image_format: Literal["jpg", "png", "tif", "webp"] | None,
-    reporter: Reporter,
-) -> None:
+def undistort(inputs: tuple[Path, ...], camera: Path | None, output: Path, reporter: Reporter, **given: Any) -> None:
     """Undistort images with a known lens, each into a file of the same name in a folder.
 
     INPUT is what 'rdstitch mosaic' takes. The lens comes from a camera file, as 'rdstitch pano --save-camera' and
@@ -59,21 +37,10 @@ def undistort(
     """
     from rdstitch.pipeline.undistort_images import undistort as recipe
 
-    if (camera is None) == (distortion is None):
+    if (camera is None) == (given["distortion"] is None):
         raise click.UsageError("give either --camera FILE or --lambda L")
-    lens = read_lens(camera, reporter)
-    written = recipe(
-        options.resolve(inputs),
-        output,
-        camera=lens,
-        distortion=distortion,
-        view=view,
-        image_format=image_format,
-        overwrite=overwrite,
-        topic=topic,
-        warn=reporter.tell,
-        progress=reporter,
-    )
+    lens, paths = read_lens(camera, reporter), options.resolve(inputs)
+    written = recipe(paths, output, camera=lens, warn=reporter.tell, progress=reporter, **given)
     reporter.finish()
     noun = "image" if len(written) == 1 else "images"
     reporter.made(f"{output}: {len(written)} {noun} undistorted")

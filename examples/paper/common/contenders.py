@@ -9,7 +9,7 @@ from examples.paper.common.peers import homlib_solver
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
-from rdstitch.synthetic import PlanarInstances
+from tests.instances import PlanarInstances
 
 HOMLIB: tuple[tuple[str, str, tuple[bool, ...]], ...] = (
     ("5 points, Fitzgibbon (homlib)", "estimate_fitzgibbon_cvpr_2001_two_sided_equal", ()),

@@ -12,7 +12,7 @@ from examples.paper.common.report import Table
 from rdstitch.arrays import FloatArray
 from rdstitch.radial_homography import lift
 from rdstitch.solvers import Solutions
-from rdstitch.synthetic import PlanarInstances
+from tests.instances import PlanarInstances
 
 SIGMAS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
 """Standard deviations of the noise in px of a 640 x 480 image."""

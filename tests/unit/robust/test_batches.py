@@ -8,7 +8,7 @@ from rdstitch.camera import Camera
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
 from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
 from rdstitch.robust.measurements import Measurements, padded_length
-from rdstitch.synthetic import correspondences
+from tests.correspondences import correspondences
 
 
 def _pairs(count: int) -> list[PairMatches]:

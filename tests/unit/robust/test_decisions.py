@@ -6,7 +6,7 @@ import pytest
 import rdstitch
 from rdstitch.robust import SolverName
 from rdstitch.robust.verification import rejection_reason
-from rdstitch.synthetic import correspondences
+from tests.correspondences import correspondences
 
 
 @pytest.mark.parametrize(("solver", "size"), [("three_point", 3), ("four_point", 4), ("five_point", 5)])

@@ -10,7 +10,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
 from rdstitch.robust.estimate import SOLVERS, SolverName
 from rdstitch.robust.ransac import RansacOptions
-from rdstitch.synthetic import correspondences
+from tests.correspondences import correspondences
 
 MATCHES = correspondences(150, seed=4, outliers=0.3)
 LENS = MATCHES.truth.camera

@@ -8,7 +8,7 @@ from rdstitch.planar_motion import rigid_in_plane, rotation_from_tilt
 from rdstitch.radial_homography import transfer
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.pair_models import HomographyPairModel, PlanarPairModel
-from rdstitch.synthetic import correspondences
+from tests.correspondences import correspondences
 
 FOCAL = 1.4
 K = np.diag([FOCAL, FOCAL, 1.0])

@@ -10,7 +10,7 @@ from rdstitch.camera import Camera
 from rdstitch.robust import estimate_radial_homography
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.own_lenses import OwnLenses, _Problems, own_lenses
-from rdstitch.synthetic import correspondences
+from tests.correspondences import correspondences
 
 _THRESHOLD = 3.0
 

@@ -9,7 +9,7 @@ import pytest
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
-from rdstitch.synthetic import Instances, PlanarInstances, general_instances, planar_instances, rotation_instances
+from tests.instances import Instances, PlanarInstances, general_instances, planar_instances, rotation_instances
 
 COUNT = 4000
 SEED = 424_242

@@ -14,7 +14,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.radial_homography import lift, transfer
 from rdstitch.solvers import Solutions
-from rdstitch.synthetic import planar_instances, rotation_instances
+from tests.instances import planar_instances, rotation_instances
 
 TILT = (0.12, -0.2)
 

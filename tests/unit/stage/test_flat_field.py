@@ -10,7 +10,7 @@ from rdstitch.inputs.source import read_sources
 from rdstitch.io.flat_field import FlatField, read_flat_field
 from rdstitch.pipeline.flat_field import with_flat_field
 from rdstitch.stage.flat_field import estimate_illumination
-from rdstitch.synthetic.stage import Specimen, StageGrid
+from tests.stage_grid import Specimen, StageGrid
 
 
 @pytest.mark.parametrize(

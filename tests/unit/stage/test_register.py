@@ -8,7 +8,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.stage import TileGrid, TileRegistration, register_tiles
 from rdstitch.stage.correlation import correlate
 from rdstitch.stage.overlap import Overlap
-from rdstitch.synthetic.stage import Specimen, StageGrid
+from tests.stage_grid import Specimen, StageGrid
 
 
 def _registered(stage: StageGrid) -> TileRegistration:

@@ -6,7 +6,8 @@ import pytest
 from rdstitch.errors import ArgumentError
 from rdstitch.radial_homography import transfer
 from rdstitch.solvers.solutions import Solutions
-from rdstitch.synthetic import HALF_SIZE, correspondences, general_instances, planar_instances
+from tests.correspondences import correspondences
+from tests.instances import HALF_SIZE, general_instances, planar_instances
 from tests.planar_constraints import constraint_residuals
 
 

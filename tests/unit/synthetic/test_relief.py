@@ -8,7 +8,6 @@ from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 from rdstitch.synthetic import (
     RELIEFS,
-    LinedTexture,
     Poses,
     Relief,
     Sequence,
@@ -18,6 +17,7 @@ from rdstitch.synthetic import (
     pair_poses,
     sequence_over,
 )
+from tests.lined_texture import LinedTexture
 
 LENS = Camera((320, 240), -0.2, focal=260.0)
 

@@ -12,11 +12,11 @@ from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, Features, detect, match
 from rdstitch.features.prepared_image import View, prepare
+from rdstitch.inputs.corner_flow import CornerFlow, fitted_affine
 from rdstitch.matching.options import PairOptions
 from rdstitch.synthetic import Sequence, blank, line_poses, sequence_over, turn_poses
 from rdstitch.tracking import Tracked, Tracker, TrackingOptions
 from rdstitch.tracking import tracker as module
-from rdstitch.tracking.flow import CornerFlow, fitted_affine
 from tests.floor_drives import floor_drive
 
 SIZE = (320, 240)

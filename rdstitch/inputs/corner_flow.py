@@ -1,4 +1,4 @@
-"""Corners of a keyframe, followed through the frames after it by Lucas and Kanade's method.
+"""Corners of a frame, followed through the frames after it by Lucas and Kanade's method.
 
 Between keyframes that takes the place of detection and matching, which cost ten times as much.
 """
@@ -25,17 +25,17 @@ class CornerFlow:
     def __init__(self) -> None:
         self._last: PreparedImage | None = None
         self._from = self._at = np.empty((0, 1, 2), dtype=np.float32)
-        self._count = 0
+        self.count = 0
 
     def begin(self, keyframe: PreparedImage | None) -> None:
         """Take the corners of a keyframe; None: there are none to be followed."""
-        self._last, self._count = keyframe, 0
+        self._last, self.count = keyframe, 0
         if keyframe is None:
             return
         detected = cv2.goodFeaturesToTrack(keyframe.grey, _CORNERS, _QUALITY, _SPACING * max(keyframe.grey.shape))
         corners = np.empty((0, 1, 2), dtype=np.float32) if detected is None else detected
         self._from = self._at = corners[_usable(keyframe, corners)]
-        self._count = len(self._from)
+        self.count = len(self._from)
 
     def follow(self, frame: PreparedImage) -> tuple[FloatArray, FloatArray] | None:
         """Follow the corners of the keyframe: their places before and now, (N, 2) each, pixels of ``grey``.
@@ -43,12 +43,12 @@ class CornerFlow:
         None where too few of them can be followed.
         """
         last = self._last
-        if last is None or last.grey.shape != frame.grey.shape or len(self._at) < max(1.0, _MIN_SHARE * self._count):
+        if last is None or last.grey.shape != frame.grey.shape or len(self._at) < max(1.0, _MIN_SHARE * self.count):
             return None
         at, kept = _moved(last, frame, self._at)
         kept &= _usable(frame, at)
         self._last, self._from, self._at = frame, self._from[kept], at[kept]
-        if len(self._at) < _MIN_SHARE * self._count:
+        if len(self._at) < _MIN_SHARE * self.count:
             return None
         before, now = self._from[:, 0].astype(np.float64), self._at[:, 0].astype(np.float64)
         moved = np.linalg.norm(now - before, axis=1)

@@ -124,8 +124,6 @@ def planar_instances(
     ----------
     count, points : int
         B and k: instances, and correspondences in each.
-    seed : int
-        Equal seeds give equal instances.
     distortion : (float, float)
         Range of λ, uniform.
     max_tilt : float
@@ -272,8 +270,6 @@ def rotation_instances(
 
     Parameters
     ----------
-    count, points, seed, distortion, overlap, noise
-        As for :func:`rdstitch.synthetic.planar_instances`, in the frame and the unit of the points.
     angle : (float, float)
         Range of the angle between the optical axes, radians; their direction is uniform.
     roll : float

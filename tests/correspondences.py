@@ -10,7 +10,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.synthetic.instances import Instances, PlanarInstances, general_instances, planar_instances
+from tests.instances import Instances, PlanarInstances, general_instances, planar_instances
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,6 @@ def correspondences(
 
     Parameters
     ----------
-    count : int
-        N.
-    seed : int
-        Equal seeds give equal matches.
-    image_size : (int, int)
-        Width and height, pixels.
     focal : float, optional
         Focal length, pixels; 1.2 times half the diagonal if not given.
     distortion : float
