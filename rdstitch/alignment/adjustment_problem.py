@@ -225,8 +225,11 @@ class Problem:
         """
         known = self.camera_priors
         planar = [other for other in others if other.model.one_camera]
-        if start is None:
-            start = (planar[-1].adjusted if planar else self.trial(model)).parameters.shared
+        if start is None and planar:
+            start = planar[-1].adjusted.parameters.shared
+        elif start is None:
+            adjuster, at = self._best_trial(model)
+            start = (at if len(self.observations) == 1 else adjuster.run(at).parameters).shared
         if len(self.observations) == 1:  # which on its own is the whole
             return start, self.lens, self.homographies
         adjuster, at = independent_pairs(
@@ -243,7 +246,12 @@ class Problem:
         return apart.parameters.shared, apart.parameters.lens, apart.homographies
 
     def trial(self, model: MotionModel) -> BundleAdjustmentResult:
-        """A few links on their own, from the shared parameters that come nearest to them without adjustment."""
+        """A few links on their own under one camera."""
+        adjuster, start = self._best_trial(model)
+        return adjuster.run(start)
+
+    def _best_trial(self, model: MotionModel) -> tuple[BundleAdjuster, Parameters]:
+        """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
         known, links = self.camera_priors, len(self.observations)
         priors = known.priors(model, self.count, _TILT_SPREAD_START)
         few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
@@ -254,8 +262,7 @@ class Problem:
         ]
         squared = [adjuster.squared(start) for adjuster, start in trials]
         width = ALIGNMENT_WIDTH * min(map(sigma_of, squared))
-        adjuster, start = trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
-        return adjuster.run(start)
+        return trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
 
     def taken_over(self, model: MotionModel, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""

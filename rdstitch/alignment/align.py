@@ -108,16 +108,16 @@ def align(
     relations = relations_at(few, own, lens)
     apart = homography_apart(few, relations, lens, free_lens, known)
     observable = options.lens_known or _observable(apart)
-    depth = observable and not options.lens_known and _may_be_depth(few, own, apart, known)
+    given, none = _lens_of(cameras[0]), np.zeros_like(free_lens)
+    may_be_depth = observable and not options.lens_known and len(np.unique([few.image1, few.image2])) <= _FEW_VIEWS
+    held = apart
+    if may_be_depth or not observable:
+        held = homography_apart(few, relations_at(few, own, given), given, none, known)
+    depth = may_be_depth and _is_depth(few, apart, held)
     observable &= not depth
-    chosen = choose_lens(few, apart, options.lenses if observable else (), known)
-    if observable:
-        apart, free_lens = chosen.apart, chosen.free
-        lens, relations = apart.parameters.lens, apart.homographies
-    else:
-        lens, free_lens = _lens_of(cameras[0]), np.zeros(len(LENS_STD), dtype=np.bool_)
-        apart = homography_apart(few, relations_at(few, own, lens), lens, free_lens, known)
-        relations = apart.homographies
+    chosen = choose_lens(few, apart if observable else held, options.lenses if observable else (), known)
+    apart = chosen.apart
+    free_lens, lens, relations = chosen.free if observable else none, apart.parameters.lens, apart.homographies
 
     report("choice of the model")
     wrong, confirmed = cycle_consistency(apart, few, len(cameras))
@@ -247,20 +247,12 @@ def _choose_from(
     return choice if choice.fit.model is warm.model and costs[0] <= costs[1] else None
 
 
-def _may_be_depth(
-    observations: Observations, relations: Sequence[RadialHomography], bent: BundleAdjustmentResult, known: CameraPriors
-) -> bool:
-    """Whether the depth of what a few images show may look like their lens.
+def _is_depth(observations: Observations, bent: BundleAdjustmentResult, flat: BundleAdjustmentResult) -> bool:
+    """Whether the depth of what a few images show may look like their lens: with λ free, and held.
 
     Depth changes most from one end of a view to the other, as the effect of a lens does: where it shows in the errors
     that are left, λ takes the blame for more of it than that.
     """
-    if len(np.unique([observations.image1, observations.image2])) > _FEW_VIEWS:
-        return False
-    straight = np.zeros_like(bent.parameters.lens)
-    flat = homography_apart(
-        observations, relations_at(observations, relations, straight), straight, straight != 0.0, known
-    )
     left = left_coherence(flat, observations)
     if left.correlation <= COHERENT_CORRELATION or left.relative_size <= LARGE_RELIEF:
         return False
