@@ -137,15 +137,17 @@ def choose_lens(
     if few:
         names = [name for name in names if name != "division-center"]
     free = [free_parameters(name) & ~(CENTER & few) for name in names]
-    fits = [apart] if names[0] == "division" else []
-    best = 0
-    for index in range(len(fits), len(names)):
-        if names[index] == "division3" and names[best] != "division2":
+
+    def fit(free: BoolArray, start: BundleAdjustmentResult) -> BundleAdjustmentResult:
+        return homography_apart(observations, start.homographies, start.parameters.lens, free, known)
+
+    if len(names) == 1:
+        return LensChoice(names[0], free[0], apart if names[0] == "division" else fit(free[0], apart), "as requested")
+    fits, best = [apart], 0
+    for index, name in enumerate(names[1:], start=1):
+        if name == "division3" and names[best] != "division2":
             break  # the next term of a series that is not needed
-        start = fits[-1] if fits else apart
-        fits.append(homography_apart(observations, start.homographies, start.parameters.lens, free[index], known))
-        if len(names) == 1:
-            return LensChoice(names[0], free[0], fits[0], "as requested")
+        fits.append(fit(free[index], fits[-1]))
         errors = whitened_errors(observations, fits[-1].homographies, fits[-1].parameters.lens)
         judge = _Judge(NoiseModel.of_independent_links(observations, errors), _parts(observations))
         added = int(free[index].sum() - free[best].sum())
