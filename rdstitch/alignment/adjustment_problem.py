@@ -30,8 +30,8 @@ from rdstitch.alignment.motion_models import (
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import shared_variance
 from rdstitch.alignment.warm_start import WarmStart
-from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.matching.match_graph import spanning_tree
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 
 _LONG_CHAIN = 60
@@ -90,7 +90,7 @@ class Problem:
     count : int
         N.
     reference : int
-        The image that fixes the gauge.
+        The image that fixes the gauge; -1 for none in particular, before :meth:`part`.
     lens : ndarray of shape (4,)
         Where to start.
     free_lens : ndarray of shape (5,), bool
@@ -111,6 +111,31 @@ class Problem:
     camera_priors: CameraPriors
     overdispersion: float = 1.0
     warm: WarmStart | None = None
+
+    def part(self, kept: BoolArray, images: IntArray | None = None) -> tuple["Problem", IntArray]:
+        """The problem of some links (L,) between these images, or the largest group that they connect; and the images.
+
+        Without a reference among them the centre of their match graph is it.
+        """
+        o = self.observations
+        if images is None:
+            images = np.array(connected_components(self.count, o.image1[kept], o.image2[kept])[0], dtype=np.intp)
+        number = np.full(self.count + 1, -1, dtype=np.intp)
+        number[images] = np.arange(len(images))
+        links = np.flatnonzero(kept & (number[o.image1] >= 0) & (number[o.image2] >= 0))
+        own, reference = o.subset(links, number), int(number[self.reference])
+        if reference < 0:
+            reference = spanning_tree(len(images), own.image1, own.image2, self.trust[links]).root
+        part = replace(
+            self,
+            observations=own,
+            homographies=self.homographies[links],
+            trust=self.trust[links],
+            count=len(images),
+            reference=reference,
+            camera_priors=self.camera_priors.of(images),
+        )
+        return part, images
 
     def fit(self, model: MotionModel, others: Sequence[Fit] = (), shared: FloatArray | None = None) -> Fit:
         """Adjust a model from the chained links or from the solution of a less free model, whichever is nearer.
