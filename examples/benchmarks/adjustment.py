@@ -14,10 +14,11 @@ from typing import Literal
 import numpy as np
 
 from examples.benchmarks.driver import peak_memory, run
+from examples.judging.trajectories import compare_trajectories
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
+from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from tests.alignment_scenes import Scene, grid, ring, robot_path, scene
 

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from examples.benchmarks.driver import peak_memory, run
-from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
+from examples.judging.trajectories import compare_trajectories
+from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.inputs.arrivals import Arrivals
 from rdstitch.io.write import write_image
 from rdstitch.options import StitchOptions

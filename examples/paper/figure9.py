@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from examples.judging.trajectories import compare_trajectories
 from examples.paper.common.drives import PATHS, Drive, drive, estimated_links
 from examples.paper.common.plain_ransac import all_solvers, best_of
 from examples.paper.common.report import Report, Table
@@ -25,7 +26,7 @@ from rdstitch.alignment.motion_models import RIGID, YAW, X, Y
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Prior
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
+from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import LENS_PARAMETERS
 from rdstitch.matching.links import Link

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import (
+    WIDEST_START,
     BundleAdjuster,
     BundleAdjustmentResult,
     FreeParameters,
@@ -15,7 +16,6 @@ from rdstitch.alignment.bundle_adjustment import (
     sigma_of,
 )
 from rdstitch.alignment.camera_priors import CameraPriors
-from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.initialization import independent_pairs
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.metric_upgrade import metric_upgrade
@@ -28,14 +28,11 @@ from rdstitch.alignment.motion_models import (
     PlanarModel,
 )
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.planarity import coherence
+from rdstitch.alignment.planarity import shared_variance
 from rdstitch.alignment.warm_start import WarmStart
-from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.matching.match_graph import spanning_tree
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
-
-_WIDEST_START = 0.05
-"""Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is down-weighted."""
 
 _LONG_CHAIN = 60
 """Images over which chained homographies drift so far that a planar model is the better start."""
@@ -48,7 +45,8 @@ POSE_TILT_SPREAD = math.radians(35.0)
 
 _TILT_SPREAD_START = math.radians(3.0)
 _MIN_TILT_SPREAD = math.radians(0.05)
-_TILT_SPREAD_ROUNDS = 3
+_ROUNDS, _SETTLED = 3, 0.1
+"""Of estimating scales of priors, and by how much they still change at the end."""
 
 _MISFIT = 1.5
 """Times the errors of links on their own from which on those of a model are its own."""
@@ -92,7 +90,7 @@ class Problem:
     count : int
         N.
     reference : int
-        The image that fixes the gauge.
+        The image that fixes the gauge; -1 for none in particular, before :meth:`part`.
     lens : ndarray of shape (4,)
         Where to start.
     free_lens : ndarray of shape (5,), bool
@@ -113,6 +111,31 @@ class Problem:
     camera_priors: CameraPriors
     overdispersion: float = 1.0
     warm: WarmStart | None = None
+
+    def part(self, kept: BoolArray, images: IntArray | None = None) -> tuple["Problem", IntArray]:
+        """The problem of some links (L,) between these images, or the largest group that they connect; and the images.
+
+        Without a reference among them the centre of their match graph is it.
+        """
+        o = self.observations
+        if images is None:
+            images = np.array(connected_components(self.count, o.image1[kept], o.image2[kept])[0], dtype=np.intp)
+        number = np.full(self.count + 1, -1, dtype=np.intp)
+        number[images] = np.arange(len(images))
+        links = np.flatnonzero(kept & (number[o.image1] >= 0) & (number[o.image2] >= 0))
+        own, reference = o.subset(links, number), int(number[self.reference])
+        if reference < 0:
+            reference = spanning_tree(len(images), own.image1, own.image2, self.trust[links]).root
+        part = replace(
+            self,
+            observations=own,
+            homographies=self.homographies[links],
+            trust=self.trust[links],
+            count=len(images),
+            reference=reference,
+            camera_priors=self.camera_priors.of(images),
+        )
+        return part, images
 
     def fit(self, model: MotionModel, others: Sequence[Fit] = (), shared: FloatArray | None = None) -> Fit:
         """Adjust a model from the chained links or from the solution of a less free model, whichever is nearer.
@@ -136,21 +159,39 @@ class Problem:
         return self.adjuster(model).squared(parameters)
 
     def refine(self, model: MotionModel, start: Parameters, tilt_spread: float | None = None) -> Fit:
-        """Adjust a model from a given start; again where its errors count for less than those of links do.
+        """Adjust a model from a given start, with the scales of its priors: the tilts' spread, the errors' dependence.
 
         What neighbours share in the errors belongs to the model: where that is large, priors count for more.
         """
-        fit = self._refined(model, start, tilt_spread)
-        adjusted, observations = fit.adjusted, self.observations
-        if adjusted.sigma <= _MISFIT * self._link_sigma:
-            return replace(fit, overdispersion=self.overdispersion)
-        errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
-        inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
-        shared = coherence(observations, errors, inliers).overdispersion
-        if shared <= self.overdispersion:
-            return replace(fit, overdispersion=self.overdispersion)
-        again = replace(self, overdispersion=shared)._refined(model, adjusted.parameters, fit.tilt_spread or None)
-        return replace(again, overdispersion=shared)
+        measured = self.camera_priors.attitudes_std
+        estimated = model.free_tilts and not model.any_tilt and measured is None
+        if estimated:
+            spread = tilt_spread or _TILT_SPREAD_START
+        else:
+            spread = POSE_TILT_SPREAD if model.any_tilt and measured is None else measured or 0.0
+        overdispersion, rounds = self.overdispersion, 0
+
+        def revised(now: BundleAdjuster, parameters: Parameters, sigma: float, errors: FloatArray) -> BundleAdjuster:
+            """The adjuster with the scales that a solution shows; as it is where they hardly change."""
+            nonlocal spread, overdispersion, rounds
+            rounds += 1
+            if estimated and rounds <= _ROUNDS:
+                tilts = parameters.poses[:, [PSI, THETA]] * math.exp(parameters.shared[-1])
+                former, spread = spread, max(float(np.sqrt(np.mean(tilts**2))), _MIN_TILT_SPREAD)
+                if abs(spread - former) > _SETTLED * former:
+                    return self.adjuster(model, spread, parameters.shared, overdispersion)
+            if model.free_tilts and measured is not None and rounds == 1:  # attitudes are divided by the focal length
+                return self.adjuster(model, spread, parameters.shared, overdispersion)
+            if sigma > _MISFIT * self._link_sigma and overdispersion == self.overdispersion:
+                inliers = squared_lengths(errors) <= (ALIGNMENT_WIDTH * sigma) ** 2
+                shared = shared_variance(self.observations, errors, inliers)
+                if shared > overdispersion:
+                    overdispersion = shared
+                    return self.adjuster(model, spread, parameters.shared, overdispersion)
+            return now
+
+        adjusted = self.adjuster(model, spread, start.shared).run(start, revised)
+        return Fit(model, adjusted, self.free_lens, spread if model.free_tilts else 0.0, overdispersion)
 
     @cached_property
     def _link_sigma(self) -> float:
@@ -158,51 +199,27 @@ class Problem:
         squared = squared_lengths(whitened_errors(self.observations, self.homographies, self.lens))
         return sigma_of(squared[self.observations.scale_inliers_mask])
 
-    def _refined(self, model: MotionModel, start: Parameters, tilt_spread: float | None) -> Fit:
-        if model.any_tilt and self.camera_priors.attitudes_std is None:
-            return Fit(model, self._run(model, start, POSE_TILT_SPREAD), self.free_lens, POSE_TILT_SPREAD)
-        if not model.free_tilts or self.camera_priors.attitudes_std is not None:
-            spread = self.camera_priors.attitudes_std or 0.0
-            adjusted = self._run(model, start, spread)
-            if not model.free_tilts:
-                return Fit(model, adjusted, self.free_lens)
-            again = self._run(model, adjusted.parameters, spread)  # attitudes are divided by the focal length
-            return Fit(model, again, self.free_lens, spread)
-        spread = tilt_spread or _TILT_SPREAD_START
-        adjusted = self._run(model, start, spread)
-        for _ in range(_TILT_SPREAD_ROUNDS):
-            tilts = adjusted.parameters.poses[:, [PSI, THETA]] * math.exp(adjusted.parameters.shared[-1])
-            previous, spread = spread, max(float(np.sqrt(np.mean(tilts**2))), _MIN_TILT_SPREAD)
-            if abs(spread - previous) <= 0.1 * previous:
-                break
-            adjusted = self._run(model, adjusted.parameters, spread)
-        return Fit(model, adjusted, self.free_lens, spread)
-
     def extend(self, fit: Fit, lens: BoolArray) -> Fit:
         """The same model with more of the lens free."""
         wider = replace(self, free_lens=self.free_lens | lens)
         return wider.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
 
-    def _run(self, model: MotionModel, start: Parameters, tilt_spread: float) -> BundleAdjustmentResult:
-        adjuster = self.adjuster(model, tilt_spread, start.shared)
-        medians = link_medians(adjuster.squared(start), self.observations)
-        widest = _WIDEST_START * float(np.median(self.observations.scale2))
-        width = min(1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95)), widest)
-        return adjuster.run(start, width)
-
     def adjuster_of(self, fit: Fit) -> BundleAdjuster:
         """Of a fit, with the priors on it."""
-        own = replace(self, overdispersion=fit.overdispersion)
-        return own.adjuster(fit.model, fit.tilt_spread or 1.0, fit.adjusted.parameters.shared)
+        return self.adjuster(fit.model, fit.tilt_spread or 1.0, fit.adjusted.parameters.shared, fit.overdispersion)
 
     def adjuster(
-        self, model: MotionModel, tilt_spread: float = _TILT_SPREAD_START, shared: FloatArray | None = None
+        self,
+        model: MotionModel,
+        tilt_spread: float = _TILT_SPREAD_START,
+        shared: FloatArray | None = None,
+        overdispersion: float | None = None,
     ) -> BundleAdjuster:
         """Of one model, with the priors on it; those of tilts as they show with the ``shared`` parameters."""
         freedom = FreeParameters.fixing(model, self.count, [self.reference], self.free_lens)
         log_focal = None if shared is None or not len(shared) else float(shared[-1])
         priors = self.camera_priors.priors(model, self.count, tilt_spread, log_focal)
-        return BundleAdjuster(model, self.observations, freedom, priors, self.overdispersion)
+        return BundleAdjuster(model, self.observations, freedom, priors, overdispersion or self.overdispersion)
 
     def _chained(self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None) -> Parameters:
         """Every link on its own, chained along the tree of the links trusted most."""
@@ -233,8 +250,11 @@ class Problem:
         """
         known = self.camera_priors
         planar = [other for other in others if other.model.one_camera]
-        if start is None:
-            start = (planar[-1].adjusted if planar else self.trial(model)).parameters.shared
+        if start is None and planar:
+            start = planar[-1].adjusted.parameters.shared
+        elif start is None:
+            adjuster, at = self._best_trial(model)
+            start = (at if len(self.observations) == 1 else adjuster.run(at).parameters).shared
         if len(self.observations) == 1:  # which on its own is the whole
             return start, self.lens, self.homographies
         adjuster, at = independent_pairs(
@@ -251,7 +271,12 @@ class Problem:
         return apart.parameters.shared, apart.parameters.lens, apart.homographies
 
     def trial(self, model: MotionModel) -> BundleAdjustmentResult:
-        """A few links on their own, from the shared parameters that come nearest to them without adjustment."""
+        """A few links on their own under one camera."""
+        adjuster, start = self._best_trial(model)
+        return adjuster.run(start)
+
+    def _best_trial(self, model: MotionModel) -> tuple[BundleAdjuster, Parameters]:
+        """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
         known, links = self.camera_priors, len(self.observations)
         priors = known.priors(model, self.count, _TILT_SPREAD_START)
         few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
@@ -262,8 +287,7 @@ class Problem:
         ]
         squared = [adjuster.squared(start) for adjuster, start in trials]
         width = ALIGNMENT_WIDTH * min(map(sigma_of, squared))
-        adjuster, start = trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
-        return adjuster.run(start)
+        return trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
 
     def taken_over(self, model: MotionModel, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""
@@ -279,7 +303,7 @@ class Problem:
         if len(starts) == 1:
             return starts[0]
         adjuster = self.adjuster(model)
-        width = _WIDEST_START * float(np.median(self.observations.scale2))
+        width = WIDEST_START * float(np.median(self.observations.scale2))
         return min(starts, key=lambda start: float(robust_cost(adjuster.squared(start), width).sum()))
 
 

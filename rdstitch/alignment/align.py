@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from rdstitch.alignment.adjustment_problem import (
 from rdstitch.alignment.attitude_check import check_attitudes
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult, sigma_of
-from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.evidence import Evidence
 from rdstitch.alignment.finer_lens import with_third_coefficient
@@ -38,7 +37,6 @@ from rdstitch.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
 from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.matching.links import Link, in_alternate_directions
-from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 
@@ -108,22 +106,23 @@ def align(
     relations = relations_at(few, own, lens)
     apart = homography_apart(few, relations, lens, free_lens, known)
     observable = options.lens_known or _observable(apart)
-    depth = observable and not options.lens_known and _may_be_depth(few, own, apart, known)
+    given, none = _lens_of(cameras[0]), np.zeros_like(free_lens)
+    may_be_depth = observable and not options.lens_known and len(np.unique([few.image1, few.image2])) <= _FEW_VIEWS
+    held = apart
+    if may_be_depth or not observable:
+        held = homography_apart(few, relations_at(few, own, given), given, none, known)
+    depth = may_be_depth and _is_depth(few, apart, held)
     observable &= not depth
-    chosen = choose_lens(few, apart, options.lenses if observable else (), known)
-    if observable:
-        apart, free_lens = chosen.apart, chosen.free
-        lens, relations = apart.parameters.lens, apart.homographies
-    else:
-        lens, free_lens = _lens_of(cameras[0]), np.zeros(len(LENS_STD), dtype=np.bool_)
-        apart = homography_apart(few, relations_at(few, own, lens), lens, free_lens, known)
-        relations = apart.homographies
+    chosen = choose_lens(few, apart if observable else held, options.lenses if observable else (), known)
+    apart = chosen.apart
+    free_lens, lens, relations = chosen.free if observable else none, apart.parameters.lens, apart.homographies
 
     report("choice of the model")
     wrong, confirmed = cycle_consistency(apart, few, len(cameras))
     trust = _trust(few, confirmed)
-    graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
-    problem, images = graph.problem(~wrong)
+    reference = -1 if options.reference is None else options.reference
+    whole = Problem(few, relations, trust, len(cameras), reference, lens, free_lens, known)
+    problem, images = whole.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     problem = replace(
         problem, overdispersion=noise_of_links(problem.observations, problem.homographies, problem.lens).overdispersion
@@ -138,15 +137,15 @@ def align(
         prefer_turn=options.prefer_turn,
         layout_matters=options.layout_matters,
     )
-    choice, images, wrong = _drop_wrong_pairs(graph, problem, images, choice, wrong)
-    choice = choose_over_relief(graph.problem(~wrong, images)[0], choice, options.models)
+    choice, images, wrong = _drop_wrong_pairs(whole, problem, images, choice, wrong)
+    choice = choose_over_relief(whole.part(~wrong, images)[0], choice, options.models)
 
     report("adjustment")
     if choice.fit.model.on_sphere and most_matches_read(len(links), options) is None:
         # Few images of a turn hardly determine the focal length; all their matches are used.
         everything, _ = _observations(links, cameras, _MATCHES_OF_A_TURN // len(links))
-    full = replace(graph, observations=everything, free_lens=choice.fit.free_lens)
-    problem, _ = full.problem(~wrong, images, choice.overdispersion)
+    full = replace(whole, observations=everything, free_lens=choice.fit.free_lens, overdispersion=choice.overdispersion)
+    problem, _ = full.part(~wrong, images)
     problem, fit = adjust_over_relief(problem, choice)
     problem, fit = with_third_coefficient(problem, fit) if options.lens_chosen else (problem, fit)
     problem, fit, disagreement = hold_positions(problem, fit)
@@ -160,10 +159,8 @@ def align(
         chosen.refined(fit.free_lens),
         observable,
         depth,
-        options.layout_matters,
-        None if options.gravity is None else np.asarray(options.gravity, dtype=np.float64),
+        options,
         disagreement,
-        options.pose_covariance,
     )
     return build_alignment(found)
 
@@ -247,20 +244,12 @@ def _choose_from(
     return choice if choice.fit.model is warm.model and costs[0] <= costs[1] else None
 
 
-def _may_be_depth(
-    observations: Observations, relations: Sequence[RadialHomography], bent: BundleAdjustmentResult, known: CameraPriors
-) -> bool:
-    """Whether the depth of what a few images show may look like their lens.
+def _is_depth(observations: Observations, bent: BundleAdjustmentResult, flat: BundleAdjustmentResult) -> bool:
+    """Whether the depth of what a few images show may look like their lens: with λ free, and held.
 
     Depth changes most from one end of a view to the other, as the effect of a lens does: where it shows in the errors
     that are left, λ takes the blame for more of it than that.
     """
-    if len(np.unique([observations.image1, observations.image2])) > _FEW_VIEWS:
-        return False
-    straight = np.zeros_like(bent.parameters.lens)
-    flat = homography_apart(
-        observations, relations_at(observations, relations, straight), straight, straight != 0.0, known
-    )
     left = left_coherence(flat, observations)
     if left.correlation <= COHERENT_CORRELATION or left.relative_size <= LARGE_RELIEF:
         return False
@@ -279,65 +268,22 @@ def _observable(apart: BundleAdjustmentResult) -> bool:
     return information > OBSERVABLE_STD**-2.0 and PLAUSIBLE_DISTORTION[0] < distortion < PLAUSIBLE_DISTORTION[1]
 
 
-@dataclass(frozen=True)
-class _Graph:
-    """All links; makes the problem of the largest connected part of some of them."""
-
-    count: int
-    observations: Observations
-    homographies: FloatArray
-    trust: FloatArray
-    lens: FloatArray
-    free_lens: BoolArray
-    known: CameraPriors
-    options: AlignmentOptions
-
-    def problem(
-        self, kept: BoolArray, images: IntArray | None = None, overdispersion: float = 1.0
-    ) -> tuple[Problem, IntArray]:
-        """The problem, and its images (those given, if given)."""
-        o = self.observations
-        if images is None:
-            groups = connected_components(self.count, o.image1[kept], o.image2[kept])
-            images = np.array(groups[0], dtype=np.intp)
-        number = np.full(self.count, -1, dtype=np.intp)
-        number[images] = np.arange(len(images))
-        links = np.flatnonzero(kept & (number[o.image1] >= 0) & (number[o.image2] >= 0))
-        own = o.subset(links, number)
-        chosen = self.options.reference
-        if chosen is not None and number[chosen] >= 0:
-            reference = int(number[chosen])
-        else:
-            reference = spanning_tree(len(images), own.image1, own.image2, self.trust[links]).root
-        problem = Problem(
-            own,
-            self.homographies[links],
-            self.trust[links],
-            len(images),
-            reference,
-            self.lens,
-            self.free_lens,
-            self.known.of(images),
-            overdispersion,
-        )
-        return problem, images
-
-
 def _drop_wrong_pairs(
-    graph: _Graph, problem: Problem, images: IntArray, choice: ModelChoice, wrong: BoolArray
+    whole: Problem, problem: Problem, images: IntArray, choice: ModelChoice, wrong: BoolArray
 ) -> tuple[ModelChoice, IntArray, BoolArray]:
     """Test all links against the adjusted poses, and adjust again without those that do not fit."""
-    graph = replace(graph, free_lens=choice.fit.free_lens)
+    whole = replace(whole, free_lens=choice.fit.free_lens)
+    o = whole.observations
     for _ in range(_ROUNDS):
         adjusted, model = choice.fit.adjusted, choice.fit.model
-        everything, _ = graph.problem(np.ones_like(wrong), images)
-        inside = np.isin(graph.observations.image1, images) & np.isin(graph.observations.image2, images)
+        everything, _ = whole.part(np.ones_like(wrong), images)
+        inside = np.isin(o.image1, images) & np.isin(o.image2, images)
         judged = wrong.copy()
         judged[inside] = misfitting_links(everything.squared(model, adjusted.parameters), everything.observations)
         if (judged == wrong).all():
             break
         wrong = judged
-        problem, kept = graph.problem(~wrong)
+        problem, kept = whole.part(~wrong)
         if np.isin(kept, images).all():
             poses = adjusted.parameters.poses[np.searchsorted(images, kept)]
             fit = problem.refine(model, replace(adjusted.parameters, poses=poses), choice.fit.tilt_spread)

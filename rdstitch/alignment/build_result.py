@@ -15,6 +15,7 @@ from rdstitch.alignment.lens_uncertainty import considered_covariance
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise_model import EXACTNESS
+from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.alignment.pose_covariance import pose_covariances
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
@@ -64,14 +65,9 @@ class AdjustedImages:
         Whether λ is observable, or known.
     depth : bool
         Whether that is because what few images show has depth.
-    layout_matters : bool
-        Whether an image is wanted; the lens or the poses otherwise.
-    gravity : ndarray of shape (M, 3), optional
-        Direction down in the axes of every camera; NaN where it is unknown.
+    options : AlignmentOptions
     positions_disagree : str
         Why the positions were not used; empty where they were, or where there are none.
-    pose_covariance : bool
-        Whether covariances of the poses are wanted.
     """
 
     cameras: Sequence[Camera]
@@ -82,11 +78,9 @@ class AdjustedImages:
     choice: ModelChoice
     lens: LensChoice
     observable: bool
-    depth: bool = False
-    layout_matters: bool = True
-    gravity: FloatArray | None = None
-    positions_disagree: str = ""
-    pose_covariance: bool = False
+    depth: bool
+    options: AlignmentOptions
+    positions_disagree: str
 
 
 def build_alignment(found: AdjustedImages) -> Alignment:
@@ -228,7 +222,8 @@ def _in_frame_of_reference(found: AdjustedImages) -> tuple[FloatArray, PlanarPos
     matrices = fit.adjusted.matrices.matrices
     homographies = np.full((count, 3, 3), np.nan)
     if fit.model.on_sphere:
-        gravity = None if found.gravity is None else found.gravity[found.images]
+        given = found.options.gravity
+        gravity = None if given is None else np.asarray(given, dtype=np.float64)[found.images]
         homographies[found.images] = levelled(matrices, reference, gravity)
         return homographies, None
     if not isinstance(fit.model, PlanarModel):
@@ -245,7 +240,7 @@ def _in_frame_of_reference(found: AdjustedImages) -> tuple[FloatArray, PlanarPos
     every = np.full((count, 6), np.nan)
     every[found.images] = fit.model.metric_poses(poses, shared)
     covariances = []
-    for values in pose_covariances(found.problem, fit) if found.pose_covariance else ():
+    for values in pose_covariances(found.problem, fit) if found.options.pose_covariance else ():
         covariances.append(np.full((count, 4, 4), np.nan))
         covariances[-1][found.images] = values
     return homographies, PlanarPoses(
@@ -306,7 +301,7 @@ def _warnings(found: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
             "λ is not observable: what the images show has depth, which looks like a lens in so few of them; "
             "give λ, a camera file, or more images"
         )
-        severity: Severity = "detail" if found.layout_matters else "failure"
+        severity: Severity = "detail" if found.options.layout_matters else "failure"
         result.append(Message(text, severity=severity, code="lambda-not-observable"))
     elif not found.observable:
         text = (
@@ -321,7 +316,9 @@ def _warnings(found: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
                 f"from {len(found.images)} images the lens distortion is known to about {off:.2g} pixels at the "
                 f"corners; {ENOUGH_IMAGES} or more images, or --camera, make it surer"
             )
-            result.append(Message(text, severity="detail" if found.layout_matters else "warning", code="few-images"))
+            result.append(
+                Message(text, severity="detail" if found.options.layout_matters else "warning", code="few-images")
+            )
     if (overruled := _overruled_focal(found, camera)) is not None:
         result.append(Message(overruled))
     if not found.choice.fit.adjusted.converged:

@@ -4,6 +4,7 @@ Levenberg-Marquardt on a robust loss of the transfer errors in measured pixels, 
 of the loss follows the scatter of the errors, from wide to narrow, so that good links are not lost to a rough start.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -23,6 +24,10 @@ from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
 
 _MIN_SIGMA = 1e-3
 """Pixels; a smaller one is not measurable, and errors are divided by it."""
+
+
+WIDEST_START = 0.05
+"""Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is down-weighted."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +154,10 @@ class _State:
     cost: float
 
 
+Revision = Callable[["BundleAdjuster", Parameters, float, FloatArray], "BundleAdjuster"]
+"""See :meth:`BundleAdjuster.run`."""
+
+
 @dataclass(frozen=True)
 class BundleAdjuster:
     """The adjustment of one set of observations with one model.
@@ -172,29 +181,41 @@ class BundleAdjuster:
     overdispersion: float = 1.0
     max_iterations: int = 60
 
-    def run(self, start: Parameters, width: float | None = None) -> BundleAdjustmentResult:
+    def run(self, start: Parameters, revise: Revision | None = None) -> BundleAdjustmentResult:
         """Adjust.
 
         Parameters
         ----------
         start : Parameters
-        width : float, optional
-            Of the robust loss at the start, pixels; the scatter of the first errors decides if not given. It narrows to
-            what the scatter of the errors calls for.
+        revise : callable, optional
+            Takes the adjuster, a solution, its scatter and its whitened errors (M, 2) to the adjuster to go on with;
+            the same one ends the adjustment. Then the loss is as wide in the beginning as most links need, and again
+            after each revision; otherwise the scatter of the first errors decides.
         """
-        sigma = self._sigma(self.squared(start))
-        wide = max(width or 0.0, ALIGNMENT_WIDTH * sigma)
-        parameters, used, converged = start, 0, False
-        while used < self.max_iterations:
+
+        def widest(squared: FloatArray, sigma: float) -> float:
+            return max(self._rough_width(squared) if revise else 0.0, ALIGNMENT_WIDTH * sigma)
+
+        squared = self.squared(start)
+        sigma = self._sigma(squared)
+        adjuster, wide, parameters, total, used = self, widest(squared, sigma), start, 0, 0
+        while True:
             last = wide <= ALIGNMENT_WIDTH * sigma * 1.05
-            state, iterations, converged = self._descend(parameters, sigma, wide, 12 if last else 4)
-            parameters, used = state.parameters, used + iterations
-            sigma, previous = self._sigma(state.equations.squared), sigma
+            state, iterations, converged = adjuster._descend(parameters, sigma, wide, 12 if last else 4)
+            parameters, squared, total, used = (
+                state.parameters,
+                state.equations.squared,
+                total + iterations,
+                used + iterations,
+            )
+            sigma, previous = self._sigma(squared), sigma
             wide = max(wide / 3.0, ALIGNMENT_WIDTH * sigma)
-            if last and converged and abs(sigma - previous) <= 0.02 * previous:
-                break
-            converged = False
-        return self._finished(parameters, sigma, used, converged)
+            converged = last and converged and abs(sigma - previous) <= 0.02 * previous
+            if converged or used >= self.max_iterations:
+                revised = revise(adjuster, parameters, sigma, state.equations.errors) if revise else adjuster
+                if revised is adjuster:
+                    return adjuster._finished(parameters, sigma, total, converged)
+                adjuster, wide, used = revised, widest(squared, sigma), 0
 
     def squared(self, parameters: Parameters) -> FloatArray:
         """``|r|²`` of each correspondence (M,), px², whitened; inf where it cannot be transferred."""
@@ -264,6 +285,12 @@ class BundleAdjuster:
     def _blocks(self) -> PoseBlocks:
         """The pattern of the normal matrix."""
         return PoseBlocks.of(self.observations, self.free.poses)
+
+    def _rough_width(self, squared: FloatArray) -> float:
+        """Width of the loss, pixels, at which most links still count, as far off as a chain may have put them."""
+        medians = self.observations.medians(np.sqrt(squared))
+        most = 1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95))
+        return min(most, WIDEST_START * float(np.median(self.observations.scale2)))
 
     def _sigma(self, squared: FloatArray) -> float:
         return sigma_of(squared[self.observations.scale_inliers_mask])

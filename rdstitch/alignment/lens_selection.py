@@ -137,16 +137,19 @@ def choose_lens(
     if few:
         names = [name for name in names if name != "division-center"]
     free = [free_parameters(name) & ~(CENTER & few) for name in names]
-    fits = [apart] if names[0] == "division" else []
-    for own in free[len(fits) :]:
-        start = fits[-1] if fits else apart
-        fits.append(homography_apart(observations, start.homographies, start.parameters.lens, own, known))
+
+    def fit(free: BoolArray, start: BundleAdjustmentResult) -> BundleAdjustmentResult:
+        return homography_apart(observations, start.homographies, start.parameters.lens, free, known)
+
     if len(names) == 1:
-        return LensChoice(names[0], free[0], fits[0], "as requested")
-    errors = whitened_errors(observations, fits[-1].homographies, fits[-1].parameters.lens)
-    judge = _Judge(NoiseModel.of_independent_links(observations, errors), _parts(observations))
-    best = 0
-    for index in range(1, len(names)):
+        return LensChoice(names[0], free[0], apart if names[0] == "division" else fit(free[0], apart), "as requested")
+    fits, best = [apart], 0
+    for index, name in enumerate(names[1:], start=1):
+        if name == "division3" and names[best] != "division2":
+            break  # the next term of a series that is not needed
+        fits.append(fit(free[index], fits[-1]))
+        errors = whitened_errors(observations, fits[-1].homographies, fits[-1].parameters.lens)
+        judge = _Judge(NoiseModel.of_independent_links(observations, errors), _parts(observations))
         added = int(free[index].sum() - free[best].sum())
         gains = judge.prefers(fits[index], fits[best], added, names[best])
         if gains and has_plausible_center(fits[index], observations):
@@ -231,7 +234,7 @@ class _Judge:
     Attributes
     ----------
     noise : NoiseModel
-        Of the errors that the richest lens leaves.
+        Of the errors that the richer lens leaves.
     part : ndarray of shape (M,), intp
         The part of the observations that each correspondence falls into: its link, or a cell of it.
     """
@@ -278,10 +281,10 @@ def _parts(observations: Observations) -> IntArray:
 
 def _reason(names: Sequence[str], fits: Sequence[BundleAdjustmentResult], best: int) -> str:
     """Why a lens was chosen, one sentence."""
-    errors = [f"{name} {fit.sigma:.3f} pixels" for name, fit in zip(names, fits, strict=True)]
+    errors = [f"{name} {fit.sigma:.3f} pixels" for name, fit in zip(names, fits, strict=False)]
     text = f"{names[best]}: pairs on their own leave an error of {fits[best].sigma:.3f} pixels"
     if best:
         text += f", simpler lenses more ({', '.join(errors[:best])})"
-    if best + 1 < len(names):
+    if best + 1 < len(fits):
         text += f", more parameters gain too little ({', '.join(errors[best + 1 :])})"
     return text

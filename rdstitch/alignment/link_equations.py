@@ -49,6 +49,11 @@ class LinkEquations:
     whitening: FloatArray
     error: FloatArray
 
+    @property
+    def errors(self) -> FloatArray:
+        """Whitened errors (M, 2), pixels; NaN where there is no transfer."""
+        return whiten(self.whitening, self.error.T).T
+
     @np.errstate(all="ignore")
     def squared_with(self, whitening: FloatArray) -> FloatArray:
         """``|r|²`` (M,) with a whitening that was computed elsewhere, px²; inf where there is no transfer.

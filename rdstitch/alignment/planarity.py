@@ -60,9 +60,8 @@ class Coherence:
 def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray) -> Coherence:
     """Agreement of the residuals (M, 2) of neighbouring inliers of the same link; of very many links, every n-th."""
     chosen = _sample(observations, inliers)
-    link, points, residual = observations.link[chosen], observations.points1[chosen], errors[chosen]
-    images = len(np.unique(np.concatenate([observations.image1, observations.image2])))
-    if len(points) < 2:
+    residual = errors[chosen]
+    if len(residual) < 2:
         return Coherence(0.0, 0.0, 0.0, 1.0)
     first, second = neighbours(observations, inliers)
     products = np.einsum("mi,mi->m", errors[first], errors[second])
@@ -73,9 +72,19 @@ def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray
         common / power if power > 0.0 else 0.0,
         size,
         size / (2.0 * float(np.median(observations.scale2))),
-        max(_overdispersion(link, points, residual, len(observations), cells) for cells in _CELLS)
-        * max(1.0, len(observations) / max(images - 1, 1)),
+        shared_variance(observations, errors, inliers),
     )
+
+
+def shared_variance(observations: Observations, errors: FloatArray, inliers: BoolArray) -> float:
+    """The overdispersion of residuals (M, 2), see :class:`Coherence`."""
+    chosen, links = _sample(observations, inliers), len(observations)
+    if len(chosen) < 2:
+        return 1.0
+    link, points, residual = observations.link[chosen], observations.points1[chosen], errors[chosen]
+    images = len(np.unique([observations.image1, observations.image2]))
+    worst = max(_overdispersion(link, points, residual, links, cells) for cells in _CELLS)
+    return worst * max(1.0, links / max(images - 1, 1))
 
 
 def neighbours(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:

@@ -161,6 +161,9 @@ def select_model(
     turns = [MODELS[name] for name in names if MODELS[name].on_sphere]
     wide = replace(problem, free_lens=np.logical_or.reduce([problem.free_lens, *lenses]))
     for turn in turns:
+        if len(problem.observations) == 1:  # a trial is the whole
+            tried.append(posterior.of(problem.fit(turn)))
+            continue
         trial = wide.trial(turn)
         if len(names) == 1 or trial.sigma <= posterior.largest_trial:
             tried.append(posterior.of(problem.fit(turn, shared=trial.parameters.shared)))

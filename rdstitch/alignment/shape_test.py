@@ -16,6 +16,7 @@ camera's distance, that prior would allow little: so extreme cases are tried, to
 curved wall by a strong tilt and a focal length that next to no lens has: then the usual focal length is tried.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
@@ -23,12 +24,25 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.motion_models import PlanarModel
+from rdstitch.alignment.bundle_adjustment import BundleAdjuster, Parameters
+from rdstitch.alignment.linear_response import LinearResponse
+from rdstitch.alignment.link_equations import LinearizedErrors
+from rdstitch.alignment.motion_models import PlanarModel, inverses
+from rdstitch.alignment.noise_model import EXACTNESS
+from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ShapeTest
-from rdstitch.alignment.shape_directions import Directions, places
-from rdstitch.alignment.unmodelled import CROPPED, USUAL_FOCAL, Effect, cropping_effects, unmodelled_effects
+from rdstitch.alignment.unmodelled import (
+    CROPPED,
+    USUAL_FOCAL,
+    Effect,
+    cropping_effects,
+    mapped,
+    undistorted,
+    unmodelled_effects,
+)
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
+from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _LARGE = 0.004
 """Of an image's diagonal: an image may be off by less; sets wrong by three pixels of 500 have 0.005 and more."""
@@ -39,117 +53,67 @@ _SHOWN_PER_EFFECT = 4.0
 UNLIKELY_FOCAL = 4.0
 """Standard deviations of what is known of a focal length beyond which it may stand for something else."""
 
+_SIDE = 6
+"""Points along a side of each image whose places are compared."""
+
+_ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 8
+"""Correspondences in all, and of each link at least, that say what the shape is."""
+
+_NO_ROBUSTNESS = 1e9
+"""Pixels: a width of the loss at which it is the square."""
+
+_STEP = 1e-4
+"""Of differences: sizes of an effect, standard deviations of a shared parameter, and half diagonals."""
+
 
 def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeTest:
-    """Try a fit against what it leaves out.
-
-    Parameters
-    ----------
-    problem : Problem
-    fit : Fit
-        Of a model over a plane.
-    cameras : sequence of Camera
-        Of the problem's images.
-    """
+    """Try a fit of a model over a plane against what it leaves out; the cameras are those of the problem's images."""
     effects, probes = unmodelled_effects(fit), cropping_effects(problem.count)
-    found = Directions.of(problem, fit, [*effects, *probes])
-    information, gradient = found.information()
-    tried = len(gradient) - len(probes)
-    probed = (_gain(information, gradient) - _gain(information[:tried, :tried], gradient[:tried])) / len(probes)
-    information, gradient = information[:tried, :tried], gradient[:tried]
-    at = *places(found, cameras, tried), problem.count
-    usual = _Prediction.of(effects, information, gradient, *at, max(1.0, probed))
-    extreme = _Prediction.of(effects, _with_extremes(information, effects), gradient, *at, max(1.0, probed))
-    diagonals = np.array([2.0 * camera.scale for camera in cameras])
-    judged, off = usual, np.hypot(usual.shifts, usual.stds)
+    answers = _Answers.of(problem, fit, [*effects, *probes])
+    stds = np.array([effect.std for effect in answers.effects])
+    usual_stds, extreme_stds = stds[: len(effects)], np.array([effect.largest or effect.std for effect in effects])
+    probed = (answers.gain(stds) - answers.gain(usual_stds)) / len(probes)
+    moved, images = _displacements(answers, fit, len(effects), cameras)
+
+    def per_image(squared: FloatArray) -> FloatArray:
+        """Root mean square (N,) of the points of each image, from the squares of all."""
+        points = np.maximum(np.bincount(images, minlength=len(cameras)), 1)
+        return np.sqrt(np.maximum(np.bincount(images, squared, len(cameras)), 0.0) / points)
+
+    def predict(stds: FloatArray) -> _Prediction:
+        sizes, covariance = answers.estimate(stds)
+        gain, spread = answers.gain(stds), max(1.0, probed) * np.einsum("pas,st,pat->p", moved, covariance, moved)
+        shifts = per_image(((moved @ sizes) ** 2).sum(axis=1))
+        return _Prediction(gain, gain / len(stds), shifts, per_image(spread), _cause(effects, sizes, covariance))
+
+    large = _LARGE * np.array([2.0 * camera.scale for camera in cameras])
+    judged = usual = predict(usual_stds)
+    off = np.hypot(usual.shifts, usual.stds)
     # Extreme cases count where the errors show them. Where the images only fail to exclude them, as along any row, no
     # image would be good enough.
-    doubtful = bool(off.max() > _LARGE * diagonals[off.argmax()])
-    if not doubtful and extreme.shown and (extreme.shifts > _LARGE * diagonals).any():
-        doubtful, judged, off = True, extreme, extreme.shifts
+    doubtful = bool(off.max() > large[off.argmax()])
+    if not doubtful and answers.gain(extreme_stds) > _SHOWN_PER_EFFECT * len(effects):
+        extreme = predict(extreme_stds)
+        if (extreme.shifts > large).any():
+            doubtful, judged, off = True, extreme, extreme.shifts
     beside = beside_usual_focal(problem, fit)
     if not doubtful and abs(beside) > UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
-        elsewhere = usual.moved_along(len(fit.adjusted.parameters.shared) - 1, -beside, information, *at)
-        if (elsewhere.shifts > _LARGE * diagonals).any():
-            doubtful, judged, off = True, elsewhere, elsewhere.shifts
+        by_focal = np.delete(answers.shared[len(fit.adjusted.parameters.shared) - 1], np.s_[len(effects) : len(stds)])
+        follow = answers.estimate(usual_stds)[1] @ by_focal  # all that moves with the focal length
+        shifts = per_image(((moved @ follow * (beside / (by_focal @ follow))) ** 2).sum(axis=1))
+        if (shifts > large).any():
+            doubtful, off = True, shifts
+            judged = _Prediction(usual.gain, 0.0, shifts, np.zeros_like(shifts), USUAL_FOCAL)
     image = int(off.argmax())
     return ShapeTest(
         doubtful=doubtful,
         gain=judged.gain,
-        shown=judged.shown or probed > _SHOWN_PER_EFFECT,
+        shown=max(judged.by_effect, probed) > _SHOWN_PER_EFFECT,
         image=image,
         shift=float(judged.shifts[image]),
         shift_std=float(judged.stds[image]),
         cause=CROPPED if probed > max(judged.by_effect, _SHOWN_PER_EFFECT) else judged.cause,
     )
-
-
-@dataclass(frozen=True)
-class _Prediction:
-    """What the effects would change.
-
-    Attributes
-    ----------
-    gain, by_effect : float
-        By how much they lessen the cost, in squared standard deviations; the same for each of them.
-    shifts, stds : ndarray of shape (N,)
-        How far each image moves, and the standard deviation of that, pixels.
-    cause : str
-        The kind of effects that is farthest from nothing.
-    """
-
-    gain: float
-    by_effect: float
-    shifts: FloatArray
-    stds: FloatArray
-    cause: str
-
-    @property
-    def shown(self) -> bool:
-        """Whether they explain more than noise does."""
-        return self.by_effect > _SHOWN_PER_EFFECT
-
-    @classmethod
-    def of(
-        cls,
-        effects: Sequence[Effect],
-        information: FloatArray,
-        gradient: FloatArray,
-        moved: FloatArray,
-        images: IntArray,
-        count: int,
-        inflation: float,
-    ) -> Self:
-        """From the information (S, S) and gradient (S,) on the shared parameters and the effects.
-
-        ``moved`` and ``images`` are what :func:`places` gives; variances are multiplied by ``inflation``.
-        """
-        kept = len(gradient) - len(effects)
-        alone = information[:kept, :kept]
-        covariance = np.linalg.inv(information)
-        step = -covariance @ gradient
-        step[:kept] += np.linalg.solve(alone, gradient[:kept])  # what the fit lacks without any effect
-        covariance *= inflation
-        squared = ((moved @ step) ** 2).sum(axis=1), np.einsum("pas,st,pat->p", moved, covariance, moved)
-        shifts, stds = (_per_image(own, images, count) for own in squared)
-        gain = _gain(information, gradient) - _gain(alone, gradient[:kept])
-        cause = _cause(effects, step[kept:], np.asarray(covariance[kept:, kept:], dtype=np.float64))
-        return cls(gain, gain / len(effects), shifts, stds, cause)
-
-    def moved_along(
-        self, index: int, size: float, information: FloatArray, moved: FloatArray, images: IntArray, count: int
-    ) -> Self:
-        """What a step of one shared parameter, the logarithm of the focal length, changes when all others follow it."""
-        response = np.linalg.inv(information)[:, index]
-        shifts = _per_image(((moved @ response * (size / response[index])) ** 2).sum(axis=1), images, count)
-        return replace(self, by_effect=0.0, shifts=shifts, stds=np.zeros(count), cause=USUAL_FOCAL)
-
-
-def _per_image(squared: FloatArray, images: IntArray, count: int) -> FloatArray:
-    """Root mean square (N,) of the points (P,) of each image."""
-    points = np.maximum(np.bincount(images, minlength=count), 1)
-    result: FloatArray = np.sqrt(np.maximum(np.bincount(images, squared, count), 0.0) / points)
-    return result
 
 
 def beside_usual_focal(problem: Problem, fit: Fit) -> float:
@@ -160,17 +124,142 @@ def beside_usual_focal(problem: Problem, fit: Fit) -> float:
     return log_focal - problem.camera_priors.log_focal
 
 
-def _with_extremes(information: FloatArray, effects: Sequence[Effect]) -> FloatArray:
-    """The information (S, S) if the effects, which come last, may be as large as in extreme cases."""
-    result = information.copy()
-    last = np.arange(len(information) - len(effects), len(information))
-    result[last, last] += [(effect.largest or effect.std) ** -2.0 - effect.std**-2.0 for effect in effects]
-    return result
+@dataclass(frozen=True)
+class _Prediction:
+    """What effects would change: gain in squared standard deviations, in all and by effect; pixels (N,); the cause."""
+
+    gain: float
+    by_effect: float
+    shifts: FloatArray
+    stds: FloatArray
+    cause: str
 
 
-def _gain(information: FloatArray, gradient: FloatArray) -> float:
-    """By how much a step lessens the cost, in squared standard deviations."""
-    return float(gradient @ np.linalg.solve(information, gradient))
+@dataclass(frozen=True)
+class _Answers:
+    """How an adjustment answers E effects of unit size, and its S shared parameters: these as they are without effects.
+
+    Attributes
+    ----------
+    adjuster : BundleAdjuster
+    effects : sequence of Effect
+    poses, shared : ndarray of shape (F, E + S) and (S, E + S)
+        Steps of the free pose parameters, and of the shared ones.
+    information, gradient : ndarray of shape (E, E) and (E,)
+        On the sizes of the effects, by what the parameters do not absorb.
+    covariance : ndarray of shape (S, S)
+        Of the shared parameters without the effects.
+    """
+
+    adjuster: BundleAdjuster
+    effects: Sequence[Effect]
+    poses: FloatArray
+    shared: FloatArray
+    information: FloatArray
+    gradient: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, problem: Problem, fit: Fit, effects: Sequence[Effect]) -> Self:
+        """At a fit of the problem, by the inliers; no error says more than :data:`EXACTNESS` allows."""
+        adjuster = problem.adjuster_of(fit)
+        o = _inliers(adjuster, fit)
+        adjuster, at = (
+            replace(adjuster, observations=o),
+            replace(fit.adjusted, sigma=math.hypot(fit.adjusted.sigma, EXACTNESS)),
+        )
+        normal, weight = adjuster.normal_equations(at, _NO_ROBUSTNESS), adjuster.weight(at.sigma)
+        response = LinearResponse(adjuster, at, np.full(len(o.points1), weight), 1.0, normal)
+        link, count = o.link, len(effects)
+
+        def fields(part: LinearizedErrors) -> FloatArray:
+            """How the errors change (m, 2, E)."""
+            changes = np.zeros((*part.errors.shape, count))
+            for by, points, images in ((part.by_point1, o.points1, o.image1), (part.by_point2, o.points2, o.image2)):
+                own = points[part.rows], images[link[part.rows]]
+                changes += by @ np.nan_to_num(np.stack([each.displacement(*own) for each in effects], axis=2))
+            return changes
+
+        poses, shared = response.steps_of(fields, count)
+        information = np.zeros((count, count))
+        gradient = poses.T @ normal.gradient_poses + shared.T @ normal.gradient_shared
+        for part in response.parts():
+            changes = fields(part)
+            left = changes + response.changes(part, poses, shared)
+            weighted = weight * changes.reshape(-1, count)
+            gradient += weighted.T @ part.errors.ravel()
+            information += weighted.T @ left.reshape(-1, count)
+        covariance = normal.responses(np.zeros_like(normal.coupling), -np.eye(len(shared)))[1]
+        return cls(
+            adjuster,
+            effects,
+            np.hstack([poses, normal.pose_response()]),
+            np.hstack([shared, np.eye(len(shared))]),
+            (information + information.T) / 2.0,
+            gradient,
+            covariance,
+        )
+
+    def estimate(self, stds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Sizes of the first effects, by their standard deviations (K,), and of the shared parameters; covariance."""
+        count, shared = len(stds), len(self.covariance)
+        covariance = np.zeros((count + shared,) * 2)
+        covariance[:count, :count] = np.linalg.inv(self.information[:count, :count] + np.diag(stds**-2.0))
+        covariance[count:, count:] = self.covariance
+        return -covariance[:, :count] @ self.gradient[:count], covariance
+
+    def gain(self, stds: FloatArray) -> float:
+        """By how much the first effects, of these standard deviations, lessen the cost, squared standard deviations."""
+        count = len(stds)
+        return -float(self.gradient[:count] @ self.estimate(stds)[0][:count])
+
+
+def _inliers(adjuster: BundleAdjuster, fit: Fit) -> Observations:
+    """As many observations as say what the shape is, without those that the fit does not explain."""
+    few = adjuster.observations.thinned(max(_ENOUGH // max(len(adjuster.observations), 1), _MIN_MATCHES_PER_LINK))
+    squared = replace(adjuster, observations=few).squared(fit.adjusted.parameters)
+    kept = squared <= (ALIGNMENT_WIDTH * fit.adjusted.sigma) ** 2
+    before = np.concatenate([[0], np.cumsum(kept)])
+    return replace(few, start=before[few.start], points1=few.points1[kept], points2=few.points2[kept])
+
+
+def _displacements(answers: _Answers, fit: Fit, count: int, cameras: Sequence[Camera]) -> tuple[FloatArray, IntArray]:
+    """How far points all over the images move in them (P, 2, K + S), pixels, and the image of each (P,).
+
+    With the first K effects, of unit size, and with the shared parameters; up to one homography of the whole.
+    """
+    grid = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, _SIDE)] * 2), axis=-1).reshape(-1, 2)
+    points = np.concatenate([camera.normalize(grid * (np.array(camera.image_size) - 1.0)) for camera in cameras])
+    images = np.repeat(np.arange(len(cameras)), len(grid))
+    free, parameters = answers.adjuster.free, fit.adjusted.parameters
+
+    def ground(measured: FloatArray, parameters: Parameters = parameters) -> FloatArray:
+        """Where measured points lie on the plane; NaN beyond the horizon."""
+        matrices = fit.model.matrices(parameters.poses, parameters.shared).matrices
+        return mapped(inverses(matrices)[images], undistorted(measured, parameters.lens))
+
+    here, columns = ground(points), []
+    of_shared = np.sqrt(np.maximum(np.diag(answers.covariance), 1e-300))
+    steps = [(points + _STEP * effect.displacement(points, images), _STEP) for effect in answers.effects[:count]]
+    steps += [(points, _STEP * std) for std in of_shared.tolist()]
+    for index, (measured, size) in enumerate(steps):
+        column = index if index < count else index - count - len(of_shared)
+        poses = np.zeros(free.poses.shape)
+        poses[free.poses] = answers.poses[:, column] * size
+        moved = parameters.retract(fit.model, poses, answers.shared[:, column] * size, free.lens)
+        columns.append((ground(measured, moved) - here) / size)
+    flat = (here - np.nanmean(here, axis=0)) / max(float(np.nanstd(here)), 1e-12)
+    frame = [np.outer(own, unit).reshape(-1, 2) for own in (np.ones(len(flat)), *flat.T) for unit in np.eye(2)]
+    frame += [flat * flat[:, [axis]] for axis in (0, 1)]
+    by_point = [(ground(points + step) - ground(points - step)) / (2.0 * _STEP) for step in _STEP * np.eye(2)]
+    on_plane = np.stack([*columns, *frame], axis=2)
+    seen = np.isfinite(on_plane).all(axis=(1, 2)) & np.isfinite(by_point).all(axis=(0, 2))
+    images = images[seen]
+    scale = np.array([camera.scale for camera in cameras])[images, None, None]
+    in_image = np.linalg.solve(np.stack(by_point, axis=2)[seen], on_plane[seen]) * scale
+    changes, by_frame = np.split(in_image, [len(columns)], axis=2)
+    known = np.linalg.lstsq(by_frame.reshape(-1, len(frame)), changes.reshape(-1, len(columns)), rcond=None)[0]
+    return changes - by_frame @ known, images
 
 
 def _cause(effects: Sequence[Effect], sizes: FloatArray, covariance: FloatArray) -> str:

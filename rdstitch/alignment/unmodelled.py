@@ -12,6 +12,7 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit
 from rdstitch.alignment.lens_selection import CENTER
+from rdstitch.alignment.link_equations import split_lens
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y, inverses
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import distort, undistort
@@ -27,6 +28,9 @@ ROLLING_SHUTTER = "rows that were read while the camera moved (a rolling shutter
 CURVED = "a curved surface"
 CROPPED = "images that were cropped, or stabilised, each differently"
 USUAL_FOCAL = "a usual focal length, far from the one that fits best"
+
+_STEP = 1e-4
+"""Of differences by an effect's size."""
 
 _PATTERNS = 8
 """Random ways in which images are tried to be cropped: as many for few images as for many."""
@@ -51,6 +55,12 @@ class Effect:
     correct: Correction
     std: float
     largest: float | None = None
+
+    def displacement(self, points: FloatArray, images: IntArray) -> FloatArray:
+        """Derivative (M, 2) of the corrected points by the size."""
+        ahead, behind = (self.correct(points, images, size) for size in (_STEP, -_STEP))
+        derivative: FloatArray = (ahead - behind) / (2.0 * _STEP)
+        return derivative
 
 
 def unmodelled_effects(fit: Fit) -> list[Effect]:
@@ -81,45 +91,23 @@ _SHEARS = ([[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [0.0, 0.0]])
 
 def _shifted(axis: int) -> Correction:
     """The distortion centre lies elsewhere."""
-    direction = np.eye(2)[axis]
-
-    def correct(points: FloatArray, images: IntArray, size: float) -> FloatArray:
-        moved: FloatArray = points - size * direction
-        return moved
-
-    return correct
+    return lambda points, images, size: points - size * np.eye(2)[axis]
 
 
 def _cropped(pattern: FloatArray) -> Correction:
     """The distortion centre lies elsewhere in each image, by its row of (N, 2)."""
-
-    def correct(points: FloatArray, images: IntArray, size: float) -> FloatArray:
-        moved: FloatArray = points - size * pattern[images]
-        return moved
-
-    return correct
-
-
-def _bent(lens: FloatArray) -> Correction:
-    """μ is another one."""
-    center, (first, second, third) = lens[CENTER], lens[~CENTER].tolist()
-
-    def correct(points: FloatArray, images: IntArray, size: float) -> FloatArray:
-        flat = undistort(points - center, first, (second + size, third))
-        moved: FloatArray = distort(flat, first, (second, third)) + center
-        return moved
-
-    return correct
+    return lambda points, images, size: points - size * pattern[images]
 
 
 def _sheared(matrix: FloatArray) -> Correction:
     """The image is changed linearly."""
+    return lambda points, images, size: points + size * points @ matrix.T
 
-    def correct(points: FloatArray, images: IntArray, size: float) -> FloatArray:
-        moved: FloatArray = points + size * points @ matrix.T
-        return moved
 
-    return correct
+def _bent(lens: FloatArray) -> Correction:
+    """μ is another one."""
+    more = np.array([0.0, 1.0, 0.0, 0.0, 0.0])
+    return lambda points, images, size: _distorted(undistorted(points, lens + size * more), lens)
 
 
 def _curved(fit: Fit, model: PlanarModel, axes: tuple[int, int]) -> Correction:
@@ -127,20 +115,29 @@ def _curved(fit: Fit, model: PlanarModel, axes: tuple[int, int]) -> Correction:
     adjusted = fit.adjusted
     poses = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)
     position, height = poses[:, [X, Y]], np.exp(poses[:, LOG_HEIGHT])
-    to_image, middle = adjusted.matrices.matrices, position.mean(axis=0)
+    to_image, middle, lens = adjusted.matrices.matrices, position.mean(axis=0), adjusted.parameters.lens
     to_ground = inverses(to_image)
-    lens = adjusted.parameters.lens
-    distortion, higher, center = float(lens[0]), tuple(lens[1:3].tolist()), lens[CENTER]
 
     def correct(points: FloatArray, images: IntArray, size: float) -> FloatArray:
-        foot = mapped(to_ground[images], undistort(points - center, distortion, higher))
+        foot = mapped(to_ground[images], undistorted(points, lens))
         a, b = (foot - middle)[:, axes].T
         below = position[images]
         place = below + (foot - below) * (1.0 - 0.5 * size * a * b / height[images])[:, None]
-        moved: FloatArray = distort(mapped(to_image[images], place), distortion, higher) + center
-        return moved
+        return _distorted(mapped(to_image[images], place), lens)
 
     return correct
+
+
+def undistorted(points: FloatArray, lens: FloatArray) -> FloatArray:
+    """Measured points (M, 2), half diagonals, without the lens (5,)."""
+    distortion, higher, center = split_lens(lens)
+    return undistort(points - center, distortion, higher)
+
+
+def _distorted(points: FloatArray, lens: FloatArray) -> FloatArray:
+    distortion, higher, center = split_lens(lens)
+    measured: FloatArray = distort(points, distortion, higher) + center
+    return measured
 
 
 def mapped(homographies: FloatArray, points: FloatArray) -> FloatArray:

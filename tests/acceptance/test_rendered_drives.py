@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rdstitch
-from rdstitch.alignment.trajectory import compare_trajectories
+from examples.judging.trajectories import compare_trajectories
 from tests.cli.running import FAST, finished, start
 from tests.floor_drives import DISTORTION, PATHS, floor_drive, read_path, true_path
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import ExifTags, Image
 
 import rdstitch
-from rdstitch.alignment.trajectory import compare_trajectories
+from examples.judging.trajectories import compare_trajectories
 from rdstitch.camera import Camera
 from rdstitch.synthetic import Photometry, ground, parking_poses, sequence_over
 from tests.cli.running import CACHED, DISTORTION, Run

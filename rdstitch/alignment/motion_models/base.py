@@ -1,8 +1,8 @@
 """What the adjustment uses of a motion model."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -27,65 +27,71 @@ class ModelMatrices:
     by_shared: FloatArray
 
 
-class MotionModel(Protocol):
-    """A motion model, as the adjustment uses it."""
+class MotionModel(ABC):
+    """A motion model, as the adjustment uses it.
 
-    @property
-    def name(self) -> str:
-        """One word for it."""
+    Attributes
+    ----------
+    name : str
+        One word for it.
+    pose_size : int
+        Free parameters per image, D.
+    shared_names : tuple of str
+        Parameters that all images share, S of them, without those of the lens.
+    on_sphere : bool
+        Whether images lie around one centre, not over a plane.
+    one_camera : bool
+        Whether all images are of one camera with one focal length, the last of the shared parameters.
+    free_tilts, any_tilt : bool
+        Whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one.
+    """
 
-    @property
-    def pose_size(self) -> int:
-        """Free parameters per image, D."""
-
-    @property
-    def on_sphere(self) -> bool:
-        """Whether images lie around one centre, not over a plane."""
-
-    @property
-    def one_camera(self) -> bool:
-        """Whether all images are of one camera with one focal length, the last of the shared parameters."""
-
-    @property
-    def free_tilts(self) -> bool:
-        """Whether each image has a tilt of its own."""
-
-    @property
-    def any_tilt(self) -> bool:
-        """Whether the tilts may be any, and not only differ a little from a shared one."""
-
-    @property
-    def shared_names(self) -> tuple[str, ...]:
-        """Parameters that all images share, S of them, without those of the lens."""
+    name: str
+    pose_size: int
+    shared_names: tuple[str, ...] = ()
+    on_sphere: bool = False
+    one_camera: bool = True
+    free_tilts: bool = False
+    any_tilt: bool = False
 
     @property
     def gauge(self) -> BoolArray:
-        """Gauge: which of the D parameters of the reference image the choice of the frame fixes, shape (D,)."""
+        """Gauge: which of the D parameters of the reference image the choice of the frame fixes, shape (D,); all."""
+        return np.ones(self.pose_size, dtype=np.bool_)
 
+    @abstractmethod
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
         """Homographies from the plane to the images, with derivatives."""
 
     def physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What :attr:`shared_names` names (S,), and its derivatives by the shared parameters (S, S)."""
+        return shared, np.eye(len(shared))
 
     def shared_from_physical(self, physical: FloatArray) -> FloatArray:
-        """The inverse of :meth:`physical_parameters`."""
+        """The inverse of :meth:`physical_parameters`, also from those of a model with more of them."""
+        return np.asarray(physical[len(physical) - len(self.shared_names) :], dtype=np.float64)
 
+    @abstractmethod
     def shared_starts(self, log_focal: float, tilt: Sequence[float], *, tilt_known: bool) -> list[FloatArray]:
         """Shared parameters (S,) near enough to any usual ones for an adjustment to converge from the nearest."""
 
+    @abstractmethod
     def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, D)."""
 
     def prior_coordinates(self, poses: FloatArray) -> FloatArray:
         """The D parameters of each image (N, D) that priors are on; zeros where there can be none."""
+        return np.zeros((len(poses), self.pose_size))
 
+    @abstractmethod
     def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """Homographies (N, 3, 3) of images at the origin of the plane, with the tilts (N, 2) given."""
 
+    @abstractmethod
     def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The poses with these tilts (N, 2) that come nearest to plane-to-image homographies (N, 3, 3)."""
 
+    @abstractmethod
     def description(self, poses: FloatArray, shared: FloatArray) -> str:
         """What a fit says of the camera."""
 

@@ -1,12 +1,11 @@
 """Any motion of any camera: one homography per image."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.alignment.motion_models.base import ModelMatrices
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel
+from rdstitch.arrays import FloatArray
 
 _TRACELESS = np.zeros((8, 3, 3))
 _TRACELESS[[0, 1, 2, 3, 4, 5], [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0
@@ -14,8 +13,7 @@ _TRACELESS[6] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2.0)
 _TRACELESS[7] = np.diag([1.0, 1.0, -2.0]) / np.sqrt(6.0)
 
 
-@dataclass(frozen=True)
-class HomographyModel:
+class HomographyModel(MotionModel):
     """One homography per image: eight parameters, a step being ``P ← exp(Σ δ_k E_k) P``.
 
     The step acts in the image's frame, where coordinates are of order one however far away the image lies. ``E_k``
@@ -23,31 +21,12 @@ class HomographyModel:
     all relations of images as they are, to any order. Poses are P, row by row.
     """
 
-    name: str = "homography"
-    pose_size: int = 8
-    shared_names: tuple[str, ...] = ()
-    on_sphere: bool = False
-    one_camera: bool = False
-    free_tilts: bool = False
-    any_tilt: bool = False
-
-    @property
-    def gauge(self) -> BoolArray:
-        """All of the reference image: the plane may be mapped by any homography."""
-        return np.ones(8, dtype=np.bool_)
+    name, pose_size, one_camera = "homography", 8, False
 
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
         """Homographies from the plane to the images, with derivatives."""
         matrices = poses.reshape(-1, 3, 3)
         return ModelMatrices(matrices, _TRACELESS @ matrices[:, None], np.zeros((len(poses), 0, 3, 3)))
-
-    def physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Nothing."""
-        return np.zeros(0), np.zeros((0, 0))
-
-    def shared_from_physical(self, physical: FloatArray) -> FloatArray:
-        """Nothing."""
-        return np.zeros(0)
 
     def shared_starts(self, log_focal: float, tilt: Sequence[float], *, tilt_known: bool) -> list[FloatArray]:
         """Nothing to try."""
@@ -58,10 +37,6 @@ class HomographyModel:
         change = np.einsum("nk,kij->nij", step, _TRACELESS)
         growth = np.eye(3) + change @ (np.eye(3) + change / 2.0)  # exp to second order
         return _unit_determinant(growth @ poses.reshape(-1, 3, 3))
-
-    def prior_coordinates(self, poses: FloatArray) -> FloatArray:
-        """Zeros: homographies have no prior."""
-        return np.zeros((len(poses), 8))
 
     def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The identity."""

@@ -6,11 +6,10 @@ those; otherwise it would have to follow a curved valley, and a prior on small t
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.alignment.motion_models.base import ModelMatrices
+from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.planar_motion import ABOUT_X, ABOUT_Y, nearest_in_plane, rigid_in_plane, rotation_from_tilt
 
@@ -23,38 +22,18 @@ _TILT_STARTS = np.array([(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, 
 _MAX_LOG_HEIGHT = 10.0  # where the model does not describe the motion, heights may diverge
 
 
-@dataclass(frozen=True)
-class PlanarModel:
+class PlanarModel(MotionModel):
     """Camera that moves over a plane with a tilt that it keeps, or nearly keeps.
 
     Poses have six columns, :data:`YAW` to :data:`THETA`, of which only the free ones move; positions are multiplied by
     the focal length, tilts that are free divided by it. The shared parameters are ψ/f, θ/f and log f.
-
-    Attributes
-    ----------
-    name : str
-    free : tuple of int
-        The free columns.
-    any_tilt : bool
-        Whether free tilts may be any.
     """
 
-    name: str
-    free: tuple[int, ...]
-    any_tilt: bool = False
-    shared_names: tuple[str, ...] = ("psi", "theta", "log_focal")
-    on_sphere: bool = False
-    one_camera: bool = True
+    shared_names = ("psi", "theta", "log_focal")
 
-    @property
-    def free_tilts(self) -> bool:
-        """Whether each image has a tilt of its own."""
-        return PSI in self.free
-
-    @property
-    def pose_size(self) -> int:
-        """Free parameters per image."""
-        return len(self.free)
+    def __init__(self, name: str, free: tuple[int, ...], *, any_tilt: bool = False) -> None:
+        self.name, self.free, self.any_tilt = name, free, any_tilt
+        self.pose_size, self.free_tilts = len(free), PSI in free
 
     @property
     def gauge(self) -> BoolArray:

@@ -6,12 +6,11 @@ no horizon, so that a full circle closes. A step turns the camera in its own fra
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.alignment.motion_models.base import ModelMatrices
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel
+from rdstitch.arrays import FloatArray
 from rdstitch.planar_motion import nearest_rotation
 
 _FOCAL_STARTS = tuple(math.log(focal) for focal in (0.6, 0.9, 1.4, 2.2, 3.6, 6.0))
@@ -26,26 +25,14 @@ _CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = 1.0
 _CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = -1.0
 
 
-@dataclass(frozen=True)
-class RotationModel:
+class RotationModel(MotionModel):
     """Camera that turns about its centre.
 
     Poses are R, row by row, from the common frame of directions to the camera; the shared parameter is log f, f in
     half diagonals.
     """
 
-    name: str = "rotation"
-    pose_size: int = 3
-    shared_names: tuple[str, ...] = ("log_focal",)
-    on_sphere: bool = True
-    one_camera: bool = True
-    free_tilts: bool = False
-    any_tilt: bool = False
-
-    @property
-    def gauge(self) -> BoolArray:
-        """All of the reference image: the frame of directions may be turned."""
-        return np.ones(3, dtype=np.bool_)
+    name, pose_size, shared_names, on_sphere = "rotation", 3, ("log_focal",), True
 
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
         """Matrices from directions to the images, with derivatives."""
@@ -57,14 +44,6 @@ class RotationModel:
         by_focal = np.array([[focal], [focal], [0.0]]) * rotations
         return ModelMatrices(matrices, by_pose, by_focal[:, None])
 
-    def physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Log f itself."""
-        return shared, np.eye(1)
-
-    def shared_from_physical(self, physical: FloatArray) -> FloatArray:
-        """Log f."""
-        return np.asarray(physical[-1:], dtype=np.float64)
-
     def shared_starts(self, log_focal: float, tilt: Sequence[float], *, tilt_known: bool) -> list[FloatArray]:
         """The focal length that is known, and a range of others."""
         return [np.array([each]) for each in (log_focal, *_FOCAL_STARTS)]
@@ -73,10 +52,6 @@ class RotationModel:
         """Poses after a step of shape (N, 3), radians."""
         turned: FloatArray = rotation_from_vector(step) @ poses.reshape(-1, 3, 3)
         return turned.reshape(-1, 9)
-
-    def prior_coordinates(self, poses: FloatArray) -> FloatArray:
-        """Zeros: rotations have no prior."""
-        return np.zeros((len(poses), 3))
 
     def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """``diag(f, f, 1)``."""

@@ -7,11 +7,12 @@ from importlib import import_module
 import numpy as np
 import pytest
 
+from examples.judging.trajectories import compare_trajectories
 from rdstitch.alignment import AlignmentOptions, align, most_matches_read
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import CONTRADICTS, Alignment, PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
+from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, RegistrationError

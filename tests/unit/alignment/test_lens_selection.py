@@ -309,7 +309,6 @@ def test_a_lens_with_more_freed_is_the_next_that_has_it_all(freed: list[int], na
     ("images", "names", "fitted", "chosen"),
     [
         (6, ["division", "division-center"], [[3, 4]], "division-center"),
-        (6, ["division-center", "division2"], [[3, 4], [1, 3, 4]], "division-center"),
         (6, ["division2"], [[1, 3, 4]], "division2"),
         (3, ["division", "division-center", "division2"], [[1]], "division2"),
         (3, ["division-center"], [[3, 4]], "division-center"),

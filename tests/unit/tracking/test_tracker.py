@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from examples.judging.trajectories import compare_trajectories
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
+from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, Features, detect, match
 from rdstitch.features.prepared_image import View, prepare
