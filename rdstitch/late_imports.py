@@ -15,19 +15,17 @@ if TYPE_CHECKING:
     from scipy import fft, linalg, ndimage, sparse, spatial, special
     from scipy.sparse import csgraph
     from scipy.sparse import linalg as sparse_linalg
-    from scipy.spatial import distance
 else:
-    fft, linalg, ndimage, sparse, spatial, special, csgraph, sparse_linalg, distance, tifffile = map(
+    fft, linalg, ndimage, sparse, spatial, special, csgraph, sparse_linalg, tifffile = map(
         _Late,
         (
             *("scipy.fft", "scipy.linalg", "scipy.ndimage", "scipy.sparse", "scipy.spatial", "scipy.special"),
-            *("scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial.distance", "tifffile"),
+            *("scipy.sparse.csgraph", "scipy.sparse.linalg", "tifffile"),
         ),
     )
 
 __all__ = [
     "csgraph",
-    "distance",
     "fft",
     "linalg",
     "ndimage",

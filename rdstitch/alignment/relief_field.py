@@ -11,7 +11,7 @@ Mandelbrot 1975).
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 
@@ -154,16 +154,28 @@ def _spectrum(left: FloatArray, found: FloatArray, std: FloatArray) -> FloatArra
     steep = found[0] / float(left[0].mean()) if left[0].mean() > 0.0 else 0.0
     if steep <= 0.0:
         return np.zeros(left.shape[1])
-    # Imported late: where no relief shows, nobody should wait for SciPy's optimizers.
-    from scipy.optimize import nnls
-
     bands = left.shape[1]
     weight = 1.0 / np.maximum(std, 1e-12)
     # What the errors do not show is as of equally steep waves: an octave may have next to nothing or twice as much.
     equations = np.concatenate([left * (steep / bands) * weight[:, None], np.eye(bands)])
-    power = nnls(equations, np.concatenate([found * weight, np.ones(bands)]))[0]
+    power = _nonnegative_solution(equations, np.concatenate([found * weight, np.ones(bands)]))
     scaled: FloatArray = power * (steep / bands)
     return scaled
+
+
+def _nonnegative_solution(equations: FloatArray, right: FloatArray) -> FloatArray:
+    """Least-squares solution (B,) of equations (M, B) with nothing below 0: the best of those with some of it 0.
+
+    To try them all is quick for the few bands; SciPy's optimizers would take longer to import than a pair to align.
+    """
+    best, least = np.zeros(equations.shape[1]), np.inf
+    for chosen in product((False, True), repeat=len(best)):
+        solution = np.zeros(len(best))
+        solution[list(chosen)] = np.linalg.lstsq(equations[:, list(chosen)], right)[0]
+        cost = float(np.linalg.norm(equations @ solution - right))
+        if cost < least and (solution >= 0.0).all():
+            best, least = solution, cost
+    return best
 
 
 def _independent(part: LinearizedErrors) -> FloatArray:

@@ -10,6 +10,7 @@ Gains alone carry the automatic exposure of one end of a flight to the other, wh
 With "balanced", fields tend to the brightness of each region's own images instead, as a photographer would leave it.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
@@ -46,7 +47,7 @@ _ROUNDS = 6
 _MIN_RELATIVE_GAIN = 0.05
 # From here on, as a share of the full range, brightened samples are compressed instead of clipped.
 _KNEE = 0.75
-_MEDIAN_SAMPLES = 400_000  # of all images together
+_MEDIAN_SAMPLES = 50_000  # of all images together
 # Residual, as a share of the right side, and decimals that are kept: both far below a grey level.
 _TOLERANCE, _MAX_STEPS, _DECIMALS = 1e-5, 3000, 5
 
@@ -258,12 +259,13 @@ def _medians(values: FloatArray, pair: IntArray, which: BoolArray) -> FloatArray
 def _with_median_kept(exposure: Exposure, survey: Survey, cameras: Sequence[Camera]) -> Exposure:
     """Gains with a common factor that leaves the median of all samples where it was."""
     before, after = [], []
+    area = sum(np.count_nonzero(tile.inside) for tile in survey.tiles if tile is not None)
+    # A grid: so many pixels counted row by row would lie in few columns.
+    step = max(1, round(math.sqrt(area / _MEDIAN_SAMPLES)))
     for index, tile in enumerate(survey.tiles):
         if tile is not None:
-            y, x = (axis[:: -(-axis.size * len(cameras) // _MEDIAN_SAMPLES)] for axis in np.nonzero(tile.inside))
-            points = survey.warps[index].source_points(
-                *np.add((x, y), np.array(tile.box[:2], dtype=np.float64)[:, None])
-            )
+            y, x = step * np.array(np.nonzero(tile.inside[::step, ::step]))
+            points = survey.warps[index].source_points(x + float(tile.box[0]), y + float(tile.box[1]))
             log = exposure.log_gain[index] + exposure.smooth_part(index, cameras[index], points)
             light = tile.pixels[y, x] / full_scale(tile.pixels.dtype) + exposure.offset
             before.append(light.mean(axis=1))

@@ -14,7 +14,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.features.nearest import compare, mutual_nearest
-from rdstitch.late_imports import distance, spatial
+from rdstitch.late_imports import spatial
 
 Matcher = Callable[[Features, Features], Correspondences]
 """Matches the features of two images: :func:`match`, or a network's."""
@@ -235,5 +235,5 @@ def _around(features: Features, size: tuple[int, int], points: FloatArray, reach
 
 def _distances(points: FloatArray, others: FloatArray, size: tuple[int, int]) -> FloatArray:
     """Between all points (N, 2) and all others (M, 2), diagonals of the image, (N, M)."""
-    diagonal = np.hypot(*size)
-    return distance.cdist(points / diagonal, others / diagonal)
+    across, down = (np.subtract.outer(points[:, k], others[:, k]) for k in (0, 1))
+    return np.asarray(np.sqrt(across**2 + down**2) / np.hypot(*size), dtype=np.float64)

@@ -30,9 +30,9 @@ _RESTART_7 = b"\xff\xd7"
 _START_OF_FRAME, _START_OF_SCAN = 0xC0, 0xDA
 _BLOCK_GREY, _BLOCK_COLOUR = 8, 16
 _COLOUR_TYPES = {(1, False): 0, (3, False): 2, (1, True): 4, (3, True): 6}
-_FILTER_UP = 2
-# Higher levels take several times as long for a few per cent.
-_PNG_LEVEL = 3
+_FILTER_SUB = 1
+# Level 3 takes twice as long for 3 % less, higher ones several times as long for a few per cent more.
+_PNG_LEVEL = 1
 
 
 def jpeg_pieces(layout: Layout, strips: Iterable[Strip]) -> Iterator[bytes | memoryview]:
@@ -101,15 +101,13 @@ def png_pieces(layout: Layout, strips: Iterable[Strip]) -> Iterator[bytes]:
     yield PNG_MAGIC
     yield png_chunk(b"IHDR", struct.pack(">IIBBBBB", *layout.size, 8 * layout.dtype.itemsize, kind, 0, 0, 0))
     yield from _metadata_chunks(layout.metadata)
-    packer = zlib.compressobj(_PNG_LEVEL)
-    above = np.zeros(layout.size[0] * layout.samples_per_pixel * layout.dtype.itemsize, dtype=np.uint8)
+    packer, pixel = zlib.compressobj(_PNG_LEVEL), layout.samples_per_pixel * layout.dtype.itemsize
     for samples, alpha in strips:
         rows = _bytes_of_rows(with_alpha(samples, alpha) if layout.transparent else samples)
-        filtered = np.empty((len(rows), rows.shape[1] + 1), dtype=np.uint8)
-        filtered[:, 0] = _FILTER_UP
-        np.subtract(rows[0], above, out=filtered[0, 1:])
-        np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])
-        above = rows[-1].copy()
+        filtered = np.empty((len(rows), 1 + rows.shape[1]), dtype=np.uint8)
+        filtered[:, 0] = _FILTER_SUB
+        filtered[:, 1 : 1 + pixel] = rows[:, :pixel]
+        np.subtract(rows[:, pixel:], rows[:, :-pixel], out=filtered[:, 1 + pixel :])
         if packed := packer.compress(filtered.data):
             yield png_chunk(b"IDAT", packed)
     yield png_chunk(b"IDAT", packer.flush())
