@@ -141,7 +141,6 @@ def _relation(
 
 
 def height_of(poses: FloatArray) -> FloatArray:
-    """Heights (N,) of poses."""
     return np.exp(poses[:, LOG_HEIGHT])
 
 

@@ -32,12 +32,10 @@ class Scene:
 
     @property
     def sources(self) -> list[Callable[[], DecodedImage]]:
-        """What the compositor reads."""
         return [partial(as_image, frame) for frame in self.frames]
 
     @property
     def images(self) -> list[PlacedImage]:
-        """What the compositor takes."""
         return place_images(self.sources, self.cameras, self.homographies)
 
     def truth(self, canvas: Canvas | None = None) -> NDArray[np.float32]:
@@ -82,7 +80,6 @@ def grey(pixels: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def gradient(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Length of the gradient."""
     return np.hypot(*(cv2.Sobel(values, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)))
 
 

@@ -28,7 +28,6 @@ def test_names_and_defaults_are_the_librarys(name: str) -> None:
 
 @pytest.fixture(scope="module")
 def sidecar(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A registration of ``frames``."""
     from rdstitch_cli.main import run
 
     output = tmp_path_factory.mktemp("registered") / "small.png"

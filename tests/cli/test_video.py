@@ -11,7 +11,6 @@ from tests.videos import write_video
 
 @pytest.fixture
 def video(frames: list[Path], tmp_path: Path) -> Path:
-    """The frames one after the other."""
     return write_video(tmp_path / "drive.avi", (read_image(frame).pixels for frame in frames))
 
 

@@ -106,7 +106,6 @@ def test_seams_are_where_labels_change() -> None:
 
 
 def read_shown(data: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Which pixels are opaque."""
     from PIL import Image
 
     return np.asarray(np.asarray(Image.open(io.BytesIO(data)))[..., 3] > 0)

@@ -48,7 +48,6 @@ def pair_of(kind: str, seed: int) -> tuple[Features, Features]:
 
 
 def distances(one: Features, two: Features) -> NDArray[np.float64]:
-    """All distances, by the definition."""
     if one.binary:
         bits = [np.unpackbits(np.asarray(f.descriptors, np.uint8), axis=1).astype(np.int64) for f in (one, two)]
         return np.asarray(np.abs(bits[0][:, None] - bits[1]).sum(axis=2), np.float64)

@@ -20,7 +20,6 @@ from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 
 
 def first_pairs(features: list[Features], seed: int, positions: FloatArray | None = None) -> list[tuple[int, int]]:
-    """Of features in memory."""
     return _first_pairs(FeatureStore.of(features), seed, positions)
 
 

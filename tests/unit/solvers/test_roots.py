@@ -21,7 +21,6 @@ class Product:
     heights: FloatArray
 
     def polynomial(self, distortion: FloatArray) -> FloatArray:
-        """Value of the product."""
         value = np.broadcast_to(self.scale, distortion.shape).copy()
         for root in self.roots:
             value = value * (distortion - root)
@@ -30,7 +29,6 @@ class Product:
         return value
 
     def take(self, samples: IndexArray) -> Self:
-        """Some of them."""
         return type(self)(*(a[..., samples] for a in (self.roots, self.scale, self.centres, self.heights)))
 
 
@@ -47,7 +45,6 @@ def product(roots: FloatArray, pairs: int = 0, seed: int = 0) -> Product:
 
 
 def interval(batch: int, low: float = -1.5, high: float = 0.5) -> tuple[FloatArray, FloatArray]:
-    """The same interval for all."""
     return np.full(batch, low), np.full(batch, high)
 
 

@@ -23,7 +23,6 @@ def texture(width: int = 480, height: int = 400, seed: int = 5) -> Grey:
 
 
 def blob(center: tuple[float, float], sigma: float, sign: int = 1, size: int = 160) -> Grey:
-    """One Gaussian blob."""
     v, u = np.mgrid[:size, :size]
     squared = (u - center[0]) ** 2 + (v - center[1]) ** 2
     return np.asarray(np.rint(128 + sign * 90 * np.exp(-squared / (2 * sigma**2))), np.uint8)
