@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import cv2
@@ -49,7 +49,12 @@ def as_image(frame: NDArray[Any], alpha: NDArray[np.uint8] | None = None) -> Dec
     return DecodedImage(frame, alpha, Metadata((frame.shape[1], frame.shape[0])))
 
 
-def render(
+def render(columns: int = 3, rows: int = 2, **options: Any) -> Scene:
+    """Views side by side with tilt, yaw and lens distortion; the options are those of :func:`_rendered`."""
+    return _rendered(columns, rows, **options) if "photometry" in options else _kept(columns, rows, **options)
+
+
+def _rendered(
     columns: int = 3,
     rows: int = 2,
     *,
@@ -61,7 +66,6 @@ def render(
     seed: int = 0,
     **canvas_options: Any,
 ) -> Scene:
-    """Views side by side with tilt, yaw and lens distortion."""
     lens = Camera(size, distortion=distortion, focal=0.8 * size[0])
     poses = grid_poses(lens, columns, rows, overlap=overlap, yaw=0.12, shift=0.08, tilt=(0.04, -0.03), seed=seed)
     rendering = sequence_over(partial(ground, seed=seed + 1, channels=channels), lens, poses, photometry=photometry)
@@ -70,6 +74,9 @@ def render(
     matrices = np.stack([np.linalg.inv(rendering.from_plane(i)) @ scale for i in range(len(rendering))])
     cameras = [lens] * len(rendering)
     return Scene(rendering, rendering.frames(), cameras, matrices, plan_canvas(cameras, matrices, **canvas_options))
+
+
+_kept = cache(_rendered)
 
 
 def grey(pixels: NDArray[Any]) -> NDArray[np.float32]:

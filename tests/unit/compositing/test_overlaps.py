@@ -50,7 +50,7 @@ def _row(count: int) -> tuple[Survey, list[PlacedImage]]:
 
 def test_what_is_compared_is_linear_in_the_number_of_images() -> None:
     """Two neighbours an image in a row."""
-    count = 400
+    count = 200
     survey, images = _row(count)
     cells = compare_overlaps(survey)
     assert cells is not None
