@@ -49,11 +49,9 @@ class AlteredSequence(Sequence):
     dispensable: frozenset[int] = frozenset()  # images without which the set is solved, too
 
     def frame(self, index: int) -> NDArray[np.uint8]:
-        """See :meth:`Sequence.frame`."""
         return self.alter(index, super().frame(index))
 
     def to_plane(self, index: int, points: ArrayLike) -> FloatArray:
-        """See :meth:`Sequence.to_plane`."""
         measured = np.asarray(points, dtype=np.float64)
         foot = super().to_plane(index, measured + self._of(self.offset, index))
         foot = foot + self._moved(index, measured[..., 1])
@@ -66,7 +64,6 @@ class AlteredSequence(Sequence):
         return place
 
     def to_image(self, index: int, points: ArrayLike) -> FloatArray:
-        """See :meth:`Sequence.to_image`."""
         place = np.asarray(points, dtype=np.float64)
         if self.height is not None:
             position, above = self.poses.position[index], self.poses.height[index]
@@ -95,7 +92,6 @@ class RottenSequence(AlteredSequence):
     flips: int = 1  # bits that are flipped
 
     def write(self, folder: str | Path, name: str = "frame_{:04d}.jpg") -> list[Path]:
-        """See :meth:`Sequence.write`."""
         paths = super().write(folder, name)
         data = bytearray(paths[self.rotten].read_bytes())
         rng = np.random.default_rng((self.seed, self.rotten, self.flips))

@@ -1,4 +1,4 @@
-"""Links synthesised from known poses, for the tests and benchmarks of the global adjustment."""
+"""Links synthesised from known poses, for the tests of the global adjustment."""
 
 from dataclasses import dataclass
 
@@ -45,16 +45,6 @@ def robot_path(count: int, step: float) -> FloatArray:
     return poses
 
 
-def ring(count: int, step: float) -> FloatArray:
-    """Poses (N, 6) around a circle, ``step`` heights apart, so that the last frame comes before the first."""
-    turn = 2.0 * np.pi * np.arange(count) / count
-    radius = step * count / (2.0 * np.pi)
-    poses = np.zeros((count, 6))
-    poses[:, YAW] = -turn
-    poses[:, X], poses[:, Y] = radius * np.sin(turn), radius * (1.0 - np.cos(turn))
-    return poses
-
-
 def scene(
     poses: FloatArray,
     *,
@@ -71,11 +61,9 @@ def scene(
     focal_source: str | None = "option",
     rng: np.random.Generator,
     reach: int | None = None,
-    closed: bool = False,
     relief: float = 0.0,
 ) -> Scene:
-    """Links between all images whose overlap is at least ``overlap``, at most ``reach`` frames apart, also across
-    the end of the sequence where it is ``closed``.
+    """Links between all images whose overlap is at least ``overlap``, at most ``reach`` frames apart.
 
     Outliers are what a pairwise estimation lets pass: off by up to 4 px. ``relief`` is the amplitude of smooth hills,
     in heights above the plane. ``lens`` is taken instead of ``size`` and ``distortion``.
@@ -90,8 +78,7 @@ def scene(
     links = []
     near = KDTree(poses[:, [X, Y]]).query_pairs(3.0 * float(np.hypot(*size)) / focal)
     for i, j in sorted(near):
-        # Around a ring, the last frames are next to the first.
-        if reach is not None and reach < j - i < len(poses) - (reach if closed else 0):
+        if reach is not None and reach < j - i:
             continue
         h = truth[j] @ inverse[i]
         pixels = rng.uniform((0, 0), (size[0] - 1, size[1] - 1), (3 * per_link, 2))
@@ -138,11 +125,6 @@ def _relation(
     return RadialHomography(
         h, camera, camera, np.ones(count, dtype=np.bool_), distortion_std=std, model="homography", rms=0.5
     )
-
-
-def height_of(poses: FloatArray) -> FloatArray:
-    """Heights (N,) of poses."""
-    return np.exp(poses[:, LOG_HEIGHT])
 
 
 def jittered(poses: FloatArray, height: float, tilt: float, rng: np.random.Generator) -> FloatArray:

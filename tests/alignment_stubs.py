@@ -36,7 +36,6 @@ def observations(errors: FloatArray, images: int = 6) -> Observations:
 
 
 def independent_errors(links: int = 9, each: int = 60, sigma: float = 0.5) -> FloatArray:
-    """Normal errors (L, K, 2)."""
     return np.random.default_rng(3).normal(0.0, sigma, (links, each, 2))
 
 

@@ -25,7 +25,6 @@ Undistort = Callable[[FloatArray], FloatArray]
 
 
 def files_of(folder: Path) -> list[Path]:
-    """The images of a folder."""
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES)
 
 

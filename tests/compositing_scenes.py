@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import cv2
@@ -32,12 +32,10 @@ class Scene:
 
     @property
     def sources(self) -> list[Callable[[], DecodedImage]]:
-        """What the compositor reads."""
         return [partial(as_image, frame) for frame in self.frames]
 
     @property
     def images(self) -> list[PlacedImage]:
-        """What the compositor takes."""
         return place_images(self.sources, self.cameras, self.homographies)
 
     def truth(self, canvas: Canvas | None = None) -> NDArray[np.float32]:
@@ -51,7 +49,12 @@ def as_image(frame: NDArray[Any], alpha: NDArray[np.uint8] | None = None) -> Dec
     return DecodedImage(frame, alpha, Metadata((frame.shape[1], frame.shape[0])))
 
 
-def render(
+def render(columns: int = 3, rows: int = 2, **options: Any) -> Scene:
+    """Views side by side with tilt, yaw and lens distortion; the options are those of :func:`_rendered`."""
+    return _rendered(columns, rows, **options) if "photometry" in options else _kept(columns, rows, **options)
+
+
+def _rendered(
     columns: int = 3,
     rows: int = 2,
     *,
@@ -63,7 +66,6 @@ def render(
     seed: int = 0,
     **canvas_options: Any,
 ) -> Scene:
-    """Views side by side with tilt, yaw and lens distortion."""
     lens = Camera(size, distortion=distortion, focal=0.8 * size[0])
     poses = grid_poses(lens, columns, rows, overlap=overlap, yaw=0.12, shift=0.08, tilt=(0.04, -0.03), seed=seed)
     rendering = sequence_over(partial(ground, seed=seed + 1, channels=channels), lens, poses, photometry=photometry)
@@ -74,6 +76,9 @@ def render(
     return Scene(rendering, rendering.frames(), cameras, matrices, plan_canvas(cameras, matrices, **canvas_options))
 
 
+_kept = cache(_rendered)
+
+
 def grey(pixels: NDArray[Any]) -> NDArray[np.float32]:
     """Mean of the channels, 0 to 1."""
     full = np.iinfo(pixels.dtype).max
@@ -82,7 +87,6 @@ def grey(pixels: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def gradient(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Length of the gradient."""
     return np.hypot(*(cv2.Sobel(values, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)))
 
 

@@ -72,7 +72,6 @@ def _rerun(block: str) -> str:
 
 @contextlib.contextmanager
 def _in_empty_folder() -> Iterator[None]:
-    """A folder that has nothing but the examples."""
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "examples").symlink_to(ROOT / "examples")

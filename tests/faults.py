@@ -27,7 +27,6 @@ class FailingDisk:
         self.operation, self.failing, self.count = operation, failing, 0
 
     def step(self) -> None:
-        """One more operation."""
         self.count += 1
         if self.count - 1 == self.failing:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -18,7 +18,6 @@ def lens_scene(lens: Camera, seed: int, *, relief: float = 0.0, columns: int = 4
 
 
 def aligned(given: Scene, **options: object) -> Alignment:
-    """The alignment of a scene."""
     return align(given.cameras, given.links, AlignmentOptions(**options))  # type: ignore[arg-type]
 
 

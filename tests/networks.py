@@ -123,6 +123,5 @@ def save(
 
 
 def _gaussian(u: NDArray[Any], v: NDArray[Any], sigma: float) -> NDArray[np.float64]:
-    """Of unit sum."""
     values = np.exp(-(u**2 + v**2) / (2 * sigma**2))
     return np.asarray(values / values.sum(), np.float64)

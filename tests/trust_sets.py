@@ -65,7 +65,6 @@ class MixedSequence(Sequence):
     damaged: bool = False  # whether their files are cut off or have flipped bits
 
     def write(self, folder: str | Path, name: str = "frame_{:04d}.png") -> list[Path]:
-        """See :meth:`Sequence.write`."""
         paths = super().write(folder, name)
         rng = np.random.default_rng((self.seed, 78))
         for index in sorted(self.taken) if self.damaged else ():
@@ -83,22 +82,17 @@ class MixedSequence(Sequence):
         return self.other if index in self.taken and self.other is not None else own
 
     def to_plane(self, index: int, points: ArrayLike) -> FloatArray:
-        """See :meth:`Sequence.to_plane`."""
         return self._of(index).to_plane(index, points)
 
     def to_image(self, index: int, points: ArrayLike) -> FloatArray:
-        """See :meth:`Sequence.to_image`."""
         return self._of(index).to_image(index, points)
 
     def frame(self, index: int) -> np.ndarray:
-        """See :meth:`Sequence.frame`."""
         return self._of(index).frame(index)
 
 
 @dataclass(frozen=True)
 class TrustSet:
-    """One random set."""
-
     kind: str  # one of :data:`SOLVABLE`, :data:`ODD`, :data:`HOPELESS` or :data:`tests.adverse_sets.ADVERSE`
     sequence: Sequence
 
@@ -286,7 +280,6 @@ def overlap_error(sequence: Sequence, registration: Registration) -> tuple[float
 
 
 def _number(path: str) -> int:
-    """The number of an image in its sequence."""
     return int(Path(path).stem.split("_")[-1])
 
 

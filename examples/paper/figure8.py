@@ -1,33 +1,29 @@
 """Fig. 8: the pairs of a sequence vote on λ, and what they elect straightens and rectifies a chart.
 
 The votes on a drive come from plain RANSAC with each solver, as in the paper, and from rdstitch, which weights them
-by what each pair can know and then adjusts all images. Real chessboards, which move freely, vote by five points.
+by what each pair can know and then adjusts all images.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
-from pathlib import Path
+from dataclasses import dataclass
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from examples.judging import fit_homography, fit_similarity
+from examples.judging import fit_similarity
 from examples.paper.common.charts import (
     before_and_after,
-    board_grid,
-    find_boards,
     off_grid,
     rendered_chart,
     seen_corners,
     undistorted,
 )
-from examples.paper.common.drives import Drive, FramePair, drive, estimated_links
+from examples.paper.common.drives import Drive, drive, estimated_links
 from examples.paper.common.plain_ransac import all_solvers, best_of
 from examples.paper.common.report import Pixels, Report, Table
 from examples.paper.common.settings import Settings
-from rdstitch.alignment import Alignment, AlignmentOptions, Link, align
+from rdstitch.alignment import Alignment, Link, align
 from rdstitch.arrays import FloatArray
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.planar_motion import rotation_from_tilt
@@ -36,20 +32,12 @@ from rdstitch.robust.measurements import Measurements
 
 OWN, WEIGHTED, ADJUSTED = "rdstitch, pairs", "rdstitch, weighted votes", "rdstitch, adjusted"
 
-BOARDS = {
-    "carnd_wide_gopro_chess": ((8, 6), -0.555),
-    "opencv_chess_left": ((9, 6), -0.169),
-    "opencv_chess_right": ((9, 6), -0.181),
-}
-"""Real chessboards: inner corners, and λ of a direct fit to the corners, with the distortion centre in the middle."""
-
 _ITERATIONS = 60  # of plain RANSAC, for each pair
 _LEFT_OUT = ("3 points, tilt given, height free", "4 points, no distortion (DLT)")
 _DRAWN = ("2 points, tilt given", "5 points", "5 points, Fitzgibbon (homlib)", OWN)
 _BIN = 0.01  # of λ
 _NEAR = 0.02
 _YAW = 0.25  # of the chart
-_MARGIN = 1.0  # squares about a real board
 
 
 @dataclass(frozen=True)
@@ -61,60 +49,17 @@ class _Election:
     alignment: Alignment
 
 
-@dataclass(frozen=True)
-class BoardVotes:
-    """What images of a chessboard vote for.
-
-    ``elected``, ``adjusted``: λ by the weighted votes, and by the adjustment of all images. ``off_before``,
-    ``off_by_truth``, ``off_by_adjusted``: rms distance of the corners from the grid after a homography, % of a square,
-    mean over the images: as measured, undistorted with the given λ, and with the adjusted one.
-    """
-
-    votes: FloatArray  # λ of each pair; shape (pairs,)
-    elected: float
-    adjusted: float
-    off_before: float
-    off_by_truth: float
-    off_by_adjusted: float
-    image: Pixels  # the image with the largest board, beside itself undistorted and rectified; shape (h, w, 3)
-
-
 def run(settings: Settings) -> Report:
     """λ by votes, and how far the corners of charts are from a grid."""
     d = drive("parallel parking", settings.count(8, 24, 107), seed=80)
     election = _drive_election(d)
-    boards, notes, images, shown = [], [], {}, {}
-    tables = [_votes_table(d, election)]
-    table, images["figure8_chart.png"] = _rectified_chart(d, election.alignment)
-    tables.append(table)
-    for name, (corners, truth) in BOARDS.items():
-        files = settings.real_sequence(name)
-        if not files:
-            notes.append(f"the real images {name} are not here and were left out")
-            continue
-        found = vote_on_boards(files, corners, truth, reach=settings.count(1, 2, len(files)))
-        lambdas = (truth, float(np.median(found.votes)), found.elected, found.adjusted)
-        boards.append((name, len(found.votes), *lambdas, found.off_before, found.off_by_truth, found.off_by_adjusted))
-        shown[name] = (found.votes, truth)
-        images[f"figure8_{name}.png"] = found.image
-    if boards:
-        header = (
-            "boards", "pairs", "λ of the fit to corners", "median of the votes", "weighted votes", "adjusted",
-            "corners off a grid before, %", "by the fit, %", "by the adjusted camera, %",
-        )  # fmt: skip
-        title = (
-            "Fig. 8: real chessboards, voting by five points; corners off the grid in % of a square, after a homography"
-        )
-        tables.append(Table(title, header, tuple(boards)))
+    table, chart = _rectified_chart(d, election.alignment)
 
     def draw(figure: Any) -> None:
-        all_axes = figure.subplots(1, 1 + len(shown), squeeze=False)[0]
         drawn = {name: votes for name, votes in election.votes.items() if name in _DRAWN}
-        _draw_votes(all_axes[0], drawn, d.camera.distortion, "parallel parking")
-        for axes, (name, (votes, truth)) in zip(all_axes[1:], shown.items(), strict=True):
-            _draw_votes(axes, {"5 points, rdstitch": votes}, truth, name)
+        _draw_votes(figure.subplots(), drawn, d.camera.distortion, "parallel parking")
 
-    return Report(tuple(tables), draw, images, tuple(notes))
+    return Report((_votes_table(d, election), table), draw, {"figure8_chart.png": chart})
 
 
 def _drive_election(d: Drive) -> _Election:
@@ -177,37 +122,6 @@ def _rectified_chart(d: Drive, alignment: Alignment) -> tuple[Table, Pixels]:
         file = sequence.write(folder)[0]
         image = before_and_after(file, camera, to_grid, (float(extent[0]), float(extent[1])), 40.0)
     return Table(title, header, rows), image
-
-
-def vote_on_boards(files: list[Path], corners: tuple[int, int], truth: float, reach: int) -> BoardVotes:
-    """λ of a camera from the corners of a board, by pairs of images that are told nothing of the board.
-
-    ``corners``: inner corners across and down. ``truth``: λ that the corners are undistorted with for comparison.
-    ``reach``: images are paired with so many that follow.
-    """
-    camera, boards = find_boards(files, corners)
-    grid, seen = board_grid(corners), list(boards.values())
-    near = [(i, j) for i, j in combinations(range(len(seen)), 2) if j - i <= reach]
-    links = estimated_links((FramePair(i, j, seen[i], seen[j]) for i, j in near), camera, solver="five_point")
-    own, std = _votes(links)
-    alignment = align([camera.with_focal()] * len(seen), links, AlignmentOptions(model="homography"))
-    adjusted = alignment.cameras[alignment.reference]
-    before, by_truth, by_adjusted = (
-        float(np.mean([off_grid(undistorted(lens, points), grid, metric=False) for points in seen]))
-        for lens in (camera, replace(camera, distortion=truth), adjusted)
-    )
-    largest = max(boards, key=lambda file: float(np.ptp(boards[file], axis=0).prod()))
-    to_grid = fit_homography(undistorted(adjusted, boards[largest]), grid + _MARGIN)
-    extent = (corners[0] - 1 + 2 * _MARGIN, corners[1] - 1 + 2 * _MARGIN)
-    return BoardVotes(
-        votes=own,
-        elected=vote(own, std).distortion,
-        adjusted=alignment.distortion,
-        off_before=before,
-        off_by_truth=by_truth,
-        off_by_adjusted=by_adjusted,
-        image=before_and_after(largest, adjusted, to_grid, extent, 50.0),
-    )
 
 
 def _draw_votes(axes: Any, votes: Mapping[str, FloatArray], truth: float, title: str) -> None:

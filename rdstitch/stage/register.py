@@ -196,14 +196,12 @@ def _transfer(overlap: Overlap, offset: FloatArray, camera: Camera) -> Transfer:
 def _best_lens(surfaces: Sequence[Surfaces], overlaps: Sequence[Overlap], camera: Camera, radius: int) -> float:
     """λ for which the blocks of all pairs agree best."""
     heights = np.zeros(len(_LENSES))
-    usual, lenses = len(_LENSES) // 2, [camera.with_coefficients(value) for value in _LENSES]
+    lenses = [camera.with_coefficients(value) for value in _LENSES]
     for surface, overlap in zip(surfaces, overlaps, strict=True):
-        tops = np.array(
-            [surface.total(_shifts(overlap, camera.with_coefficients(value)), radius).max() for value in _LENSES]
-        )
+        tops = np.array([surface.total(_shifts(overlap, lens), radius).max() for lens in lenses])
         if tops.max() > _threshold(surface.total(np.zeros((len(overlap.blocks), 2)), radius), radius):
             heights += tops
-    return 0.0 if heights.max() <= heights[usual] else float(_LENSES[int(heights.argmax())])
+    return 0.0 if heights.max() <= heights[len(_LENSES) // 2] else float(_LENSES[int(heights.argmax())])
 
 
 def _threshold(total: FloatArray, radius: int) -> float:

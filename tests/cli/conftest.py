@@ -37,6 +37,17 @@ def place(tmp_path: Path, frames: list[Path]) -> Path:
 
 
 @pytest.fixture
+def here(place: Path, frames: list[Path], stranger: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder: two good images ``a.png`` and ``b.png``; in ``more`` two again; and one of other ground."""
+    (place / "more").mkdir()
+    for frame in frames[:2]:
+        shutil.copy(frame, place / "more")
+    shutil.copy(stranger, place / "stranger.png")
+    monkeypatch.chdir(place)
+    return place
+
+
+@pytest.fixture
 def rdstitch(capsys: pytest.CaptureFixture[str]) -> Run:
     """``rdstitch(*arguments)``: run the command line in this process, and check the exit status.
 

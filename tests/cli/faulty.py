@@ -48,8 +48,6 @@ def cut(kind: str, share: float, suffix: str) -> Make:
 
 
 def drawn(array: NDArray[Any], name: str = "drawn.png") -> Make:
-    """An image of these samples."""
-
     def make(good: Path, folder: Path) -> Path:
         file = folder / name
         if file.suffix == ".tif":
@@ -62,12 +60,10 @@ def drawn(array: NDArray[Any], name: str = "drawn.png") -> Make:
 
 
 def missing(good: Path, folder: Path) -> Path:
-    """Nothing."""
     return folder / "missing.jpg"
 
 
 def a_folder(good: Path, folder: Path) -> Path:
-    """A folder with the name of an image."""
     (folder / "folder.jpg").mkdir()
     return folder / "folder.jpg"
 
@@ -79,19 +75,16 @@ def a_pipe(good: Path, folder: Path) -> Path:
 
 
 def a_loop(good: Path, folder: Path) -> Path:
-    """A link to itself."""
     (folder / "loop.png").symlink_to("loop.png")
     return folder / "loop.png"
 
 
 def a_dangling_link(good: Path, folder: Path) -> Path:
-    """A link to nothing."""
     (folder / "dangling.png").symlink_to("nowhere.png")
     return folder / "dangling.png"
 
 
 def too_long_a_name(good: Path, folder: Path) -> Path:
-    """A name that no file can have."""
     return folder / ("x" * 300 + ".png")
 
 

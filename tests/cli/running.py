@@ -66,7 +66,6 @@ class Outcome:
 
     @property
     def line(self) -> str:
-        """The one line of an error."""
         lines = self.err.splitlines()
         assert len(lines) == 1, self.err
         return lines[0]
@@ -77,7 +76,6 @@ Run = Callable[..., Outcome]
 
 
 def flight(seed: int, columns: int, rows: int = 1, distortion: float = DISTORTION, overlap: float = 0.5) -> Sequence:
-    """Small images of a textured plane."""
     lens = Camera((400, 300), distortion=distortion, focal=380.0)
     poses = grid_poses(lens, columns, rows, overlap=overlap, yaw=0.1, shift=0.05, tilt=(0.05, -0.03), seed=seed)
     return sequence_over(partial(ground, seed=seed), lens, poses, photometry=Photometry(noise=0.01), seed=seed)
@@ -97,7 +95,6 @@ def start(
 
 
 def finished(process: "subprocess.Popen[bytes]", data: bytes | None = None) -> Outcome:
-    """Wait for a process of :func:`start`."""
     out, err = process.communicate(data, timeout=300)
     assert b"Traceback" not in err, err.decode("utf-8", "replace")
     return Outcome.of(process.returncode, out.decode("utf-8", "replace"), err.decode("utf-8", "replace"))

@@ -17,7 +17,6 @@ from rdstitch.matching import two_view
 from rdstitch.pipeline import aligner
 from rdstitch.verification import overlap_check
 from tests.cli.running import FAST, Run, finished, start
-from tests.interrupted_runs import repeated
 from tests.sampled import sampled
 
 
@@ -174,10 +173,3 @@ def test_two_processes_share_a_cache(frames: list[Path], plain: tuple[bytes, dic
     for process, output in zip(running, outputs, strict=True):
         assert finished(process).status == 0
         assert _result(output) == plain
-
-
-@pytest.mark.slow
-def test_killed_runs_of_hundreds_of_images_repeat_little() -> None:
-    shares, same = repeated(300, 10)
-    assert same
-    assert shares["all work"] < 0.1

@@ -24,7 +24,6 @@ _IMAGES = 8  # each a task
 
 @pytest.fixture(scope="module")
 def images(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """A strip."""
     return flight(4, _IMAGES).write(tmp_path_factory.mktemp("strip"))
 
 

@@ -12,8 +12,6 @@ from rdstitch_cli.main import cli
 from rdstitch.compositing import CompositeOptions
 from rdstitch.io import read_image
 from rdstitch.io.deepzoom import read_deep_zoom
-from rdstitch.options import StitchOptions
-from rdstitch.pipeline.recipes import mosaic
 from tests.cli.running import CACHED, Run
 
 LIBRARY_ONLY = {"bands", "tile_size", "workers"}
@@ -30,7 +28,6 @@ def test_names_and_defaults_are_the_librarys(name: str) -> None:
 
 @pytest.fixture(scope="module")
 def sidecar(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A registration of ``frames``."""
     from rdstitch_cli.main import run
 
     output = tmp_path_factory.mktemp("registered") / "small.png"
@@ -64,27 +61,10 @@ def test_every_way_makes_another_image_of_the_same_place(
         assert [k for k in range(number) if (images[k] == image).all()] == []
 
 
-def test_crop_leaves_no_hole(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
-    output = tmp_path / "cropped.png"
-    rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--crop", "--scale", "1", err="")
-    image = read_image(output)
-    assert image.alpha is None or (image.alpha == 255).all()
-
-
 def test_background_is_what_no_image_covers(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "white.jpg"
     rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--background", "255")
     assert (read_image(output).pixels[0, 0] > 250).all()
-
-
-def test_too_little_memory_is_refused_with_the_reason(
-    rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path
-) -> None:
-    output = tmp_path / "none.tif"
-    done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--max-memory", "2M", status=7)
-    assert "2 MB are too little" in done.line
-    assert "--max-memory" in done.line
-    assert not list(tmp_path.iterdir())
 
 
 def test_amounts_of_memory() -> None:
@@ -105,17 +85,6 @@ def test_dry_run_reports_and_writes_nothing(rdstitch: Run, frames: list[Path], t
     rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *CACHED)
     height, width = read_image(tmp_path / "a.png").pixels.shape[:2]
     assert told["canvas"].startswith(f"{width} x {height} pixels")
-
-
-def test_file_and_memory_hold_the_same_image(frames: list[Path], tmp_path: Path) -> None:
-    options = StitchOptions(workers=1)
-    held = mosaic(frames, None, options).composite
-    assert held is not None
-    written = mosaic(frames, tmp_path / "a.tif", options)
-    assert written.composite is None
-    back = read_image(tmp_path / "a.tif")
-    np.testing.assert_array_equal(back.pixels, held.pixels)
-    np.testing.assert_array_equal(back.alpha, held.alpha)
 
 
 def test_deep_zoom_is_the_same_image(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

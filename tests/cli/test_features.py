@@ -21,7 +21,6 @@ SMALL = ("--scale", "0.1", "--blend", "feather", "--seam", "voronoi", "-j", "1")
 
 
 def stitched(rdstitch: Run, folder: Path, kind: str) -> dict[str, Any]:
-    """The sidecar of the bundled pair."""
     output = folder / f"{kind}.jpg"
     done = rdstitch("pano", *PAIR, "-o", output, "--features", kind, "--reference", PAIR[0].name, *SMALL)
     assert all("[few-images]" in line for line in done.err.splitlines())

@@ -22,7 +22,6 @@ _IMAGES = 64  # enough for worker processes
 
 @pytest.fixture
 def strip(tmp_path: Path) -> Path:
-    """Parts of one image."""
     folder = tmp_path / "strip"
     folder.mkdir()
     width, height, step = 200, 150, 60

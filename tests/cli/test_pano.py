@@ -11,7 +11,7 @@ from examples.judging import alignment_error, compare_with_plane
 from rdstitch.camera import Camera
 from rdstitch.io import read_image
 from rdstitch.synthetic import Sequence
-from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, start, transfers
+from tests.cli.running import CACHED, DISTORTION, FAST, Run, transfers
 
 
 def test_writes_image_sidecar_and_camera_and_prints_lambda(
@@ -113,9 +113,3 @@ def test_unobservable_lambda_is_nan(rdstitch: Run, frames: list[Path], tmp_path:
     done = rdstitch("pano", frames[0], again, "-o", tmp_path / "pano.jpg", *CACHED)
     assert math.isnan(float(done.out))
     assert "not observable" in done.err
-
-
-def test_as_a_process(frames: list[Path], tmp_path: Path) -> None:
-    done = finished(start("pano", *frames[:2], "-o", tmp_path / "pano.jpg", *CACHED))
-    assert (done.status, done.err) == (0, "")
-    assert abs(float(done.out) - DISTORTION) < 0.01

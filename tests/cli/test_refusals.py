@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,17 +32,6 @@ FOLLOW = "mosaic incoming --follow --idle 0.05 -o "
 INCOMING: Files = {"incoming": None}
 BROKEN: Files = {"empty.png": "", "half.png": "\x89PNG"}
 MASK = cv2.imencode(".png", np.full((40, 30), 255, np.uint8))[1].tobytes()
-
-
-@pytest.fixture
-def here(place: Path, frames: list[Path], stranger: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder: two good images ``a.png`` and ``b.png``; in ``more`` two again; and one of other ground."""
-    (place / "more").mkdir()
-    for frame in frames[:2]:
-        shutil.copy(frame, place / "more")
-    shutil.copy(stranger, place / "stranger.png")
-    monkeypatch.chdir(place)
-    return place
 
 
 def _check(rdstitch: Run, folder: Path, arguments: list[str], status: int, told: str) -> None:

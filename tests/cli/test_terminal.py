@@ -117,11 +117,3 @@ def test_tilde_is_the_home_folder_where_no_shell_saw_it(
     rdstitch("pano", *frames, "--output=~/pano.png", *CACHED)
     assert (tmp_path / "pano.png").exists()
     assert UserPath().convert("~no-such-user/x", None, None) == Path("~no-such-user/x")
-
-
-def test_patterns_are_expanded_where_the_shell_leaves_them(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    pattern = str(frames[0].parent / "*.png")
-    done = rdstitch("pano", pattern, "-o", tmp_path / "pano.png", *CACHED)
-    assert "3 of 3 images" in done.made
-    rdstitch("undistort", pattern, "-o", tmp_path / "straight", "--lambda", "-0.2")
-    assert len(list((tmp_path / "straight").iterdir())) == 3

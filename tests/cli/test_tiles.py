@@ -19,7 +19,6 @@ NAMED = ("--grid", "r{row}c{col}", "--overlap", "15")
 
 @pytest.fixture(scope="module")
 def slide(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of nine tiles."""
     folder = tmp_path_factory.mktemp("slide")
     STAGE.write(folder)
     return folder

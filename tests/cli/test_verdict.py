@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from PIL import ExifTags, Image
 
 from rdstitch.camera import Camera
 from rdstitch.messages import Message
@@ -62,18 +61,6 @@ def test_two_images_of_two_lenses_are_noticed(rdstitch: Run, tmp_path: Path) -> 
     assert not (tmp_path / "out.png").exists()
 
 
-def test_the_last_image_through_another_lens_is_left_out(rdstitch: Run, tmp_path: Path) -> None:
-    sequence = flight(3, 3)
-    assert isinstance(sequence.lens, Camera)
-    other = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
-    images = [*sequence.write(tmp_path, "own_{}.png")[:2], other.write(tmp_path, "other_{}.png")[2]]
-    done = rdstitch("mosaic", *images, "-o", tmp_path / "out.png", *CACHED)
-    warning, left_out = done.err.splitlines()
-    assert "own_0.png and own_1.png fit without the images of another lens" in warning
-    assert "other_2.png: comes from another lens or zoom setting (λ about -0.1" in left_out
-    assert abs(float(done.out) - DISTORTION) < 0.01
-
-
 @pytest.mark.parametrize("strict", [False, True])
 def test_images_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tmp_path: Path, strict: bool) -> None:
     sequence = flight(3, 5)
@@ -88,22 +75,3 @@ def test_images_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tmp_
         r"another lens or zoom setting \(λ about -0\.1[12]\d, that of the others -0\.(19|20)\d\)", done.err
     )
     assert strict or abs(float(done.out) - DISTORTION) < 0.002
-
-
-@pytest.mark.parametrize(
-    ("models", "lengths", "told"),
-    [
-        (("One", "One", "Two"), (35, 35, 35), "come from 2 cameras: One (2: 0.jpg, 1.jpg); Two (1: 2.jpg)"),
-        (("One", "One", "One"), (28, 28, 35), "was zoomed between the images, by up to 1.25 (between 0.jpg and 2.jpg)"),
-    ],
-)
-def test_images_of_several_cameras_are_reported(
-    rdstitch: Run, frames: list[Path], tmp_path: Path, models: tuple[str], lengths: tuple[int], told: str
-) -> None:
-    for number, (frame, model, length) in enumerate(zip(frames, models, lengths, strict=True)):
-        exif = Image.Exif()
-        exif[ExifTags.Base.Model] = model
-        exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLengthIn35mmFilm: length}
-        with Image.open(frame) as image:
-            image.save(tmp_path / f"{number}.jpg", exif=exif, quality=95)
-    rdstitch("mosaic", tmp_path, "-o", tmp_path / "out.png", *CACHED, told=told)

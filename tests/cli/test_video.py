@@ -2,29 +2,16 @@
 
 from pathlib import Path
 
-import cv2
 import pytest
 
 from rdstitch.io import read_image
 from tests.cli.running import DISTORTION, FAST, Run, finished, start
+from tests.videos import write_video
 
 
 @pytest.fixture
 def video(frames: list[Path], tmp_path: Path) -> Path:
-    """The frames one after the other."""
-    return _write(frames, tmp_path / "drive.avi")
-
-
-def _write(frames: list[Path], file: Path) -> Path:
-    images = [cv2.cvtColor(read_image(frame).pixels, cv2.COLOR_RGB2BGR) for frame in frames]
-    height, width = images[0].shape[:2]
-    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (width, height))
-    if not writer.isOpened():
-        pytest.skip("this OpenCV writes no videos")
-    for image in images:
-        writer.write(image)
-    writer.release()
-    return file
+    return write_video(tmp_path / "drive.avi", (read_image(frame).pixels for frame in frames))
 
 
 @pytest.mark.parametrize(
@@ -42,7 +29,7 @@ def test_a_video_is_as_good_as_its_frames(
 def test_frames_that_show_nothing_new_are_passed_over_and_counted(
     rdstitch: Run, frames: list[Path], tmp_path: Path
 ) -> None:
-    slow = _write([frame for frame in frames for _ in range(4)], tmp_path / "slow.avi")
+    slow = write_video(tmp_path / "slow.avi", (read_image(frame).pixels for frame in frames for _ in range(4)))
     done = rdstitch("mosaic", slow, "-o", tmp_path / "out.png", "--focal", "380", *FAST)
     assert f"of {4 * len(frames)} frames are used" in done.err
     assert "--every 1 takes all" in done.err

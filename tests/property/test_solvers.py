@@ -38,7 +38,6 @@ def same(first: Solutions, second: Solutions, scale: float = 1.0, tolerance: flo
 
 
 def rotated(points: FloatArray, angle: float) -> FloatArray:
-    """Points turned about the optical axis."""
     c, s = np.cos(angle), np.sin(angle)
     return np.asarray(points @ np.array([[c, s], [-s, c]]))
 

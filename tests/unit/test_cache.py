@@ -25,7 +25,6 @@ def _forgetsoftware() -> Iterator[None]:
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package in the place of this one."""
     folder = tmp_path / "package"
     (folder / "robust").mkdir(parents=True)
     (folder / "robust" / "ransac.py").write_text("LIMIT = 1\n", encoding="utf-8")

@@ -1,6 +1,5 @@
-"""Chessboards: seen by a camera, found in images, undistorted, laid on their grid, and drawn so."""
+"""A chessboard: seen by a camera, undistorted, laid on its grid, and drawn so."""
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -20,8 +19,6 @@ from rdstitch.synthetic import Sequence as RenderedSequence
 _SQUARE = 80  # texels of a rendered chart
 _SQUARES = 30  # a side
 _DARK, _LIGHT = 40, 225
-_HALF_WINDOW = 5  # px, for finding corners to a fraction of a pixel
-_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
 _AS_IT_IS = CompositeOptions(exposure="none", seam="none", blend="none", background=255)
 
 
@@ -42,25 +39,6 @@ def seen_corners(sequence: RenderedSequence) -> tuple[FloatArray, FloatArray]:
     with np.errstate(invalid="ignore"):
         seen = ((points >= 0.0) & (points <= limit)).all(axis=1)
     return points[seen], grid[seen]
-
-
-def find_boards(files: Sequence[Path], corners: tuple[int, int]) -> tuple[Camera, dict[Path, FloatArray]]:
-    """The corners (N, 2), px, of the board in every image that shows all of it, and the camera of blank λ."""
-    boards, size = {}, (0, 0)
-    for file in files:
-        grey = np.asarray(read_image(file).pixels)
-        grey = grey if grey.ndim == 2 else cv2.cvtColor(grey, cv2.COLOR_RGB2GRAY)
-        found, points = cv2.findChessboardCorners(grey, corners)
-        if found and size in ((0, 0), grey.shape[::-1]):
-            cv2.cornerSubPix(grey, points, (_HALF_WINDOW, _HALF_WINDOW), (-1, -1), _STOP)
-            boards[file], size = points.reshape(-1, 2).astype(np.float64), grey.shape[::-1]
-    return Camera((int(size[0]), int(size[1]))), boards
-
-
-def board_grid(corners: tuple[int, int]) -> FloatArray:
-    """Grid coordinates of a board's corners in the order in which they are found, shape (N, 2)."""
-    across, down = corners
-    return np.stack(np.meshgrid(np.arange(float(across)), np.arange(float(down))), axis=-1).reshape(-1, 2)
 
 
 def off_grid(points: FloatArray, grid: FloatArray, *, metric: bool) -> float:

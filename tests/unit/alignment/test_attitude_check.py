@@ -29,7 +29,6 @@ def _aligned(given: Scene, attitudes: FloatArray | None, std: float) -> Alignmen
 
 @pytest.fixture(scope="module")
 def plain(windy: tuple[Scene, FloatArray]) -> Alignment:
-    """Without attitudes."""
     return _aligned(windy[0], None, _ONE)
 
 

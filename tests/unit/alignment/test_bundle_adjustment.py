@@ -29,13 +29,6 @@ def _start(model: MotionModel, truth: Scene) -> Parameters:
     return Parameters(poses, shared, np.array([-0.23, 0.01, -0.02, 0.004, -0.006]))
 
 
-def test_the_weight_of_an_error_is_the_derivative_of_its_loss() -> None:
-    squared, step = np.array([0.0, 0.5, 4.0, 9.0, 100.0, 1e4]), 1e-5
-    slope = (robust_cost(squared + step, 2.0) - robust_cost(squared - step, 2.0)) / (2 * step)
-    np.testing.assert_allclose(robust_weight(squared, 2.0), slope, rtol=1e-3, atol=1e-9)
-    assert robust_weight(np.array([4.0]), 2.0) == pytest.approx(0.25)
-
-
 @pytest.mark.parametrize("width", [2.0, 20.0])  # px; the errors at the start are of some twenty
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: float) -> None:

@@ -1,6 +1,5 @@
 """The ladder of lenses: as simple as the images allow, and never taken in by relief."""
 
-import importlib
 import re
 from dataclasses import replace
 from functools import cache
@@ -23,7 +22,6 @@ from tests.alignment_stubs import adjusted, independent_errors, observations
 from tests.lens_scenes import FISHEYE, SIZE, aligned, lens_distance, lens_scene
 from tests.sampled import sampled
 
-align_module = importlib.import_module("rdstitch.alignment.align")
 OFF_CENTRE = Camera(SIZE, -0.25, 0.0, (339.0, 229.0))
 
 
@@ -275,16 +273,6 @@ def test_a_centre_far_off_is_none_where_errors_agree() -> None:
     for center, plausible in ((0.07, True), (0.09, False)):
         found = adjusted(seen, np.full(540, 1.0), lens=(0.0, 0.0, 0.0, center, 0.0))
         assert has_plausible_center(found, seen) is plausible
-
-
-def test_the_ladder() -> None:
-    free = {name: free_parameters(name).tolist() for name in LENSES}
-    assert free == {
-        "division": [True, False, False, False, False],
-        "division-center": [True, False, False, True, True],
-        "division2": [True, True, False, True, True],
-        "division3": [True] * 5,
-    }
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ SIGNS = np.array([[1.0], [-1.0]])
 
 
 def _some(model: MotionModel, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Poses and shared parameters."""
     shared = model.shared_from_physical(np.array([0.05, -0.08, np.log(1.4)]))
     poses = model.nearest_poses(np.tile(np.eye(3), (count, 1, 1)), shared, np.zeros((count, 2)))
     return model.retract(poses, 0.3 * rng.normal(size=(count, model.pose_size))), shared

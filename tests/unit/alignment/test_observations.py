@@ -4,7 +4,6 @@ import numpy as np
 
 from rdstitch.alignment.link_equations import link_equations
 from rdstitch.alignment.observations import Observations
-from tests.alignment_scenes import ring, robot_path, scene
 
 
 def _observations(counts: list[int]) -> Observations:
@@ -55,11 +54,3 @@ def test_sums_of_a_link_do_not_depend_on_the_other_links() -> None:
         np.testing.assert_allclose(together.gradient[link], alone.gradient[0], rtol=1e-12, atol=1e-9)
     assert (together.gram[3] == 0.0).all()
     assert (together.gram[0] != 0.0).any()
-
-
-def test_scenes_link_frames_in_reach_and_around_the_end() -> None:
-    """What the benchmark of the adjustment is given."""
-    made = scene(robot_path(8, 0.15), reach=2, per_link=20, rng=np.random.default_rng(0))
-    assert {(k.image1, k.image2) for k in made.links} == {(i, j) for i in range(8) for j in (i + 1, i + 2) if j < 8}
-    closed = scene(ring(12, 0.3), reach=1, closed=True, per_link=20, rng=np.random.default_rng(0))
-    assert {(k.image1, k.image2) for k in closed.links} == {*((i, i + 1) for i in range(11)), (0, 11)}

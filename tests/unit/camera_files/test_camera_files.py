@@ -16,7 +16,6 @@ from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera, read_camera_file, save_camera
 from rdstitch.camera_files.lens_models import LensModel
 from rdstitch.errors import InputError, OutputError
-from rdstitch.orientation import turning_matrix
 from rdstitch.records import parse_yaml
 
 OPENCV = ["c.yml", "c.yaml", "opencv.json", "left.opencv.json", "a.fisheye.yml"]
@@ -32,7 +31,6 @@ CAMERAS = [
 
 
 def _points(camera: Camera) -> FloatArray:
-    """Measured px all over the image."""
     width, height = camera.image_size
     u, v = np.meshgrid(np.linspace(0, width - 1, 23), np.linspace(0, height - 1, 17))
     return np.column_stack([u.ravel(), v.ravel()])
@@ -61,21 +59,6 @@ def test_focal_length_and_tilt_keep_their_standard_deviations(tmp_path: Path, na
     assert found.tilt == pytest.approx(camera.tilt)
     assert found.tilt_std == pytest.approx(camera.tilt_std)
     assert found.with_focal(600.0, "option").focal_log_std == 0.01
-
-
-def test_the_tilt_turns_with_the_image() -> None:
-    upright = Camera((640, 480), focal=512.0, tilt=(0.05, -0.03), tilt_std=(0.002, 0.001))
-    (nadir,) = upright.denormalize([[-0.03 * 512.0 / 400.0, -0.05 * 512.0 / 400.0]])  # to first order
-    for orientation in (3, 6, 8):
-        turned = upright.turned(orientation)
-        assert turned.tilt is not None
-        psi, theta = turned.tilt
-        seen = turned.denormalize([theta * 512.0 / 400.0, -psi * 512.0 / 400.0])
-        matrix = turning_matrix(orientation)
-        expected = matrix @ (nadir - upright.center) + turned.center
-        np.testing.assert_allclose(seen, expected, atol=0.1)
-        assert sorted(turned.tilt_std or ()) == [0.001, 0.002]
-        assert (turned.tilt_std == upright.tilt_std) == (orientation == 3)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)

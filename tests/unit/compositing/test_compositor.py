@@ -17,7 +17,7 @@ from rdstitch.compositing.crop import largest_rectangle
 from rdstitch.compositing.options import ExposureMethod
 from rdstitch.compositing.placed_image import ImageLoader, place_images
 from rdstitch.compositing.preparation import prepare_composite
-from rdstitch.errors import ArgumentError, InputError, LimitError
+from rdstitch.errors import ArgumentError, InputError
 from rdstitch.io import Metadata, read_image
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import Scene, as_image, gradient, grey, inner, render
@@ -139,14 +139,6 @@ def test_a_clipped_sky_ends_in_no_step() -> None:
     assert steps["balanced"] < 0.4 * steps["gain"]
 
 
-def test_vignetting_is_found() -> None:
-    scene = render(3, 2, size=(480, 360), photometry=Photometry(vignetting=0.4), seed=3)
-    exposure = _compose(scene).exposure
-    radius2 = np.linspace(0, 0.9, 10)
-    estimate = np.exp(np.stack([radius2, radius2**2, radius2**3], axis=1) @ exposure.vignetting)
-    np.testing.assert_allclose(estimate, 1 - 0.4 * radius2, atol=0.03)
-
-
 def test_equal_images_are_not_touched() -> None:
     scene = render(2, 1, seed=4)
     exposure = _compose(scene).exposure
@@ -154,7 +146,7 @@ def test_equal_images_are_not_touched() -> None:
     assert (exposure.vignetting == 0).all()
 
 
-@pytest.mark.parametrize("share", [0.06, 0.11, 0.2, 0.28, 0.4])
+@pytest.mark.parametrize("share", sampled([0.06, 0.2, 0.4, 0.11, 0.28], 3))
 @pytest.mark.parametrize("noise", [0.0, 2.0])
 def test_what_only_one_image_shows_colours_nothing(share: float, noise: float) -> None:
     """Two pieces of white paper with text, equally exposed, and a blue header on the second."""
@@ -180,7 +172,7 @@ def test_what_only_one_image_shows_colours_nothing(share: float, noise: float) -
     assert (same[0] | same[1]).all()
 
 
-@pytest.mark.parametrize(("seed", "people"), [(0, 0), (2, 6), (3, 6), (4, 6)])
+@pytest.mark.parametrize(("seed", "people"), sampled([(0, 0), (2, 6), (3, 6), (4, 6)], 2))
 def test_gains_are_found_among_what_moved(seed: int, people: int) -> None:
     """Patches of other colours, a seventh of each image, hardly change what is found for true gains."""
     rng, gains = np.random.default_rng(9 + seed), np.random.default_rng(seed).uniform(0.7, 1.3, 9)
@@ -206,14 +198,6 @@ def test_every_combination_shows_the_plane(blend: str, seam: str) -> None:
     mine, truth = grey(result.pixels), scene.truth()
     assert np.sqrt(np.mean((mine[ok] - truth[ok]) ** 2)) < 0.03
     assert sharpness(mine, truth, ok) > 0.95
-
-
-def test_nothing_of_the_covered_plane_is_missing() -> None:
-    scene = render(3, 2)
-    covered = [
-        _compose(scene, blend=blend, seam=seam).alpha for blend, seam in (("none", "none"), ("multiband", "graphcut"))
-    ]
-    np.testing.assert_array_equal(covered[0], covered[1])
 
 
 @pytest.mark.parametrize("shift", sampled([0, 75, -50, 150, -150, -125, -100, -75, -25, 25, 50, 100, 125], 5))
@@ -321,14 +305,6 @@ def test_sixteen_bits_grey_and_mixed_sizes() -> None:
     assert len(np.unique(result.pixels)) > 1000
 
 
-def test_grey_among_colours_becomes_coloured() -> None:
-    scene = render(2, 1)
-    frames = [scene.frames[0], cv2.cvtColor(scene.frames[1], cv2.COLOR_RGB2GRAY)]
-    sources = [partial(as_image, np.asarray(frame)) for frame in frames]
-    result = compose(place_images(sources, scene.cameras, scene.homographies), scene.canvas)
-    assert result.pixels.shape[2] == 3
-
-
 def test_images_that_do_not_fit() -> None:
     scene = render(2, 1)
     wrong: list[ImageLoader] = [scene.sources[0], partial(as_image, np.zeros((10, 10, 3), np.uint8))]
@@ -339,12 +315,6 @@ def test_images_that_do_not_fit() -> None:
         compose(place_images(deep, scene.cameras, scene.homographies), scene.canvas)
     with pytest.raises(ArgumentError):
         compose(place_images(scene.sources[:1], scene.cameras, scene.homographies), scene.canvas)
-
-
-def test_memory_limit_is_checked_before_the_work() -> None:
-    scene = render(2, 1)
-    with pytest.raises(LimitError, match="--max-memory"):
-        _compose(scene, max_memory=10_000)
 
 
 @pytest.mark.parametrize(

@@ -32,12 +32,10 @@ class DecodedImageCache:
         self.reads: Counter[int] = Counter()
 
     def read(self, index: int) -> DecodedImage:
-        """One image."""
         self.reads[index] += 1
         return as_image(self.frames[index])
 
     def cache(self, limit: int, *, ahead: bool = False) -> ImageCache:
-        """All images, as they are."""
         lens = Camera((200, 100))
         read = [lambda k=k: self.read(k) for k in range(4)]
         reader = ImageReader(place_images(read, [lens] * 4, [np.eye(3)] * 4))
@@ -108,7 +106,6 @@ def test_what_is_not_expected_makes_room_and_is_read_once_more_if_need_be() -> N
 
 
 def _until(told: Callable[[], bool]) -> None:
-    """Wait for another thread."""
     end = monotonic() + 30.0
     while not told():
         assert monotonic() < end

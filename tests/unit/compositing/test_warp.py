@@ -54,16 +54,6 @@ def test_coordinates_are_exact_to_what_resampling_rounds(distortion: float, scal
         assert warp.step >= (8 if scale == 1.0 else 2)
 
 
-def test_source_points_go_back_to_where_they_came_from() -> None:
-    lens = Camera((640, 480), distortion=-0.3)
-    matrix = np.array([[0.9, 0.1, 2.0], [-0.1, 0.9, 1.0], [0.03, 0.02, 1.0]])
-    canvas = plan_canvas([lens], matrix[None], rotate=20, scale=1.7)
-    px = np.random.default_rng(1).uniform(0, [639, 479], (50, 2))
-    z = np.column_stack([lens.normalize(lens.undistort(px)), np.ones(50)]) @ (canvas.matrix @ matrix).T
-    back = plan_warp(lens, matrix, canvas, 0).source_points(z[:, 0] / z[:, 2], z[:, 1] / z[:, 2])
-    np.testing.assert_allclose(back, px, atol=1e-8)
-
-
 def test_a_box_anywhere_gives_the_same_coordinates() -> None:
     lens = Camera((640, 480), distortion=-0.3)
     canvas = plan_canvas([lens], np.eye(3)[None])

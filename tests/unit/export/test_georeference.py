@@ -346,15 +346,6 @@ def test_images_without_positions_leave_no_world_file(cached: StitchOptions, tmp
     assert not list(tmp_path.glob("*.prj"))
 
 
-def test_geotiff_counts_from_the_corner_of_the_first_pixel() -> None:
-    place = Georeference(Crs(32633), 0.1 * np.exp(-0.4j), complex(448_251.8, 5_411_935.1), 0.1)
-    tags = {tag[0]: tag[3] for tag in place.tiff_tags()}
-    matrix = np.reshape(tags[34264], (4, 4))
-    pixels = np.array([(0.0, 0.0), (899.0, 0.0), (0.0, 599.0)])
-    corners = np.column_stack([pixels + 0.5, np.zeros(3), np.ones(3)])
-    np.testing.assert_allclose((corners @ matrix.T)[:, :2], place.to_map(pixels), atol=1e-6)
-
-
 def test_gdal_sees_what_was_meant(tmp_path: Path) -> None:
     place = Georeference(Crs(32734), 0.05 * np.exp(0.3j), complex(268_832.3, 6_246_117.8), 0.1)
     alpha = np.full((600, 900), 255, np.uint8)

@@ -18,7 +18,6 @@ _OPTIONS = rdstitch.StitchOptions(workers=1, channel_order="rgb", features=rdsti
 
 @pytest.fixture(scope="module")
 def frames() -> list[NDArray[np.uint8]]:
-    """Three images in a chain."""
     sequence = flight(3, 3)
     return [sequence.frame(index) for index in range(3)]
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features import Features, match
 from rdstitch.features.keypoints import Descriptors
-from rdstitch.features.nearest import Locations
 
 
 def features(descriptors: Descriptors, points: NDArray[np.float64] | None = None, kind: str = "sift") -> Features:
@@ -50,7 +48,6 @@ def pair_of(kind: str, seed: int) -> tuple[Features, Features]:
 
 
 def distances(one: Features, two: Features) -> NDArray[np.float64]:
-    """All distances, by the definition."""
     if one.binary:
         bits = [np.unpackbits(np.asarray(f.descriptors, np.uint8), axis=1).astype(np.int64) for f in (one, two)]
         return np.asarray(np.abs(bits[0][:, None] - bits[1]).sum(axis=2), np.float64)
@@ -111,14 +108,6 @@ def test_the_ratio_is_that_of_the_distances_and_orders_the_matches(kind: str) ->
     np.testing.assert_array_equal(found.points2, two.points[found.indices[:, 1]])
 
 
-def test_opencv_finds_the_same_matches_of_sift_descriptors() -> None:
-    one, two = pair_of("float", seed=6)
-    knn = [cv2.BFMatcher().knnMatch(a.descriptors, b.descriptors, k=2) for a, b in ((one, two), (two, one))]
-    passed = [{(m.queryIdx, m.trainIdx) for m, n in pairs if m.distance < 0.8 * n.distance} for pairs in knn]
-    expected = passed[0] & {(i, j) for j, i in passed[1]}
-    assert as_set(match(one, two, 0.8).indices) == expected
-
-
 def test_a_tie_is_no_match() -> None:
     rng = np.random.default_rng(7)
     values = sift_like(rng, 20)
@@ -175,24 +164,3 @@ def test_bad_arguments_are_refused() -> None:
         replace(one, descriptors=one.descriptors[1:])
     with pytest.raises(ArgumentError, match="finite"):
         replace(one, points=one.points * np.nan)
-
-
-def test_blocks_hold_as_many_keypoints_as_they_may() -> None:
-    rng = np.random.default_rng(4)
-    points = np.repeat(rng.uniform(0, 100, (40, 2)), rng.integers(1, 6, 40), axis=0)
-    locations = Locations.group(points)
-    for most in (0, 1, 7, 30, 1000):
-        blocks = list(locations.blocks(most))
-        assert [here.start for here in blocks] == [0, *(here.stop for here in blocks[:-1])]
-        assert blocks[-1].stop == len(locations)
-        held = [np.concatenate(locations.places(here)) for here in blocks]
-        assert sorted(np.concatenate(held).tolist()) == list(range(len(points)))
-        for own, here in zip(held, blocks, strict=True):
-            shown = points[locations.layers[0][here]]
-            assert (points[locations.order[own]][:, None] == shown).all(axis=2).any(axis=1).all()
-            assert len(own) <= most or here.stop == here.start + 1
-        # No block could take the next location, too.
-        for own, here in zip(held[:-1], blocks[:-1], strict=True):
-            following = locations.places(slice(here.stop, here.stop + 1))
-            assert len(own) + len(following) > most
-            assert here.stop > here.start

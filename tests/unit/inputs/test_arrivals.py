@@ -2,8 +2,6 @@
 
 import io
 import os
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,9 +10,9 @@ import numpy as np
 import pytest
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.inputs import arrivals as module
 from rdstitch.inputs.arrivals import Arrivals
 from rdstitch.inputs.frame import Frame
+from tests.videos import write_video
 
 
 def _nowhere() -> Path:
@@ -38,52 +36,11 @@ def test_what_is_in_a_folder_comes_in_natural_order_and_then_it_ends(tmp_path: P
     assert arrivals.inputs == [str(tmp_path)]
 
 
-def test_files_that_come_later_are_found_once_and_only_when_they_are_complete(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "_POLL_SECONDS", 0.02)
-    frames = iter(Arrivals(tmp_path, frames_folder=_nowhere, idle=1.5))
-    _image(tmp_path / "a.png")
-    assert next(frames).path.name == "a.png"
-    data = (tmp_path / "a.png").read_bytes()
-
-    def write_slowly() -> None:
-        with (tmp_path / "b.png").open("wb") as file:
-            for byte in data:
-                file.write(bytes([byte]))
-                file.flush()
-                time.sleep(0.002)
-
-    writer = threading.Thread(target=write_slowly)
-    writer.start()
-    found = next(frames)
-    writer.join()
-    assert found.path.name == "b.png"
-    assert found.path.read_bytes() == data
-    assert list(frames) == []
-
-
 def test_a_file_that_rdstitch_wrote_is_none(tmp_path: Path) -> None:
     _image(tmp_path / "out.png")
     (tmp_path / "out.png.json").write_text('{"format": "rdstitch sidecar", "output": {"file": "out.png"}}')
     _image(tmp_path / "frame.png")
     assert _names(iter(Arrivals(tmp_path, frames_folder=_nowhere, idle=0.01))) == ["frame.png"]
-
-
-def test_names_come_as_they_are_written_and_end_with_their_stream() -> None:
-    reading, writing = os.pipe()
-    with os.fdopen(reading, encoding="utf-8") as stream:
-        arrivals = Arrivals("-", frames_folder=_nowhere, names=stream)
-        frames = iter(arrivals)
-        for name in ("one.png", "a name with spaces.png"):
-            os.write(writing, f"{name}\n".encode())
-            assert next(frames).path == Path(name)
-        os.close(writing)
-        assert list(frames) == []
-    assert [frame.path.name for frame in arrivals.inputs if isinstance(frame, Frame)] == [
-        "one.png",
-        "a name with spaces.png",
-    ]
 
 
 def test_names_that_do_not_come_are_waited_for_no_longer_than_that() -> None:
@@ -101,14 +58,7 @@ def test_names_that_do_not_come_are_waited_for_no_longer_than_that() -> None:
 @pytest.fixture
 def video(tmp_path: Path) -> Path:
     """Six frames, ever lighter, at 5 frames a second."""
-    file = tmp_path / "drive.avi"
-    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (64, 48))
-    if not writer.isOpened():
-        pytest.skip("this OpenCV writes no videos")
-    for level in range(6):
-        writer.write(np.full((48, 64, 3), 40 * level, np.uint8))
-    writer.release()
-    return file
+    return write_video(tmp_path / "drive.avi", (np.full((48, 64, 3), 40 * level, np.uint8) for level in range(6)))
 
 
 def test_every_nth_frame_of_a_video_with_its_number_and_time(video: Path) -> None:

@@ -38,7 +38,6 @@ def test_a_source_can_be_sent_elsewhere(source: Source) -> None:
 
 @pytest.fixture
 def read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The reductions at which files are decoded."""
     seen: list[int] = []
 
     def noted(path: Path, reduction: int, metadata: Metadata) -> DecodedImage:

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 from rdstitch.errors import InputError
 from rdstitch.inputs.find import find_images
+from tests.videos import write_video
 
 
 def images(folder: Path, count: int) -> list[Path]:
@@ -20,13 +20,7 @@ def images(folder: Path, count: int) -> list[Path]:
 
 
 def video(path: Path) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (64, 48))
-    if not writer.isOpened():
-        pytest.skip("this OpenCV writes no videos")
-    for k in range(3):
-        writer.write(np.full((48, 64, 3), 80 * k, np.uint8))
-    writer.release()
-    return path
+    return write_video(path, (np.full((48, 64, 3), 80 * k, np.uint8) for k in range(3)))
 
 
 def test_what_is_no_image_in_a_folder_is_named_once(tmp_path: Path) -> None:

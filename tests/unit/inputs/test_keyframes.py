@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.frame_tracking import tracked
 from rdstitch.inputs.keyframes import Wanted, choose, keyframes, wanted_frames
+from tests.videos import write_video
 
 _WIDTH, _HEIGHT = 160, 120
 _GROUND = np.asarray(
@@ -101,12 +102,7 @@ def test_no_frames() -> None:
 def test_of_a_video_these_frames_are_written_unless_the_user_says_which(tmp_path: Path) -> None:
     file, folder = tmp_path / "drive.avi", tmp_path / "frames"
     folder.mkdir()
-    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (_WIDTH, _HEIGHT))
-    if not writer.isOpened():
-        pytest.skip("this OpenCV writes no videos")
-    for image in _film([4.0 * k for k in range(60)] + [236.0] * 20):
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
+    write_video(file, _film([4.0 * k for k in range(60)] + [236.0] * 20), 25.0)
     found = find_images([file], frames_folder=lambda: folder)
     numbers = [frame.number for frame in found.frames]
     assert numbers[0] == 0

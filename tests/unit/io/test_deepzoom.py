@@ -12,7 +12,6 @@ from PIL import Image
 from rdstitch.errors import OutputError
 from rdstitch.io import Layout, Metadata, write_image, write_strips
 from rdstitch.io.deepzoom import read_deep_zoom
-from rdstitch.outputs import check_output, tiles_folder
 
 NAMESPACE = "{http://schemas.microsoft.com/deepzoom/2008}"
 
@@ -90,37 +89,6 @@ def test_profile_is_in_every_tile(tmp_path: Path) -> None:
     for tile in (tmp_path / "a_files").rglob("*.jpg"):
         with Image.open(tile) as image:
             assert image.info["icc_profile"] == profile
-
-
-def test_failure_leaves_the_old_one(tmp_path: Path) -> None:
-    write_image(tmp_path / "a.dzi", _smooth(300, 300))
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    layout = Layout((300, 600), 3, np.dtype(np.uint8))
-
-    def broken() -> Any:
-        yield _smooth(256, 300), None
-        raise OSError(28, "No space left on device")
-
-    with pytest.raises(OutputError, match="No space left"):
-        write_strips(tmp_path / "a.dzi", layout, broken())
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
-    write_image(tmp_path / "a.dzi", _smooth(100, 100))
-    assert {path.name for path in tmp_path.iterdir()} == {"a.dzi", "a_files"}
-    assert {path.name for path in (tmp_path / "a_files").iterdir()} == {str(k) for k in range(8)}
-
-
-def test_a_folder_of_other_things_is_never_replaced(tmp_path: Path) -> None:
-    folder = tiles_folder(tmp_path / "a.dzi")
-    folder.mkdir()
-    with pytest.raises(OutputError, match="exists"):
-        check_output(tmp_path / "a.dzi")
-    check_output(tmp_path / "a.dzi", overwrite=True)
-    (folder / "holiday.jpg").write_bytes(b"dear")
-    with pytest.raises(OutputError, match="holds other files"):
-        check_output(tmp_path / "a.dzi", overwrite=True)
-    with pytest.raises(OutputError, match="holds other files"):
-        write_image(tmp_path / "a.dzi", _smooth(30, 30))
-    assert (folder / "holiday.jpg").read_bytes() == b"dear"
 
 
 def test_floats_are_refused(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import open_regular, read_limited, read_text
-from rdstitch.io import Metadata, read_image, read_metadata, write_image
+from rdstitch.io import read_image, read_metadata, write_image
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.metadata import MAX_PROFILE
 
@@ -126,15 +126,3 @@ def test_a_file_of_several_blocks_is_read_whole(tmp_path: Path) -> None:
     assert read_limited(tmp_path / "file", len(content)) == content
     with pytest.raises(OSError, match="too large"):
         read_limited(tmp_path / "file", len(content) - 1)
-
-
-def test_deep_images_keep_their_channels(tmp_path: Path) -> None:
-    deep = np.random.default_rng(1).integers(0, 65536, (300, 200, 4), dtype=np.uint16)
-    write_image(tmp_path / "a.png", deep[..., :3])
-    np.testing.assert_array_equal(read_image(tmp_path / "a.png").pixels, deep[..., :3])
-    alpha = np.where(deep[..., 3] > 30000, 255, 0).astype(np.uint8)
-    write_image(tmp_path / "a.png", deep[..., :3], alpha)
-    back = read_image(tmp_path / "a.png")
-    np.testing.assert_array_equal(back.pixels, deep[..., :3])
-    np.testing.assert_array_equal(back.alpha, alpha)
-    assert back.metadata == Metadata((200, 300), bit_depth=16, channels=4)

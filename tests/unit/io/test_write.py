@@ -1,9 +1,7 @@
 """Writing images: whole or not at all, the same bytes for the same image, nothing lost."""
 
 import itertools
-import os
 import shutil
-import stat
 import subprocess
 from importlib import import_module
 from importlib.util import find_spec
@@ -27,7 +25,6 @@ from rdstitch.io import (
     write_image,
     write_strips,
 )
-from rdstitch.outputs import Outputs, check_output, write_bytes_atomic
 
 Pixels = NDArray[Any]
 
@@ -191,78 +188,6 @@ def test_wrong_arguments(tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match="rows"):
         write_strips(tmp_path / "a.png", layout, [(np.zeros((9, 4, 1), np.uint8), None)])
     assert list(tmp_path.iterdir()) == []
-
-
-class TestAtomic:
-    """A reader sees the old file or the new one."""
-
-    def test_failure_leaves_the_old_file(self, tmp_path: Path) -> None:
-        target = tmp_path / "a.txt"
-        target.write_text("old")
-
-        def interrupted() -> None:
-            with Outputs(overwrite=True) as outputs, outputs.writing(target) as temporary:
-                temporary.write_text("new, half-writ")
-                raise RuntimeError
-
-        with pytest.raises(RuntimeError):
-            interrupted()
-        assert target.read_text() == "old"
-        assert list(tmp_path.iterdir()) == [target]
-
-    def test_full_disk(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        def full(descriptor: int) -> None:
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(os, "fsync", full)
-        with pytest.raises(OutputError, match="No space left"):
-            write_bytes_atomic(tmp_path / "a.json", b"{}")
-        assert list(tmp_path.iterdir()) == []
-
-    def test_mode_is_kept(self, tmp_path: Path) -> None:
-        target = tmp_path / "a.json"
-        target.write_text("{}")
-        target.chmod(0o640)
-        write_bytes_atomic(target, b"{}")
-        assert stat.S_IMODE(target.stat().st_mode) == 0o640
-
-    def test_missing_folder(self, tmp_path: Path) -> None:
-        with pytest.raises(OutputError):
-            write_bytes_atomic(tmp_path / "none" / "a.json", b"{}")
-
-
-class TestCheckOutput:
-    """Found out before long work."""
-
-    def test_good(self, tmp_path: Path) -> None:
-        assert check_output(tmp_path / "a.tif") == tmp_path / "a.tif"
-        assert list(tmp_path.iterdir()) == []
-
-    @pytest.mark.parametrize(
-        ("name", "words"),
-        [
-            ("a.xyz", "unknown file type"),
-            ("a", "no file type"),
-            ("none/a.jpg", "does not exist"),
-            ("old.jpg", "exists"),
-        ],
-    )
-    def test_bad(self, tmp_path: Path, name: str, words: str) -> None:
-        (tmp_path / "old.jpg").write_bytes(b"x")
-        with pytest.raises(OutputError, match=words):
-            check_output(tmp_path / name)
-
-    def test_overwrite_but_never_an_input(self, tmp_path: Path) -> None:
-        (tmp_path / "old.jpg").write_bytes(b"x")
-        (tmp_path / "link.jpg").symlink_to(tmp_path / "old.jpg")
-        check_output(tmp_path / "old.jpg", overwrite=True)
-        with pytest.raises(OutputError, match="input"):
-            check_output(tmp_path / "link.jpg", overwrite=True, inputs=[tmp_path / "old.jpg"])
-
-    def test_folder(self, tmp_path: Path) -> None:
-        (tmp_path / "a.jpg").mkdir()
-        with pytest.raises(OutputError, match="folder"):
-            check_output(tmp_path / "a.jpg")
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])

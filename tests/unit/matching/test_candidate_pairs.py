@@ -1,12 +1,8 @@
 """Which pairs are looked at: all of a few images; of many, those that follow one another or look alike."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from rdstitch.arrays import FloatArray
@@ -16,17 +12,14 @@ from rdstitch.features.keypoints import Descriptors
 from rdstitch.matching.candidate_pairs import (
     CANDIDATES,
     EXHAUSTIVE_UP_TO,
-    _most_alike,
     neighbours,
     pairs_that_matter,
 )
 from rdstitch.matching.candidate_pairs import first_pairs as _first_pairs
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
-from rdstitch.matching.retrieval import similarity
 
 
 def first_pairs(features: list[Features], seed: int, positions: FloatArray | None = None) -> list[tuple[int, int]]:
-    """Of features in memory."""
     return _first_pairs(FeatureStore.of(features), seed, positions)
 
 
@@ -205,24 +198,6 @@ def test_neighbours_with_partners_in_common_are_not_tried_again_but_loops_are_cl
     assert all(j - i > 12 or i < 6 or j > count - 7 for i, j in found)
 
 
-def test_too_few_features_for_words_look_like_none() -> None:
-    """Words are learned from 640 descriptors or more, or not at all."""
-    rng = np.random.default_rng(0)
-    images = [_features(rng.normal(size=(16, 64)).astype(np.float32)) for _ in range(39)]
-    assert similarity(FeatureStore.of(images), seed=1) is None
-    assert similarity(FeatureStore.of([*images, images[0]]), seed=1) is not None
-
-
-def test_images_that_look_like_none_are_paired_with_the_three_that_follow() -> None:
-    count = 40
-    pairs = first_pairs([_features(np.zeros((0, 64), dtype=np.float32))] * count, seed=0)
-    assert pairs == [(i, j) for i in range(count) for j in range(i + 1, min(i + 4, count))]
-
-
-def test_no_image_is_paired_with_itself() -> None:
-    assert all(i < j for i, j in first_pairs(_drive(40), seed=0))
-
-
 def test_ten_neighbours_of_each_image_are_candidates() -> None:
     lens = Camera((640, 480))
     places = np.stack([np.eye(3)] * 11)
@@ -247,20 +222,3 @@ def test_of_a_turn_neighbours_are_those_that_see_a_part_of_each_other(focal: flo
     assert apart == set(range(1, max(apart) + 1))
     assert abs(max(apart) - reach) <= 1
     assert (0, count - 1) in found
-
-
-def _alike(ordered: bool = False) -> Any:
-    rows = [[0.0, 0.9, 0.5, 0.0], [0.9, 0.0, 0.7, 0.2], [0.5, 0.7, 0.0, 0.0], [0.0, 0.2, 0.0, 0.0]]
-    scores = sparse.csr_array(np.array(rows))
-    most = np.array([[1, 2], [0, 2], [1, 0], [1, 2]])
-    return SimpleNamespace(most_alike=most, ordered=ordered, scores=scores)
-
-
-def test_images_without_features_are_like_none() -> None:
-    images = [*_drive(40), _features(np.zeros((0, 64), np.float32))]
-    assert not any(40 - i > 3 for i, j in first_pairs(images, seed=0) if j == 40)
-
-
-def test_the_pairs_most_alike_fill_up_what_is_wanted() -> None:
-    for total, pairs in ((0, set()), (1, set()), (2, {(0, 1)}), (3, {(0, 1), (1, 2)}), (9, {(0, 1), (1, 2), (1, 3)})):
-        assert _most_alike(_alike(), {(0, 2)}, total) == pairs, total

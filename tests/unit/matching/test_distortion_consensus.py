@@ -68,8 +68,3 @@ def test_votes_agree_within_three_standard_deviations(offset: float, agreeing: i
 def test_the_middle_of_votes_that_do_not_agree_is_their_median() -> None:
     assert vote([-0.5, -0.2, 0.1], [0.001] * 3).distortion == pytest.approx(-0.2, abs=0.01)
     assert vote([0.1, -0.6, -0.2, -0.5, 0.2], [0.001] * 5).distortion == pytest.approx(-0.2, abs=0.01)
-
-
-def test_without_votes_there_is_nothing() -> None:
-    none = vote([np.nan], [0.01])
-    assert (none.scatter, none.agreeing, none.votes, len(none.histogram), len(none.edges)) == (0.0, 0, 0, 0, 0)

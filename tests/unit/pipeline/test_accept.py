@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from rdstitch.cache import NO_CACHE
-from rdstitch.errors import RegistrationError
 from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import write_image
 from rdstitch.messages import Message, Severity, left_out
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.accept import Offenders, _is_of_the_whole, _is_simpler, _may_be_another_plane, _without, accept
+from rdstitch.pipeline.accept import _is_of_the_whole, _is_simpler, _may_be_another_plane, _without, accept
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
 from rdstitch.verification.findings import Finding
@@ -72,65 +71,6 @@ def test_another_plane_is_looked_for_where_there_may_be_one(finding: Finding, ex
 )
 def test_motions_in_the_plane_are_compared_by_their_freedom(former: str, model: str, simpler: bool) -> None:
     assert _is_simpler(model, former) is simpler
-
-
-class _Stub(SimpleNamespace):
-    """As much of a registration of four images, the third of which is damaged, as ``accept`` asks for."""
-
-    def with_messages(self, messages: object) -> Any:
-        return _Stub(**{**vars(self), "found": messages})
-
-    @property
-    def ok(self) -> bool:
-        return not self.found
-
-
-def _stub(model: str, used: int) -> Any:
-    guard = SimpleNamespace(messages=[Message("is damaged", ("2.jpg",), code="damaged")])
-    sources = [SimpleNamespace(path=f"{k}.jpg", guard=guard) for k in range(4)]
-    alignment = SimpleNamespace(model=model, used=np.arange(4) < used)
-    return _Stub(alignment=alignment, sources=sources, pairs=(), left_out=(), found=())
-
-
-@pytest.mark.parametrize(
-    ("rest", "remaining", "fails", "left_out"),
-    [
-        ("rigid", 3, (), True),  # the damaged one alone asked for tilts
-        ("tilting", 3, (), False),
-        ("tilting", 3, (4,), True),  # the whole fails, the rest does not
-        ("tilting", 3, (3, 4), None),
-        ("rigid", 2, (), False),  # most of the images would be missing
-    ],
-)
-def test_what_is_damaged_is_left_out_where_the_others_fit_better(
-    monkeypatch: pytest.MonkeyPatch, rest: str, remaining: int, fails: tuple[int, ...], left_out: bool | None
-) -> None:
-    whole, smaller = _stub("tilting", 4), _stub(rest, remaining)
-    asked: list[Offenders] = []
-
-    def without(_: object, offenders: Offenders, aligner: object) -> Any:
-        asked.append(offenders)
-        return smaller
-
-    def judge(found: Any) -> tuple[Finding, ...]:
-        fails_now = found.alignment.used.sum() in fails
-        return (Finding("pattern", values={"count": 2, "of": 3}),) if fails_now else ()
-
-    stage = "rdstitch.pipeline.accept"
-    monkeypatch.setattr(f"{stage}._without", without)
-    monkeypatch.setattr(f"{stage}.judge", judge)
-    monkeypatch.setattr(f"{stage}._plane_of_most", lambda *_: None)
-    monkeypatch.setattr(f"{stage}.at_full_size", lambda registration: registration)
-    aligner = Aligner.of([], OPTIONS, NO_CACHE)
-    monkeypatch.setattr(f"{stage}.Aligner.of", lambda *_, **__: aligner)
-    monkeypatch.setattr(f"{stage}.RefusedError", RegistrationError)
-    if left_out is None:
-        with pytest.raises(RegistrationError):
-            accept(whole, OPTIONS)
-    else:
-        accepted = accept(whole, OPTIONS)
-        assert accepted.alignment is (smaller if left_out else whole).alignment
-    assert [list(offenders) for offenders in asked[:1]] == [[(2,)]]
 
 
 def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Path) -> None:

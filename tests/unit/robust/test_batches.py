@@ -7,7 +7,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
 from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
-from rdstitch.robust.measurements import Measurements, padded_length
+from rdstitch.robust.measurements import Measurements
 from tests.correspondences import correspondences
 
 
@@ -46,13 +46,6 @@ def test_one_pair_by_either_function() -> None:
 
 def test_no_pairs() -> None:
     assert estimate_radial_homographies([], EstimationOptions()) == []
-
-
-@pytest.mark.parametrize("count", [1, 16, 17, 33, 100, 129, 1000, 1025])
-def test_padding_is_at_most_a_quarter(count: int) -> None:
-    length = padded_length(count)
-    assert count <= length <= max(16, 1.25 * count)
-    assert padded_length(length) == length
 
 
 @pytest.mark.parametrize("own", [False, True])

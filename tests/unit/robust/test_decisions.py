@@ -5,7 +5,6 @@ import pytest
 
 import rdstitch
 from rdstitch.robust import SolverName
-from rdstitch.robust.verification import rejection_reason
 from tests.correspondences import correspondences
 
 
@@ -54,14 +53,3 @@ def test_the_least_free_model_is_chosen() -> None:
             )
             chosen.append(found.model == motion)
     assert np.mean(chosen) > 0.9
-
-
-@pytest.mark.parametrize(("agreeing", "chance"), [(16, True), (22, True), (36, False), (300, False)])
-def test_agreement_that_chance_explains_is_rejected(agreeing: int, chance: bool) -> None:
-    """Of a thousand wrong matches ten agree by chance, beside the four that a model is made from."""
-    points = np.random.default_rng(0).uniform((0.0, 0.0), (999.0, 799.0), (1000, 2))
-    reason = rejection_reason(points, points, np.arange(1000) < agreeing, (1000, 800), 3.0)
-    if chance:
-        assert reason == f"{agreeing} of 1000 matches agree, no more than chance allows"
-    else:
-        assert reason is None

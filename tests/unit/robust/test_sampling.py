@@ -8,7 +8,6 @@ from rdstitch.robust.sampling import Sampler
 
 
 def _draw(sampler: Sampler, count: int, batch: int, *, start: int = 0, ordered: bool = False) -> IntArray:
-    """Samples of one pair."""
     picks: IntArray = sampler.draw(np.array([start]), batch, np.array([count]), np.array([ordered]))[0]
     return picks
 

@@ -173,12 +173,6 @@ def test_all_points_at_the_centre_have_no_solution(case: Case) -> None:
 
 
 @every_solver
-def test_huge_coordinates_are_refused_quietly(case: Case) -> None:
-    x1, x2 = samples(case, batch=4)
-    assert len(case.solve(1e200 * x1, 1e200 * x2)) == 0
-
-
-@every_solver
 def test_mirrored_samples_have_no_solution(case: Case) -> None:
     if case.count == 2:
         pytest.skip("two points have no orientation")

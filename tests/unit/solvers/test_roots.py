@@ -8,13 +8,6 @@ import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers.batch import IndexArray
-from rdstitch.solvers.polynomials import (
-    bernstein_from_values,
-    bernstein_subdivision,
-    chebyshev_nodes,
-    chebyshev_values,
-    value_and_slope_from_values,
-)
 from rdstitch.solvers.roots import real_roots
 
 
@@ -28,7 +21,6 @@ class Product:
     heights: FloatArray
 
     def polynomial(self, distortion: FloatArray) -> FloatArray:
-        """Value of the product."""
         value = np.broadcast_to(self.scale, distortion.shape).copy()
         for root in self.roots:
             value = value * (distortion - root)
@@ -37,7 +29,6 @@ class Product:
         return value
 
     def take(self, samples: IndexArray) -> Self:
-        """Some of them."""
         return type(self)(*(a[..., samples] for a in (self.roots, self.scale, self.centres, self.heights)))
 
 
@@ -54,7 +45,6 @@ def product(roots: FloatArray, pairs: int = 0, seed: int = 0) -> Product:
 
 
 def interval(batch: int, low: float = -1.5, high: float = 0.5) -> tuple[FloatArray, FloatArray]:
-    """The same interval for all."""
     return np.full(batch, low), np.full(batch, high)
 
 
@@ -124,29 +114,3 @@ def test_a_polynomial_without_meaning_has_no_roots(value: float) -> None:
     with np.errstate(invalid="ignore"):
         sample, _ = real_roots(equation, 1, *interval(2))
     assert sample.tolist() == [0]
-
-
-@pytest.mark.parametrize("degree", [1, 4, 6, 18])
-def test_matrices_agree_with_the_polynomial(degree: int) -> None:
-    rng = np.random.default_rng(degree)
-    monomials = rng.normal(size=degree + 1)
-    values = np.polynomial.polynomial.polyval(chebyshev_nodes(degree), monomials)
-    t = np.linspace(-1.0, 1.0, 41)
-    expected = np.polynomial.polynomial.polyval(t, monomials)
-    slopes = np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyder(monomials))
-
-    series = value_and_slope_from_values(degree) @ values
-    value, slope = chebyshev_values(np.repeat(series[:, :, None], len(t), axis=2), t)
-    assert value == pytest.approx(expected, abs=1e-12)
-    assert slope == pytest.approx(slopes, abs=1e-10)
-
-    for cell, coefficients in enumerate(bernstein_from_values(degree, 4) @ values):
-        s = np.linspace(0.0, 1.0, 7)
-        binomials = np.array([np.prod([(degree - i) / (i + 1) for i in range(j)]) for j in range(degree + 1)])
-        basis = binomials * s[:, None] ** np.arange(degree + 1) * (1 - s[:, None]) ** (degree - np.arange(degree + 1))
-        there = np.polynomial.polynomial.polyval(-1.0 + 0.5 * (cell + s), monomials)
-        assert basis @ coefficients == pytest.approx(there, abs=1e-11)
-        # The second half of the cell, by subdivision.
-        half = bernstein_subdivision(degree, 2)[1] @ coefficients
-        there = np.polynomial.polynomial.polyval(-1.0 + 0.5 * (cell + 0.5 + 0.5 * s), monomials)
-        assert basis @ half == pytest.approx(there, abs=1e-11)

@@ -1,7 +1,5 @@
 """Paths, surveys and the ground below them."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -17,7 +15,6 @@ from rdstitch.synthetic import (
     fit_to_plane,
     gradient,
     grid_poses,
-    ground,
     joined,
     line_poses,
     pair_poses,
@@ -128,18 +125,6 @@ def test_endless_ground_is_the_same_wherever_it_is_cut() -> None:
     seam = texture.region(2039 - 8, 0, 2039 + 8, 2000).mean(axis=2)
     steps = np.abs(np.diff(seam, axis=1)).mean(axis=0)
     assert steps[7] < 2.0 * np.median(steps)
-
-
-def test_ground_has_the_spectrum_of_natural_images() -> None:
-    """Power falls as frequency to the power -1.5 … -3, and seeds differ."""
-    grey = ground((512, 512), 6, 1).region(0, 0, 512, 512)[:, :, 0].astype(np.float64)
-    assert np.abs(grey - ground((512, 512), 7, 1).region(0, 0, 512, 512)[:, :, 0]).mean() > 0.05
-    power = np.abs(np.fft.fft2((grey - grey.mean()) * np.outer(np.hanning(512), np.hanning(512)))) ** 2
-    radius = np.hypot(np.fft.fftfreq(512)[:, None], np.fft.fftfreq(512))
-    bands = np.geomspace(0.01, 0.3, 12)
-    mean = [power[(radius >= a) & (radius < b)].mean() for a, b in pairwise(bands)]
-    slope = np.polyfit(np.log(bands[:-1]), np.log(mean), 1)[0]
-    assert -3.0 < slope < -1.3
 
 
 def test_hopeless_textures_are_hopeless() -> None:

@@ -67,7 +67,6 @@ def _truth(sequence: Sequence) -> Trajectory:
 
 @pytest.fixture(scope="module")
 def drive() -> Sequence:
-    """A turn of thirty frames."""
     return _drive(30)
 
 

@@ -35,6 +35,7 @@ def _kinds(findings: Any) -> list[str]:
         (9.5, 0.9, 9.01, "errors"),  # 9.07: more than 3²
         (LARGEST, 0.9, 9.9, "rough"),
         (LARGEST + 0.01, 0.9, 9.9, "errors"),
+        (np.nan, 0.9, None, "errors"),
     ],
 )
 def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kind: str | None) -> None:
@@ -45,7 +46,7 @@ def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kin
     assert _kinds(findings) == ([] if kind is None else [kind])
     for finding in findings:
         assert finding.severity == ("warning" if kind == "rough" else "failure")
-        assert finding.values == {"rms": rms, "threshold": 3.0}
+        assert finding.values == pytest.approx({"rms": rms, "threshold": 3.0}, nan_ok=True)
 
 
 def _checked(cells: int, share: float, pair: tuple[int, int] = (0, 1), *, unique: bool = False) -> Any:

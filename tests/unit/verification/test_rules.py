@@ -42,28 +42,30 @@ def test_what_is_not_said_is_a_detail() -> None:
     assert note == Finding("parallax", (0, 1), "detail", {"size": 3.0})
 
 
-@pytest.mark.parametrize("kind", ["relief", "parallax"])
-def test_of_a_turn_and_of_pairs_only_what_is_seen_is_said(kind: str) -> None:
-    turned = _with(GOOD, flat=False, depth=True)
-    assert _said(kind, found=turned) == []
-    assert _said(kind, found=_with(turned, alike=0.1)) == [kind]
+DEEP = _with(GOOD, depth=True)
+TURNED = _with(DEEP, flat=False)
+UNLIKE = _with(TURNED, alike=0.1)
+SMALL = _with(SHAPED, alignment=SimpleNamespace(shape=SimpleNamespace(shift=1e4, shift_std=8.0), cameras=[CAMERA]))
 
 
-def test_of_a_plane_one_line_says_that_it_may_be_none() -> None:
-    assert _said("relief") == ["relief"]
-    assert _said("relief", "shape bent") == ["shape bent"]
-    small = SimpleNamespace(shape=SimpleNamespace(shift=1e4, shift_std=8.0), cameras=[CAMERA])
-    assert _said("shape bent", found=_with(SHAPED, alignment=small)) == []  # by more than an image
-
-
-def test_depth_is_no_vehicle() -> None:
-    assert _said("second motion", found=_with(GOOD, flat=False, depth=True)) == []
-    assert _said("second motion") == ["second motion"]
-
-
-def test_a_seam_among_trees_is_no_doubtful_one() -> None:
-    assert _said("little alike") == ["little alike"]
-    assert _said("little alike", found=_with(GOOD, depth=True)) == []
+@pytest.mark.parametrize(
+    ("found", "kinds", "said"),
+    [
+        (TURNED, ["relief"], []),  # of a turn and of pairs only what is seen
+        (TURNED, ["parallax"], []),
+        (UNLIKE, ["relief"], ["relief"]),
+        (UNLIKE, ["parallax"], ["parallax"]),
+        (SHAPED, ["relief"], ["relief"]),
+        (SHAPED, ["relief", "shape bent"], ["shape bent"]),  # one line says that the plane may be none
+        (SMALL, ["shape bent"], []),  # by more than an image
+        (SHAPED, ["second motion"], ["second motion"]),
+        (TURNED, ["second motion"], []),  # depth is no vehicle
+        (SHAPED, ["little alike"], ["little alike"]),
+        (DEEP, ["little alike"], []),  # a seam among trees
+    ],
+)
+def test_what_is_said_aloud(found: Any, kinds: list[str], said: list[str]) -> None:
+    assert _said(*kinds, found=found) == said
 
 
 def test_failures_stay() -> None:

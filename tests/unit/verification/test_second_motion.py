@@ -52,7 +52,6 @@ def _images(covered: float, count: int = 2) -> list[Grey]:
 
 
 def _shift(pixels: float) -> FloatArray:
-    """As a homography from image 1 to image 2."""
     matrix = np.eye(3)
     matrix[0, 2] = -pixels / LENS.scale
     return matrix

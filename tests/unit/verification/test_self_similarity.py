@@ -80,13 +80,3 @@ def test_brightness_does_not_matter() -> None:
 )
 def test_as_good_is_nine_tenths_and_alike(here: float, elsewhere: float, ambiguous: bool) -> None:
     assert Ambiguity(here, elsewhere, 0.2).ambiguous is ambiguous
-
-
-def test_a_large_image_is_drawn_small_and_at_the_scale_of_its_middle() -> None:
-    large = Camera((1024, 768))
-    made = ComparedImage(np.zeros((768, 1024), np.float32), large, np.eye(3))
-    # 640 pixels of half a diagonal a unit, and a quarter of its size.
-    assert drawing_scale(made.camera, made.homography) == pytest.approx(160.0)
-    assert draw(made, 160.0).pixels.shape in ((192, 256), (193, 257))
-    assert drawing_scale(LENS, _placed(PLANE, 0, 0).homography) == pytest.approx(160.0)
-    assert draw(made, 160.0).origin == pytest.approx([-128.0, -96.0], abs=1.0)

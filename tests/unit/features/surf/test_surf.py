@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from rdstitch.features import FeatureOptions, detect, match
 from rdstitch.features.surf.descriptor import describe_patches, orientations
-from rdstitch.features.surf.hessian import find_blobs, from_level, pyramid, to_level, vertex
-from rdstitch.features.surf.refinement import apply_kernels, integer_kernels, refine
+from rdstitch.features.surf.hessian import find_blobs, pyramid, to_level
+from rdstitch.features.surf.refinement import refine
 from rdstitch.synthetic import ground
 
 Grey = NDArray[np.uint8]
@@ -23,7 +23,6 @@ def texture(width: int = 480, height: int = 400, seed: int = 5) -> Grey:
 
 
 def blob(center: tuple[float, float], sigma: float, sign: int = 1, size: int = 160) -> Grey:
-    """One Gaussian blob."""
     v, u = np.mgrid[:size, :size]
     squared = (u - center[0]) ** 2 + (v - center[1]) ** 2
     return np.asarray(np.rint(128 + sign * 90 * np.exp(-squared / (2 * sigma**2))), np.uint8)
@@ -75,13 +74,6 @@ def test_strips_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(a.response, b.response)
 
 
-def test_no_neighbour_in_place_or_scale_answers_more() -> None:
-    blobs = find_blobs(texture(), 50.0, 1, 3)
-    near = np.abs(blobs.points[:, None] - blobs.points).max(axis=2) < 1
-    close_in_size = np.abs(blobs.size[:, None] - blobs.size) < 3
-    assert (near & close_in_size).sum() == len(blobs)
-
-
 @pytest.mark.parametrize("sigma", [3.0, 4.4, 7.0, 13.0])
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_blob_is_found_where_it_is_and_as_large(sigma: float, sign: int) -> None:
@@ -106,13 +98,6 @@ def test_refinement_brings_back_a_displaced_blob() -> None:
     np.testing.assert_allclose(refine(levels, displaced).points, refine(levels, found).points, atol=0.3)
 
 
-def test_the_threshold_takes_the_strongest_blobs() -> None:
-    grey = texture()
-    many, few = find_blobs(grey, 50.0, 3, 3), find_blobs(grey, 400.0, 3, 3)
-    assert 0 < len(few) < len(many)
-    np.testing.assert_array_equal(few.points, many.take(many.response > 400.0).points)
-
-
 @pytest.mark.parametrize("degrees", [10.0, 37.0, 90.0, 160.0])
 def test_orientation_turns_with_the_image(degrees: float) -> None:
     grey = texture()
@@ -126,15 +111,6 @@ def test_orientation_turns_with_the_image(degrees: float) -> None:
     difference = np.angle(np.exp(1j * (after - before + np.radians(degrees))))
     assert np.median(np.abs(difference)) < np.radians(3)
     assert np.mean(np.abs(difference) < np.radians(10)) > 0.9
-
-
-def test_orientation_is_that_of_the_gradient() -> None:
-    v, u = np.mgrid[:120, :120]
-    for degrees in (0, 33, 118, 250, 340):
-        along = u * np.cos(np.radians(degrees)) + v * np.sin(np.radians(degrees))
-        ramp = np.rint(np.clip(128 + along - along.mean(), 0, 255)).astype(np.uint8)
-        found = np.degrees(orientations(pyramid(ramp, 4), np.array([[60.0, 58.0]]), np.array([2.5])))
-        assert (found[0] - degrees + 180) % 360 - 180 == pytest.approx(0.0, abs=1.0)
 
 
 @pytest.mark.parametrize("extended", [False, True])
@@ -156,48 +132,6 @@ def test_descriptors_follow_rotation_scale_and_contrast(extended: bool) -> None:
     for descriptors in (rotated, scaled, dimmed):
         difference = np.linalg.norm(descriptors - reference, axis=1)
         assert np.median(difference) < 0.15 * np.median(between_different)
-
-
-def test_a_patch_without_contrast_has_a_descriptor_of_zeros() -> None:
-    flat = np.full((90, 90), 77, np.uint8)
-    found = describe_patches(pyramid(flat, 4), np.array([[45.0, 45.0]]), np.array([2.0]), np.zeros(1), False)
-    np.testing.assert_array_equal(found, np.zeros((1, 64), np.float32))
-
-
-def test_levels_share_places() -> None:
-    levels = pyramid(blob((80.3, 78.6), 9.0), 4)
-    assert [level.shape for level in levels] == [(160, 160), (80, 80), (40, 40), (20, 20)]
-    for index, level in enumerate(levels):
-        light = np.maximum(level.astype(np.float64) - 130, 0)
-        v, u = np.mgrid[: level.shape[0], : level.shape[1]]
-        centre = np.array([(u * light).sum(), (v * light).sum()]) / light.sum()
-        np.testing.assert_allclose(from_level(centre, index), (80.3, 78.6), atol=0.06)
-        np.testing.assert_allclose(to_level(from_level(centre, index), index), centre)
-
-
-def test_integer_kernels_are_exact_in_any_order() -> None:
-    rng = np.random.default_rng(2)
-    kernels, factor = integer_kernels(rng.normal(size=(576, 20)) - 0.5)
-    patches = rng.integers(0, 256, (50, 24, 24), dtype=np.uint8)
-    exact = patches.reshape(50, -1).astype(np.int64) @ kernels.astype(np.int64)
-    np.testing.assert_array_equal(apply_kernels(patches, kernels), exact)
-    assert np.abs(exact).max() < 2**24
-    np.testing.assert_array_equal(kernels.sum(axis=0), 0)
-    assert factor > 0
-
-
-def test_the_vertex_of_a_quadric_is_found() -> None:
-    rng = np.random.default_rng(3)
-    step = np.arange(-1.0, 2.0)
-    s, v, u = np.meshgrid(step, step, step, indexing="ij")
-    x = np.stack([u, v, s], axis=-1)
-    for _ in range(20):
-        root = rng.normal(size=(3, 3))
-        second, middle = root @ root.T + 0.1 * np.eye(3), rng.uniform(-1, 1, 3)
-        values = 5.0 - np.einsum("...i,ij,...j->...", x - middle, second, x - middle)
-        offset, is_maximum = vertex(np.stack([values, -values]))
-        np.testing.assert_allclose(offset, [middle, np.zeros(3)], atol=1e-9)
-        assert is_maximum.tolist() == [True, False]
 
 
 @pytest.mark.parametrize("degrees", [15.0, 30.0, 45.0, 60.0, 90.0])
