@@ -13,13 +13,13 @@ _TABLE = """
 * undistort -o --output DIR: Folder to write to; made if missing.
 * trajectory -o --output FILE: File to write.
 * calibrate -o --output FILE: Camera file to write: .json, .yml and .fisheye.yml (OpenCV), .pto (Hugin), cameras.json
-    (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS), camchain.yaml (Kalibr).
+    (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS), camchain.yaml (Kalibr), .xml (lensfun).
 * --overwrite: Replace existing output files.
 * --images INPUT: Images to compose: what 'rdstitch mosaic' takes; may be given several times.
 * --preview: A quick small image: at most 1200 pixels, few features of small versions of the images, straight seams;
     options that are given stay as they are.
 * --reference NAME: Image that sets the frame; otherwise the best connected one.
-* --camera FILE: Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap or Hugin; its lens is kept.
+* --camera FILE: Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is kept.
 * --focal PX: Focal length, pixels; otherwise from EXIF, else guessed.
 * --mask DIR|FILE: Black is excluded: a folder of masks with the images' names, or one mask for all images.
 * --scale: Factor to the size of the output; 1 keeps resolution.
@@ -69,7 +69,8 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 --tilt: Known tilt of the camera to the plane, degrees.
 --attitude FILE|xmp: Tilt of each image: CSV name,psi,theta in degrees; xmp: what drones write into their images.
 --attitude-std: Standard deviation of the attitudes, degrees; 0 for exact ones.
---save-camera FILE: Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), camera_info.yaml (ROS) …
+--save-camera FILE: Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), .xml (lensfun), camera_info.yaml
+    (ROS) …
 # Features and registration
 --features: Features to match.
 --aliked-model FILE: ONNX file of the network of --features aliked.

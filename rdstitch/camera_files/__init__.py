@@ -10,6 +10,7 @@
 ``cameras.txt``                      COLMAP
 ``cameras.json``                     OpenDroneMap
 ``*.pto``                            Hugin
+``*.xml``                            lensfun
 ===================================  ==========================================================
 
 What is written follows from the name, as above; what is read is known by its content.
@@ -26,6 +27,7 @@ from rdstitch.camera_files import writing
 from rdstitch.camera_files.hugin import hugin_project, is_hugin, read_hugin
 from rdstitch.camera_files.lens_fit import CameraFile
 from rdstitch.camera_files.lens_models import LensFit
+from rdstitch.camera_files.lensfun import lensfun_xml, read_lensfun
 from rdstitch.camera_files.reading import (
     ImageSize,
     colmap_cameras,
@@ -44,7 +46,7 @@ __all__ = ["CAMERA_SUFFIXES", "CameraFile", "LensFit", "export_note", "load_came
 
 Value = TypeVar("Value")
 
-CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt")
+CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt", ".xml")
 """How names of camera files end, lower case."""
 
 _STATED = re.compile(r"(?<!lambda_)fit_largest_px\"?: ([-+.\de]+)")
@@ -58,7 +60,7 @@ def load_camera(path: str | Path, image_size: tuple[int, int] | None = None) -> 
     ----------
     path : path
     image_size : (int, int), optional
-        Width and height of the images, pixels, for a file of OpenCV that does not say them.
+        Width and height of the images, pixels, for a file of OpenCV or lensfun that does not say them.
 
     Returns
     -------
@@ -84,6 +86,8 @@ def read_camera_file(path: str | Path, image_size: ImageSize | None = None) -> C
         own = next((line for line in text.splitlines() if line.startswith(writing.OWN_COMMENT)), None)
         if own is not None:
             return _own(parse_json(own.removeprefix(writing.OWN_COMMENT), file), file)
+        if text.lstrip().startswith("<"):
+            return read_lensfun(text, file, image_size)
         if is_hugin(text):
             return read_hugin(text, file)
         if cameras := colmap_cameras(text):
@@ -166,5 +170,6 @@ _WRITERS: dict[str, Callable[[Camera], str]] = {
     "?*.yaml": writing.opencv_yaml,
     "cameras.txt": writing.colmap_text,
     "?*.pto": hugin_project,
+    "?*.xml": lensfun_xml,
 }
 """By the name of the file, the first that fits; ``.yml`` is ``.yaml``."""

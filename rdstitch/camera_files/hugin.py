@@ -7,6 +7,8 @@ the undistorted radius is that of an equidistant one.
 
 import math
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -21,7 +23,6 @@ from rdstitch.errors import ArgumentError
 from rdstitch.records import Side, convert
 
 _RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE = 0, 2, 3
-_POWERS = (4, 3, 2)  # of r, whose coefficients are a, b and c
 _PARAMETER = re.compile(r"([A-Za-z]+)(\"[^\"]*\"|\S*)")
 HEAD = """# hugin project file
 #hugin_ptoversion 2
@@ -58,48 +59,51 @@ def read_hugin(text: str, file: str) -> CameraFile:
     size, fisheye = (lens.w, lens.h), lens.f != _RECTILINEAR
     center = (size[0] - 1) / 2 + lens.d, (size[1] - 1) / 2 + lens.e
     # Tangents of the half field of view for a rectilinear lens, angles for a fisheye.
-    half_view, unit = math.radians(lens.v) / 2, min(size) / 2
+    half_view = math.radians(lens.v) / 2
     focal = size[0] / 2 / (half_view if fisheye else math.tan(half_view))
     linear = 1.0 - lens.a - lens.b - lens.c
+    terms = {4: lens.a, 3: lens.b, 2: lens.c}
+    return read_polynomial("Hugin", terms, linear, size, center, min(size) / 2, focal, fisheye=fisheye)
+
+
+def read_polynomial(
+    kind: str,
+    terms: Mapping[int, float],
+    linear: float,
+    size: tuple[int, int],
+    center: tuple[float, float],
+    unit: float,
+    focal: float,
+    *,
+    fisheye: bool,
+) -> CameraFile:
+    """A camera whose λ is fitted to ``r_d = Σ k r^p + linear r``, with ``terms`` k by p, and r in ``unit`` pixels.
+
+    ``focal`` is that of the undistorted image, which is larger by what the polynomial takes away at the centre.
+    """
     if linear <= 0.0:
         raise ArgumentError("the coefficients of the polynomial must leave a scale above 0 at the centre")
-    # The focal length of the undistorted image is larger by what the polynomial takes away at the centre.
     at_center, bend = focal * linear, np.arctan if fisheye else np.positive
 
     def forward(points: FloatArray) -> FloatArray:
         rays = (points - center) / at_center
         radius = np.linalg.norm(rays, axis=1, keepdims=True)
         ideal = bend(radius) * focal / unit
-        terms = zip((lens.a, lens.b, lens.c), _POWERS, strict=True)
-        bent = (linear * ideal + sum(k * ideal**p for k, p in terms)) * unit
+        bent = (linear * ideal + sum(k * ideal**p for p, k in terms.items())) * unit
         result: FloatArray = np.where(radius > 0.0, bent / np.maximum(radius, 1e-300), at_center) * rays + center
         return result
 
-    return fitted_camera(forward, "Hugin", size, center, at_center)
+    return fitted_camera(forward, kind, size, center, at_center)
 
 
 def hugin_lens(camera: Camera) -> tuple[str, LensFit]:
-    """The parameters f, v, a, b, c, d and e of an image line, and how far they are from the lens.
-
-    By least squares; a fisheye's where that is nearer and a rectilinear lens is not close.
-    """
-    # Imported late: no other command should wait for SciPy's optimizers.
-    from scipy.optimize import brentq
-
-    (width, height), samples = camera.image_size, LensSamples.of(camera)
-    size, found = samples.focal / (min(camera.image_size) / 2), []
-    for projection, straight in ((_RECTILINEAR, samples.straight), (_FISHEYE, np.arctan(samples.straight))):
-        values, fit = samples.fit(straight, (straight[:, None] * size) ** np.array(_POWERS) / size)
-        found.append((projection, values.tolist(), fit))
-        if fit.largest <= CLOSE:
-            break
-    projection, values, fit = min(found, key=lambda lens: lens[2].largest)
-    # Found are ``r + Σ k r^p`` for the scale of the centre. With it kept at 1 instead, r = s u: s (1 - Σ k / s^p) = 1.
-    terms = list(zip(values, _POWERS, strict=True))
-    scale = float(brentq(lambda s: s - 1.0 - sum(k / s ** (p - 1) for k, p in terms), 0.2, 5.0))
-    a, b, c = (k / scale**p for k, p in terms)
-    half_width = width / 2 / (samples.focal * scale)
-    view = 2.0 * math.degrees(math.atan(half_width) if projection == _RECTILINEAR else half_width)
+    """The parameters f, v, a, b, c, d and e of an image line, and how far they are from the lens."""
+    width, height = camera.image_size
+    lens = fitted_polynomial(camera, min(camera.image_size) / 2, (4, 3, 2))
+    fit, (scale, (a, b, c)) = lens.fit, lens.moved()
+    half_width = width / 2 / (lens.focal * scale)
+    view = 2.0 * math.degrees(half_width if lens.fisheye else math.atan(half_width))
+    projection = _FISHEYE if lens.fisheye else _RECTILINEAR
     d, e = camera.center[0] - (width - 1) / 2, camera.center[1] - (height - 1) / 2
     return f"w{width} h{height} f{projection} v{view!r} a{a!r} b{b!r} c{c!r} d{d!r} e{e!r} g0 t0", fit
 
@@ -112,3 +116,45 @@ def hugin_project(camera: Camera) -> str:
         f'{HEAD}{comments(camera, fit, "a, b, c")}p f0 w{width} h{height} v{float(view):.6g} n"TIFF_m c:LZW"\nm i0\n'
         f'i {lens} r0 p0 y0 TrX0 TrY0 TrZ0 n"image.jpg"\n'
     )
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """A lens as ``r_d = r + Σ k r^p`` of the undistorted radius, of a fisheye the equidistant one, in units of pixels.
+
+    Attributes
+    ----------
+    powers : tuple of int
+    coefficients : tuple of float
+        k, for the scale of the centre.
+    focal : float
+        There, pixels.
+    """
+
+    powers: tuple[int, ...]
+    coefficients: tuple[float, ...]
+    focal: float
+    fisheye: bool
+    fit: LensFit
+
+    def moved(self) -> tuple[float, tuple[float, ...]]:
+        """How much larger the undistorted image is where the scale is kept at r = 1, ``1 - Σ k`` at the centre; and k.
+
+        r = s u, where s (1 - Σ k) = 1, and k are those found over s^p.
+        """
+        # Imported late: no other command should wait for SciPy's optimizers.
+        from scipy.optimize import brentq
+
+        terms = list(zip(self.coefficients, self.powers, strict=True))
+        scale: float = brentq(lambda s: s - 1.0 - sum(k / s ** (p - 1) for k, p in terms), 0.2, 5.0)
+        return scale, tuple(k / scale**p for k, p in terms)
+
+
+def fitted_polynomial(camera: Camera, unit: float, powers: tuple[int, ...]) -> Polynomial:
+    """The polynomial of a camera by least squares; a fisheye's where that is nearer and the other one is not close."""
+    samples = LensSamples.of(camera)
+    size, found = samples.focal / unit, []
+    for fisheye, straight in ((False, samples.straight), (True, np.arctan(samples.straight))):
+        values, fit = samples.fit(straight, (straight[:, None] * size) ** np.array(powers) / size)
+        found.append(Polynomial(powers, tuple(values.tolist()), samples.focal, fisheye, fit))
+    return found[0] if found[0].fit.largest <= CLOSE else min(found, key=lambda lens: lens.fit.largest)

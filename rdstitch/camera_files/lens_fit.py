@@ -24,7 +24,7 @@ class CameraFile:
     """A camera as a file tells it."""
 
     camera: Camera
-    kind: str  # whose format it is: "rdstitch", "OpenCV", "COLMAP", "Kalibr", "OpenDroneMap" or "Hugin"
+    kind: str  # whose format it is: "rdstitch", "OpenCV", "COLMAP", "Kalibr", "OpenDroneMap", "Hugin" or "lensfun"
     fit: LensFit | None = None  # how well λ agrees with the file's own lens model; None where the file gives λ itself
     cause: str = ""  # what of the file's model λ cannot describe; empty where it is only the curve of the lens
 
