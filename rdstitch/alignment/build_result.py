@@ -296,19 +296,15 @@ def _overruled_focal(found: AdjustedImages, camera: Camera) -> str | None:
 def _warnings(found: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
     """What the user should know of the whole."""
     result: list[Message] = []
-    if found.depth:
-        text = (
-            "λ is not observable: what the images show has depth, which looks like a lens in so few of them; "
-            "give λ, a camera file, or more images"
-        )
-        severity: Severity = "detail" if found.options.layout_matters else "failure"
+    # An image can be right whatever the lens is.
+    image_only = found.options.layout_matters
+    if found.depth or not found.observable:
+        cause, remedy = "the images hardly move, or only turn about the optical axis", "images that overlap by less"
+        if found.depth:
+            cause, remedy = "what the images show has depth, which looks like a lens in so few of them", "more images"
+        text = f"λ is not observable: {cause}; give λ, a camera file, or {remedy}"
+        severity: Severity = "detail" if image_only else "failure" if found.depth else "warning"
         result.append(Message(text, severity=severity, code="lambda-not-observable"))
-    elif not found.observable:
-        text = (
-            "λ is not observable: the images hardly move, or only turn about the optical axis; "
-            "give λ, a camera file, or images that overlap by less"
-        )
-        result.append(Message(text, code="lambda-not-observable"))
     elif len(found.images) < ENOUGH_IMAGES and found.problem.free_lens.any():
         off = max(found.lens.corner_shift, _CONFIDENT * float(radius_std(camera, _RADII)[-1]))
         if off > WORTH_SAYING:
@@ -316,9 +312,7 @@ def _warnings(found: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
                 f"from {len(found.images)} images the lens distortion is known to about {off:.2g} pixels at the "
                 f"corners; {ENOUGH_IMAGES} or more images, or --camera, make it surer"
             )
-            result.append(
-                Message(text, severity="detail" if found.options.layout_matters else "warning", code="few-images")
-            )
+            result.append(Message(text, severity="detail" if image_only else "warning", code="few-images"))
     if (overruled := _overruled_focal(found, camera)) is not None:
         result.append(Message(overruled))
     if not found.choice.fit.adjusted.converged:
