@@ -112,4 +112,5 @@ def test_unobservable_lambda_is_nan(rdstitch: Run, frames: list[Path], tmp_path:
     again.write_bytes(frames[0].read_bytes())
     done = rdstitch("pano", frames[0], again, "-o", tmp_path / "pano.jpg", *CACHED)
     assert math.isnan(float(done.out))
-    assert "not observable" in done.err
+    assert "λ not observable" in done.made
+    assert not done.err
