@@ -27,8 +27,8 @@ from rdstitch.alignment.motion_models import (
     MotionModel,
     PlanarModel,
 )
+from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.planarity import shared_variance
 from rdstitch.alignment.warm_start import WarmStart
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.matching.match_graph import connected_components, spanning_tree

@@ -11,16 +11,14 @@ from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, WORTH_SAYING, LensChoice
-from rdstitch.alignment.lens_uncertainty import considered_covariance
+from rdstitch.alignment.lens_uncertainty import considered_covariance, sandwich_covariance
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
-from rdstitch.alignment.noise_model import EXACTNESS
+from rdstitch.alignment.noise import EXACTNESS, coherence, judge_relief
 from rdstitch.alignment.options import AlignmentOptions
-from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.alignment.pose_covariance import pose_covariances
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
 from rdstitch.alignment.rotation_frame import levelled
-from rdstitch.alignment.sandwich import sandwich_covariance
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.arrays import BoolArray, FloatArray, IntArray

@@ -13,9 +13,8 @@ import numpy as np
 
 from rdstitch.alignment.link_equations import LinkEquations, folds, link_equations, squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel, inverses
-from rdstitch.alignment.normal_equations import SparseNormalEquations, chain
+from rdstitch.alignment.normal_equations import PoseBlocks, SparseNormalEquations, chain
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.alignment.priors import Prior, costs, curvatures, slopes
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS
