@@ -16,10 +16,10 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem, homography_apart
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
-from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.noise import Coherence, NoiseModel, coherence
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS
 from rdstitch.division_model import distort, undistort
