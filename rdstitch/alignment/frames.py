@@ -17,7 +17,7 @@ from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.matching.links import Link
 from rdstitch.orientation import inverse, turning_matrix
-from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
+from rdstitch.planar_motion import rigid_in_plane, rotation_from_tilt, tilt_from_normal
 
 
 def turns(orientations: Sequence[int]) -> FloatArray:
@@ -98,21 +98,14 @@ def turned_alignment(alignment: Alignment, orientations: Sequence[int], gravity:
 
 def _turned_poses(poses: PlanarPoses, turn: FloatArray, reference: int) -> tuple[PlanarPoses, FloatArray]:
     """The poses of cameras turned about their axes, yaw zero for the reference, and how that turns the plane (3, 3)."""
-    rotation = turn @ rotation_from_tilt(poses.tilt) @ _about_axis(poses.yaw)
+    rotation = turn @ rotation_from_tilt(poses.tilt) @ rigid_in_plane(poses.yaw, np.zeros(2))
     tilt = tilt_from_normal(rotation[..., 2])
     level = rotation_from_tilt(tilt).transpose(0, 2, 1) @ rotation
     yaw = np.arctan2(level[:, 1, 0], level[:, 0, 0])
-    plane = _about_axis(yaw[reference])
+    plane = rigid_in_plane(yaw[reference], np.zeros(2))
     yaw = np.remainder(yaw - yaw[reference] + np.pi, 2.0 * np.pi) - np.pi
     around = plane[:2, :2]
     return PlanarPoses(yaw, poses.position @ around.T, poses.height, tilt, *poses.turned(around)), plane
-
-
-def _about_axis(angle: FloatArray) -> FloatArray:
-    """``Rz(φ)`` (..., 3, 3) of angles (...)."""
-    c, s = np.cos(angle), np.sin(angle)
-    zero, one = np.zeros_like(c), np.ones_like(c)
-    return np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(*np.shape(angle), 3, 3)
 
 
 def _turned_covariance(alignment: Alignment, own: FloatArray) -> FloatArray:
@@ -139,11 +132,7 @@ def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
     homographies = np.linalg.inv(alignment.homographies[reference]) @ alignment.homographies
     poses = alignment.poses
     if poses is not None and reference != alignment.reference:
-        c, s = np.cos(poses.yaw[reference]), np.sin(poses.yaw[reference])
-        unit = poses.height[reference]
-        position = (poses.position - poses.position[reference]) @ np.array([[c, -s], [s, c]]).T / unit
-        yaw = np.remainder(poses.yaw - poses.yaw[reference] + np.pi, 2.0 * np.pi) - np.pi
-        poses = PlanarPoses(yaw, position, poses.height / unit, poses.tilt)
+        poses = poses.relative_to(reference)
     return replace(alignment, homographies=homographies, reference=reference, poses=poses)
 
 
