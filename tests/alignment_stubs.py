@@ -10,7 +10,7 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.motion_models import MotionModel
-from rdstitch.alignment.noise_model import NoiseModel
+from rdstitch.alignment.noise import NoiseModel
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import FloatArray
 from rdstitch.robust.loss import ALIGNMENT_WIDTH

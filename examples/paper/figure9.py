@@ -20,11 +20,10 @@ from rdstitch.alignment.bundle_adjustment import (
     BundleAdjustmentResult,
     FreeParameters,
     Parameters,
-    Priors,
 )
 from rdstitch.alignment.motion_models import RIGID, YAW, X, Y
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Prior
+from rdstitch.alignment.priors import Prior, Priors
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray

@@ -15,7 +15,6 @@ from rdstitch.alignment.bundle_adjustment import (
     Parameters,
     sigma_of,
 )
-from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.initialization import independent_pairs
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.metric_upgrade import metric_upgrade
@@ -27,8 +26,9 @@ from rdstitch.alignment.motion_models import (
     MotionModel,
     PlanarModel,
 )
+from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.planarity import shared_variance
+from rdstitch.alignment.priors import CameraPriors
 from rdstitch.alignment.warm_start import WarmStart
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.matching.match_graph import connected_components, spanning_tree

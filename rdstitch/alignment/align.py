@@ -16,15 +16,13 @@ from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult, sigma_of
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.evidence import Evidence
-from rdstitch.alignment.finer_lens import with_third_coefficient
 from rdstitch.alignment.initialization import relations_at
-from rdstitch.alignment.lens_selection import choose_lens, left_coherence
+from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
 from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.motion_models import MODELS
-from rdstitch.alignment.noise_model import EXACTNESS, noise_of_links
+from rdstitch.alignment.noise import COHERENT_CORRELATION, EXACTNESS, LARGE_RELIEF, noise_of_links
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.options import AlignmentOptions
-from rdstitch.alignment.planarity import COHERENT_CORRELATION, LARGE_RELIEF
 from rdstitch.alignment.position_priors import hold_positions
 from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief

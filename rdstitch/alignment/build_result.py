@@ -11,16 +11,14 @@ from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, WORTH_SAYING, LensChoice
-from rdstitch.alignment.lens_uncertainty import considered_covariance
+from rdstitch.alignment.lens_uncertainty import considered_covariance, sandwich_covariance
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
-from rdstitch.alignment.noise_model import EXACTNESS
+from rdstitch.alignment.noise import EXACTNESS, coherence, judge_relief
 from rdstitch.alignment.options import AlignmentOptions
-from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.alignment.pose_covariance import pose_covariances
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
 from rdstitch.alignment.rotation_frame import levelled
-from rdstitch.alignment.sandwich import sandwich_covariance
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
@@ -29,6 +27,7 @@ from rdstitch.errors import ImpossibleCameraError
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import Message, Severity
+from rdstitch.planar_motion import rigid_in_plane
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _STEP = 1e-5
@@ -88,9 +87,14 @@ def build_alignment(found: AdjustedImages) -> Alignment:
     problem, fit = found.problem, found.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
     shared, lens = fit.model.physical_parameters(adjusted.parameters.shared)[0], adjusted.parameters.lens
-    covariance = _covariance(found)
+    covariance = adjusted.covariance
+    if covariance.size:
+        covariance = sandwich_covariance(problem.adjuster_of(fit), adjusted)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    names = (*fit.model.shared_names, *_names_of(problem.free_lens))
+    names = (
+        *fit.model.shared_names,
+        *(name for name, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free),
+    )
     focal = float(np.exp(shared[-1])) if fit.model.one_camera else None
     lens_covariance = _lens_covariance(names, covariance)
     # What is reported is how far points are off, whatever moved them.
@@ -160,18 +164,6 @@ def _shape(found: AdjustedImages) -> ShapeTest | None:
     return replace(judged, image=int(images[judged.image]))
 
 
-def _covariance(found: AdjustedImages) -> FloatArray:
-    """Covariance of the named parameters, for errors that are not independent."""
-    fit = found.choice.fit
-    if not fit.adjusted.covariance.size:
-        return fit.adjusted.covariance
-    return sandwich_covariance(found.problem.adjuster_of(fit), fit.adjusted)
-
-
-def _names_of(lens: BoolArray) -> list[str]:
-    return [name for name, free in zip(LENS_PARAMETERS, lens, strict=True) if free]
-
-
 def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray:
     """Covariance (5, 5) of :data:`LENS_PARAMETERS`, zero for those that were not estimated."""
     result = np.zeros((len(LENS_PARAMETERS), len(LENS_PARAMETERS)))
@@ -218,34 +210,33 @@ def _in_frame_of_reference(found: AdjustedImages) -> tuple[FloatArray, PlanarPos
     The adjustment may have held the reference image anywhere; here it comes to the origin, with yaw zero and, as
     the unit of length, height one.
     """
-    count, fit, reference = len(found.cameras), found.choice.fit, found.problem.reference
+    fit, reference, parameters = found.choice.fit, found.problem.reference, found.choice.fit.adjusted.parameters
     matrices = fit.adjusted.matrices.matrices
-    homographies = np.full((count, 3, 3), np.nan)
+
+    def of_all(values: FloatArray) -> FloatArray:
+        """Of all images, NaN for those that are not aligned."""
+        result = np.full((len(found.cameras), *values.shape[1:]), np.nan)
+        result[found.images] = values
+        return result
+
     if fit.model.on_sphere:
         given = found.options.gravity
         gravity = None if given is None else np.asarray(given, dtype=np.float64)[found.images]
-        homographies[found.images] = levelled(matrices, reference, gravity)
-        return homographies, None
+        return of_all(levelled(matrices, reference, gravity)), None
     if not isinstance(fit.model, PlanarModel):
-        homographies[found.images] = matrices[reference] @ np.linalg.inv(matrices)
-        return homographies, None
-    shared, poses = fit.adjusted.parameters.shared, fit.adjusted.parameters.poses.copy()
-    yaw, height = poses[reference, YAW], np.exp(poses[reference, LOG_HEIGHT])
-    c, s = np.cos(yaw), np.sin(yaw)
-    rotation = np.array([[c, -s], [s, c]])
-    poses[:, [X, Y]] = (poses[:, [X, Y]] - poses[reference, [X, Y]]) @ rotation.T / height
-    poses[:, YAW] = np.remainder(poses[:, YAW] - yaw + np.pi, 2 * np.pi) - np.pi
-    poses[:, LOG_HEIGHT] -= np.log(height)
-    homographies[found.images] = np.linalg.inv(fit.model.matrices(poses, shared).matrices)
-    every = np.full((count, 6), np.nan)
-    every[found.images] = fit.model.metric_poses(poses, shared)
-    covariances = []
-    for values in pose_covariances(found.problem, fit) if found.options.pose_covariance else ():
-        covariances.append(np.full((count, 4, 4), np.nan))
-        covariances[-1][found.images] = values
-    return homographies, PlanarPoses(
-        every[:, YAW], every[:, [X, Y]], np.exp(every[:, LOG_HEIGHT]), every[:, [PSI, THETA]], *covariances
+        return of_all(matrices[reference] @ np.linalg.inv(matrices)), None
+    metric = fit.model.metric_poses(parameters.poses, parameters.shared)
+    yaw, position, height, tilt = (
+        metric[:, YAW],
+        metric[:, [X, Y]],
+        np.exp(metric[:, LOG_HEIGHT]),
+        metric[:, [PSI, THETA]],
     )
+    frame = rigid_in_plane(yaw[reference], position[reference], height[reference])
+    poses = PlanarPoses(yaw, position, height, tilt).relative_to(reference)
+    covariances = pose_covariances(found.problem, fit) if found.options.pose_covariance else ()
+    own = (poses.yaw, poses.position, poses.height, poses.tilt, *covariances)
+    return of_all(frame @ np.linalg.inv(matrices)), PlanarPoses(*map(of_all, own))
 
 
 def _groups(found: AdjustedImages) -> tuple[tuple[int, ...], ...]:

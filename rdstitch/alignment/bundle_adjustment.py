@@ -13,12 +13,10 @@ import numpy as np
 
 from rdstitch.alignment.link_equations import LinkEquations, folds, link_equations, squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel, inverses
-from rdstitch.alignment.normal_equations import SparseNormalEquations, chain
+from rdstitch.alignment.normal_equations import PoseBlocks, SparseNormalEquations, chain
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.pose_blocks import PoseBlocks
-from rdstitch.alignment.priors import Prior, costs, curvatures, slopes
+from rdstitch.alignment.priors import Priors, costs, curvatures, slopes
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.camera import LENS_PARAMETERS
 from rdstitch.robust.levenberg_marquardt import FIRST_DAMPING, MAX_DAMPING, MIN_GAIN, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
 
@@ -61,32 +59,6 @@ class Parameters:
             shared=self.shared + step_shared[:size],
             lens=lens,
         )
-
-
-@dataclass(frozen=True)
-class Priors:
-    """Priors on all that is adjusted.
-
-    Attributes
-    ----------
-    shared : tuple of S priors
-        Of the model's named parameters, see :meth:`MotionModel.physical_parameters`.
-    lens : tuple of 5 priors
-        Of :data:`rdstitch.camera.LENS_PARAMETERS`.
-    poses, poses_precision : ndarray of shape (N, D)
-        Means and inverse variances; 0 where there is no prior.
-    """
-
-    shared: tuple[Prior, ...]
-    lens: tuple[Prior, ...]
-    poses: FloatArray
-    poses_precision: FloatArray
-
-    @classmethod
-    def none(cls, model: MotionModel, count: int) -> Self:
-        """None, for ``count`` images."""
-        poses = np.zeros((count, model.pose_size))
-        return cls((Prior(),) * len(model.shared_names), (Prior(),) * len(LENS_PARAMETERS), poses, poses)
 
 
 @dataclass(frozen=True)

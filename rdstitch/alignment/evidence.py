@@ -19,9 +19,8 @@ import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.link_equations import squared_lengths
-from rdstitch.alignment.noise_model import EXACTNESS
+from rdstitch.alignment.noise import EXACTNESS, coherence
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 

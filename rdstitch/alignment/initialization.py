@@ -13,11 +13,11 @@ from rdstitch.alignment.bundle_adjustment import (
     BundleAdjuster,
     FreeParameters,
     Parameters,
-    Priors,
 )
 from rdstitch.alignment.link_equations import split_lens
 from rdstitch.alignment.motion_models import MotionModel
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.division_model import undistort
 from rdstitch.radial_homography import RadialHomography, transfer

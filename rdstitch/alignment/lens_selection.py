@@ -14,13 +14,12 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import homography_apart
+from rdstitch.alignment.adjustment_problem import Fit, Problem, homography_apart
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
-from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.link_equations import whitened_errors
-from rdstitch.alignment.noise_model import NoiseModel
+from rdstitch.alignment.noise import Coherence, NoiseModel, coherence
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.planarity import Coherence, coherence
+from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS
 from rdstitch.division_model import distort, undistort
@@ -225,6 +224,24 @@ def left_coherence(adjusted: BundleAdjustmentResult, observations: Observations)
     errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
     inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
     return coherence(observations, errors, inliers)
+
+
+def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """A problem and its fit, with ν free where all images together may show it; pairs alone hardly do.
+
+    A lens that needs μ is a series that was cut off, so that its next term is not zero and needs no proof: freed where
+    it is smaller than its standard deviation it costs next to nothing, and left out where it is not it bends the image
+    by a tenth of a pixel. Only where the errors are noise: over relief a motion model would take ν for the ground.
+    """
+    adjusted, observations, finer = fit.adjusted, problem.observations, free_parameters("division3")
+    if problem.count < ENOUGH_IMAGES or (fit.free_lens != free_parameters("division2")).any():
+        return problem, fit
+    if not leaves_noise(adjusted, observations):
+        return problem, fit
+    wider = problem.extend(fit, finer)
+    if not has_plausible_center(wider.adjusted, observations):
+        return problem, fit
+    return replace(problem, free_lens=finer), wider
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ class Observations:
         """Number of links."""
         return len(self.image1)
 
-    @property
+    @cached_property
     def link(self) -> IntArray:
         """The link of each correspondence, shape (M,)."""
         return np.repeat(np.arange(len(self)), np.diff(self.start))

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.alignment.camera_priors import CameraPriors, known_focal
 from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
+from rdstitch.alignment.priors import CameraPriors, known_focal
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.motion_models import PlanarModel, X, Y
-from rdstitch.alignment.noise_model import EXACTNESS
+from rdstitch.alignment.noise import EXACTNESS
 from rdstitch.arrays import FloatArray
 from rdstitch.robust.similarity_fit import OUTLYING, fit_similarity
 

@@ -22,13 +22,15 @@ tilt of a plane         0 ± 20°; 0 ± 45° (0.2)       what is laid flat is lo
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
-from rdstitch.camera import LENS_STD
+from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
+from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.camera import LENS_PARAMETERS, LENS_STD, Camera
 
 _EXACT_STD = 1e-6
 
@@ -118,3 +120,101 @@ LENS = (
 """Priors on :data:`rdstitch.camera.LENS_PARAMETERS`."""
 
 TILT = Prior(((0.8, 0.0, math.radians(20.0)), (0.2, 0.0, math.radians(45.0))))
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Priors on all that is adjusted.
+
+    Attributes
+    ----------
+    shared : tuple of S priors
+        Of the model's named parameters, see :meth:`MotionModel.physical_parameters`.
+    lens : tuple of 5 priors
+        Of :data:`rdstitch.camera.LENS_PARAMETERS`.
+    poses, poses_precision : ndarray of shape (N, D)
+        Means and inverse variances; 0 where there is no prior.
+    """
+
+    shared: tuple[Prior, ...]
+    lens: tuple[Prior, ...]
+    poses: FloatArray
+    poses_precision: FloatArray
+
+    @classmethod
+    def none(cls, model: MotionModel, count: int) -> Self:
+        """None, for ``count`` images."""
+        poses = np.zeros((count, model.pose_size))
+        return cls((Prior(),) * len(model.shared_names), (Prior(),) * len(LENS_PARAMETERS), poses, poses)
+
+
+@dataclass(frozen=True)
+class CameraPriors:
+    """Priors of the camera.
+
+    Attributes
+    ----------
+    log_focal, log_focal_std : float
+        Of the logarithm of the focal length in half diagonals.
+    focal_source : str
+        Where it comes from, a key of :data:`rdstitch.camera.FOCAL_LOG_STD`.
+    tilt : (float, float)
+        (ψ, θ), radians.
+    tilt_known : bool
+    attitudes : ndarray of shape (N, 2)
+        How the tilt of each image differs from the shared one, radians; zeros where that is not known.
+    attitudes_std : float or None
+        Standard deviation of these, 0 for exact ones; None where they are not known.
+    positions : ndarray of shape (N, 2)
+        Metres east and north where each image was taken; NaN where that is not known.
+    places, places_precision : ndarray of shape (N, 2) and (N,)
+        What those say of the poses, and its inverse variance; see :mod:`rdstitch.alignment.position_priors`.
+    """
+
+    log_focal: float
+    log_focal_std: float
+    focal_source: str
+    tilt: tuple[float, float]
+    tilt_known: bool
+    attitudes: FloatArray
+    attitudes_std: float | None
+    positions: FloatArray
+    places: FloatArray | None = None
+    places_precision: FloatArray | None = None
+
+    def priors(self, model: MotionModel, count: int, tilt_spread: float, log_focal: float | None = None) -> Priors:
+        """For ``count`` images whose tilts scatter by ``tilt_spread`` where nothing else is known of them.
+
+        Tilts are turned into what they do in the images with ``log_focal``, the prior one if not given.
+        """
+        none = Priors.none(model, count)
+        tilts = map(exact, self.tilt) if self.tilt_known else (TILT, TILT)
+        focal_length = focal_prior(self.log_focal, self.log_focal_std, self.focal_source)
+        of_name = dict(zip(("psi", "theta", "log_focal"), (*tilts, focal_length), strict=True))
+        shared = tuple(of_name[name] for name in model.shared_names)
+        known = replace(none, shared=shared, lens=LENS)
+        if "psi" not in model.shared_names:
+            return known
+        poses, precision = np.zeros_like(none.poses), np.zeros_like(none.poses)
+        free = list(getattr(model, "free", ()))
+        focal = math.exp(self.log_focal if log_focal is None else log_focal)
+        for axis, column in enumerate((PSI, THETA)):
+            if column in free:
+                poses[:, free.index(column)] = self.attitudes[:, axis] / focal
+                precision[:, free.index(column)] = (focal / max(tilt_spread, 1e-6)) ** 2.0
+        if self.places is not None and self.places_precision is not None:
+            columns = [free.index(column) for column in (X, Y)]
+            poses[:, columns], precision[:, columns] = self.places, self.places_precision[:, None]
+        return replace(known, poses=poses, poses_precision=precision)
+
+    def of(self, images: IntArray) -> "CameraPriors":
+        """Of some of the images only."""
+        return replace(self, attitudes=self.attitudes[images], positions=self.positions[images])
+
+
+def known_focal(cameras: Sequence[Camera]) -> tuple[float, float, str]:
+    """Mean and standard deviation of the logarithm of the focal length in half diagonals, and where it comes from."""
+    known = [camera for camera in cameras if camera.focal is not None] or [cameras[0].with_focal()]
+    ratios = [camera.focal / camera.scale for camera in known if camera.focal is not None]
+    vaguest = max(known, key=lambda camera: camera.focal_log_std)
+    return float(np.log(np.median(ratios))), vaguest.focal_log_std, vaguest.focal_source or "guess"

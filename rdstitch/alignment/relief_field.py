@@ -17,8 +17,8 @@ import numpy as np
 
 from rdstitch.alignment.linear_response import Fields, LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors
+from rdstitch.alignment.noise import apart, neighbours
 from rdstitch.alignment.parallax import Parallax
-from rdstitch.alignment.planarity import apart, neighbours
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 

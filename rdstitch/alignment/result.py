@@ -71,6 +71,14 @@ class PlanarPoses:
     covariance: FloatArray | None = None
     with_first: FloatArray | None = None
 
+    def relative_to(self, reference: int) -> "PlanarPoses":
+        """The poses in the frame of one image: at the origin, with yaw zero, its height the unit; no covariances."""
+        c, s = np.cos(self.yaw[reference]), np.sin(self.yaw[reference])
+        unit = self.height[reference]
+        position = (self.position - self.position[reference]) @ np.array([[c, -s], [s, c]]).T / unit
+        yaw = np.remainder(self.yaw - self.yaw[reference] + np.pi, 2.0 * np.pi) - np.pi
+        return PlanarPoses(yaw, position, self.height / unit, self.tilt)
+
     def turned(self, matrix: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
         """The covariances after a rotation (2, 2) of the plane."""
         if self.covariance is None or self.with_first is None:

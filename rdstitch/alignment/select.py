@@ -54,7 +54,7 @@ class ModelChoice:
     fit : Fit
     reason : str
     overdispersion : float
-        Of the errors that it leaves, see :class:`rdstitch.alignment.planarity.Coherence`.
+        Of the errors that it leaves, see :class:`rdstitch.alignment.noise.Coherence`.
     over_relief : bool
         Whether it was chosen with heights of the ground that account for errors along the parallax.
     """

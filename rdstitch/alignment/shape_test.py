@@ -28,7 +28,7 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjuster, Parameters
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors
 from rdstitch.alignment.motion_models import PlanarModel, inverses
-from rdstitch.alignment.noise_model import EXACTNESS
+from rdstitch.alignment.noise import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ShapeTest
 from rdstitch.alignment.unmodelled import (

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align, most_matches_read
-from rdstitch.alignment.stored_frame import stored, turned_alignment, turned_link, turned_tilts, turns
+from rdstitch.alignment.frames import stored, turned_alignment, turned_link, turned_tilts, turns
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from rdstitch.alignment.frames import stored, turned_alignment
 from rdstitch.alignment.result import Alignment
-from rdstitch.alignment.stored_frame import stored, turned_alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError

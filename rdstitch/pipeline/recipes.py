@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from rdstitch.alignment.stored_frame import stored, turned_alignment
+from rdstitch.alignment.frames import stored, turned_alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg

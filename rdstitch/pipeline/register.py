@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from rdstitch.alignment import Alignment
-from rdstitch.alignment.reference_frame import frontal_reference, in_frame_of
+from rdstitch.alignment.frames import frontal_reference, in_frame_of
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
 from rdstitch.features import LightGlue, Matcher, match

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, Priors, sigma_of
+from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, sigma_of
 from rdstitch.alignment.link_equations import link_equations
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, MotionModel
-from rdstitch.alignment.normal_equations import chain
+from rdstitch.alignment.normal_equations import PoseBlocks, chain
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.pose_blocks import PoseBlocks
+from rdstitch.alignment.priors import Priors
 from rdstitch.radial_homography import transfer_jacobian
 from rdstitch.robust.loss import robust_cost, robust_weight
 from tests.alignment_scenes import Scene, grid, jittered, scene

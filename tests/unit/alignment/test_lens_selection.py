@@ -12,7 +12,7 @@ from rdstitch.alignment import LENSES, Alignment, AlignmentOptions, lens_selecti
 from rdstitch.alignment.adjustment_problem import homography_apart
 from rdstitch.alignment.lens_description import describe_lens, radius_std
 from rdstitch.alignment.lens_selection import LensChoice, _Judge, _parts, free_parameters, has_plausible_center
-from rdstitch.alignment.noise_model import NoiseModel
+from rdstitch.alignment.noise import NoiseModel
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS, Camera

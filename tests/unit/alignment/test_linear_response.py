@@ -10,13 +10,12 @@ from rdstitch.alignment.bundle_adjustment import (
     BundleAdjustmentResult,
     FreeParameters,
     Parameters,
-    Priors,
 )
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors, whitened_errors
 from rdstitch.alignment.motion_models import MODELS, MotionModel, inverses
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Prior
+from rdstitch.alignment.priors import Prior, Priors
 from rdstitch.arrays import FloatArray
 from rdstitch.radial_homography import project
 from tests.alignment_scenes import grid, scene

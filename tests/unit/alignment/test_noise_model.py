@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment.link_equations import squared_lengths
-from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel
+from rdstitch.alignment.noise import EXACTNESS, NoiseModel
 from tests.alignment_stubs import independent_errors, observations
 
 

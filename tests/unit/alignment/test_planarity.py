@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rdstitch.alignment.noise import Coherence, coherence, judge_relief
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.planarity import Coherence, coherence, judge_relief
 from rdstitch.arrays import FloatArray
 
 

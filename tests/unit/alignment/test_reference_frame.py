@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment.frames import frontal_reference, in_frame_of
 from rdstitch.alignment.motion_models import POSE, PSI, X
-from rdstitch.alignment.reference_frame import frontal_reference, in_frame_of
 from tests.alignment_scenes import scene
 
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment import AlignmentOptions, align
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, Priors
+from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
+from rdstitch.alignment.lens_uncertainty import sandwich_covariance
 from rdstitch.alignment.motion_models import SIMILARITY
+from rdstitch.alignment.noise import coherence
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.planarity import coherence
-from rdstitch.alignment.priors import Prior
-from rdstitch.alignment.sandwich import sandwich_covariance
+from rdstitch.alignment.priors import Prior, Priors
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_STD, Camera
 from rdstitch.radial_homography import project

@@ -1,7 +1,8 @@
-"""Images that EXIF turns: they are aligned as the camera stored them, so that its lens and its tilt are one in all.
+"""Frames of an alignment: images turned by EXIF as the camera stored them, and the image that is the plane.
 
-Matches, cameras and homographies are those of upright images everywhere else. Mirrors stay where they are: of
-mirrored images among others the distortion centre is mirrored too, which one lens of all cannot show.
+Turned images are aligned as the camera stored them, so that its lens and its tilt are one in all. Matches, cameras and
+homographies are those of upright images everywhere else. Mirrors stay where they are: of mirrored images among others
+the distortion centre is mirrored too, which one lens of all cannot show.
 """
 
 from collections.abc import Sequence
@@ -9,13 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from rdstitch.alignment.layout import MAX_STRETCH
 from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.alignment.rotation_frame import levelled
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.matching.links import Link
 from rdstitch.orientation import inverse, turning_matrix
-from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
+from rdstitch.planar_motion import rigid_in_plane, rotation_from_tilt, tilt_from_normal
 
 
 def turns(orientations: Sequence[int]) -> FloatArray:
@@ -96,21 +98,14 @@ def turned_alignment(alignment: Alignment, orientations: Sequence[int], gravity:
 
 def _turned_poses(poses: PlanarPoses, turn: FloatArray, reference: int) -> tuple[PlanarPoses, FloatArray]:
     """The poses of cameras turned about their axes, yaw zero for the reference, and how that turns the plane (3, 3)."""
-    rotation = turn @ rotation_from_tilt(poses.tilt) @ _about_axis(poses.yaw)
+    rotation = turn @ rotation_from_tilt(poses.tilt) @ rigid_in_plane(poses.yaw, np.zeros(2))
     tilt = tilt_from_normal(rotation[..., 2])
     level = rotation_from_tilt(tilt).transpose(0, 2, 1) @ rotation
     yaw = np.arctan2(level[:, 1, 0], level[:, 0, 0])
-    plane = _about_axis(yaw[reference])
+    plane = rigid_in_plane(yaw[reference], np.zeros(2))
     yaw = np.remainder(yaw - yaw[reference] + np.pi, 2.0 * np.pi) - np.pi
     around = plane[:2, :2]
     return PlanarPoses(yaw, poses.position @ around.T, poses.height, tilt, *poses.turned(around)), plane
-
-
-def _about_axis(angle: FloatArray) -> FloatArray:
-    """``Rz(φ)`` (..., 3, 3) of angles (...)."""
-    c, s = np.cos(angle), np.sin(angle)
-    zero, one = np.zeros_like(c), np.ones_like(c)
-    return np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(*np.shape(angle), 3, 3)
 
 
 def _turned_covariance(alignment: Alignment, own: FloatArray) -> FloatArray:
@@ -127,3 +122,37 @@ def _turned_covariance(alignment: Alignment, own: FloatArray) -> FloatArray:
 def stored(orientations: Sequence[int]) -> tuple[int, ...]:
     """What leads back from upright images."""
     return tuple(inverse(orientation) for orientation in orientations)
+
+
+_POINTS_PER_SIDE = 8
+
+
+def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
+    """The same alignment with the undistorted image ``reference`` as its plane, and its height as unit of poses."""
+    homographies = np.linalg.inv(alignment.homographies[reference]) @ alignment.homographies
+    poses = alignment.poses
+    if poses is not None and reference != alignment.reference:
+        poses = poses.relative_to(reference)
+    return replace(alignment, homographies=homographies, reference=reference, poses=poses)
+
+
+def frontal_reference(alignment: Alignment) -> int:
+    """The reference image, or, where another one is absurdly stretched by its frame, the one that stretches least."""
+    used = np.flatnonzero(alignment.used)
+    nearness = np.array([_nearest_to_horizon(alignment, used, int(k)) for k in used])
+    own = int(np.flatnonzero(used == alignment.reference)[0])
+    if nearness[own].min() > MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
+        return alignment.reference
+    crossing, least = (nearness <= 0.0).sum(axis=1), nearness.min(axis=1)
+    return int(used[np.lexsort((-least, crossing))[0]])
+
+
+def _nearest_to_horizon(alignment: Alignment, used: IntArray, reference: int) -> FloatArray:
+    """Smallest third coordinate of each image's border in the frame of ``reference``, in units of the largest."""
+    values = []
+    for index in used:
+        camera, relation = alignment.cameras[index], alignment.relation(int(index), reference)
+        flat = camera.normalize(camera.undistort(camera.outline(_POINTS_PER_SIDE)))
+        third = flat @ relation[2, :2] + relation[2, 2]
+        values.append(float(third.min() / np.abs(third).max()))
+    return np.array(values)
