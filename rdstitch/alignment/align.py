@@ -18,6 +18,7 @@ from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_l
 from rdstitch.alignment.evidence import Evidence
 from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
+from rdstitch.alignment.lens_uncertainty import weigh_lens
 from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.noise import COHERENT_CORRELATION, EXACTNESS, LARGE_RELIEF, noise_of_links
@@ -147,6 +148,7 @@ def align(
     problem, fit = adjust_over_relief(problem, choice)
     problem, fit = with_third_coefficient(problem, fit) if options.lens_chosen else (problem, fit)
     problem, fit, disagreement = hold_positions(problem, fit)
+    fit = weigh_lens(problem, fit) if observable else fit
     found = AdjustedImages(
         cameras,
         links,

@@ -14,9 +14,11 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
+from rdstitch.alignment.lens_selection import WORTH_SAYING
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PlanarModel
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.select import Posterior
 from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal
@@ -24,6 +26,9 @@ from rdstitch.arrays import FloatArray
 
 _SINGULAR = 1e-12
 """Least eigenvalue of a correlation matrix of parameters."""
+
+_REACH, _STEPS = 4.0, 801
+"""Standard deviations to either side within which λ is sought, and places where it is tried."""
 
 
 def sandwich_covariance(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> FloatArray:
@@ -149,3 +154,25 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rou
     other = considered_covariance(problem, free, rough=rough) + np.outer(off, off)
     mixed: FloatArray = (1.0 - share) * covariance + share * other
     return mixed
+
+
+def weigh_lens(problem: Problem, fit: Fit) -> Fit:
+    """λ where its prior and all of its uncertainty put it, and everything else adjusted to that.
+
+    The adjustment takes errors for independent, and so its data for surer than they are: where two images show depth,
+    they would be believed a fisheye. A lens of more parameters is only chosen where images show it.
+    """
+    if problem.free_lens.sum() != 1:
+        return fit
+    parameters, prior = fit.adjusted.parameters, LENS[0]
+    value = float(parameters.lens[0])
+    std = math.sqrt(float(considered_covariance(problem, fit, rough=True)[0, 0]))
+    near = value + std * np.linspace(-_REACH, _REACH, _STEPS)
+    weighed = float(near[np.argmin([prior.cost(x) + ((x - value) / std) ** 2 for x in near.tolist()])])
+    if abs(weighed - value) * float(np.median(problem.observations.scale1)) < WORTH_SAYING:
+        return fit
+    held = replace(problem, free_lens=np.zeros_like(problem.free_lens))
+    lens = np.where(problem.free_lens, weighed, parameters.lens)
+    refined = held.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread)
+    # λ stays one of the parameters whose uncertainty is estimated.
+    return replace(fit, adjusted=replace(refined.adjusted, covariance=fit.adjusted.covariance))
