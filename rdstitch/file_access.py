@@ -139,6 +139,15 @@ def _as_os_error() -> Iterator[None]:
         raise OSError(f"cannot be fetched: {reason}") from error
 
 
+def file_state(path: str | Path) -> tuple[int, int] | None:
+    """Size, bytes, and time of the last change, ns: what changes with a file's content; None where there is none."""
+    try:
+        status = Path(path).stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns
+
+
 def open_regular(path: str | Path) -> BufferedReader:
     """Open a regular file for reading bytes, at once whatever lies there; or one that a URL names."""
     if is_url(path):

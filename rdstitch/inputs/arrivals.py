@@ -10,6 +10,7 @@ from typing import IO
 import cv2
 
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.file_access import file_state
 from rdstitch.inputs.find import images_in, is_rdstitch_output, natural_key
 from rdstitch.inputs.frame import Frame, Named, array_as_image
 from rdstitch.io.video import VIDEO_SUFFIXES, opened_capture, write_frame
@@ -86,7 +87,7 @@ class Arrivals:
 
         A file that has not changed for so long that it should be reported comes again only if it changes after all.
         """
-        if self._kind != "folder" or (state := _state(frame.path)) is None:
+        if self._kind != "folder" or (state := file_state(frame.path)) is None:
             return False
         self._not_whole[frame.path] = state
         if time.time() - state[1] / 1e9 > _GIVE_UP_SECONDS:
@@ -110,7 +111,7 @@ class Arrivals:
                 read_at = self._not_whole.get(path)
                 if path in self._done and read_at is None:
                     continue
-                state = _state(path)
+                state = file_state(path)
                 if state is None or (path in self._done and state == read_at):
                     continue
                 age, still = time.time() - state[1] / 1e9, states.get(path) == state
@@ -180,15 +181,6 @@ class Arrivals:
 
     def _is_over(self, last: float) -> bool:
         return self._idle is not None and time.monotonic() - last >= self._idle
-
-
-def _state(path: Path) -> tuple[int, int] | None:
-    """Size and time of the last change, ns; None where the file is gone again."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_size, status.st_mtime_ns
 
 
 def _read_lines(stream: IO[str], read: "queue.Queue[str | None]") -> None:
