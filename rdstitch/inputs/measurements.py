@@ -13,6 +13,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.file_access import canonical_text, file_state, read_text
 from rdstitch.inputs.source import Source
+from rdstitch.messages import shortened
 from rdstitch.orientation import turning_matrix
 from rdstitch.planar_motion import tilt_from_normal, turned_tilt
 
@@ -20,7 +21,6 @@ XMP = "xmp"
 """The value of ``attitude`` that stands for the images' own XMP."""
 
 _TILT_COLUMNS = ("name", "psi", "theta")
-_MAX_NAMED = 3  # images in a message
 _MAX_TILT = math.radians(80.0)  # beyond, hardly an image shows ground, and more likely angles mean something else
 _EARTH = 6_371_000.0  # m
 _TIME_COLUMNS = ("name", "timestamp")
@@ -59,9 +59,9 @@ def _of_images(sources: Sequence[Source]) -> list[tuple[float, float]]:
         psi, theta = tilt_from_normal(nadir).tolist()
         tilts.append((psi, theta))
     if lacking:
-        more = f" and {len(lacking) - _MAX_NAMED} more" if len(lacking) > _MAX_NAMED else ""
-        named = ", ".join(lacking[:_MAX_NAMED])
-        raise InputError(f"{named}{more}: no attitude of the camera can be read from the XMP; give a CSV file instead")
+        raise InputError(
+            f"{shortened(lacking)}: no attitude of the camera can be read from the XMP; give a CSV file instead"
+        )
     return tilts
 
 
