@@ -120,7 +120,7 @@ def hugin_project(camera: Camera) -> str:
 
 @dataclass(frozen=True)
 class Polynomial:
-    """A lens as ``r_d = r + Σ k r^p`` of the undistorted radius, of a fisheye the equidistant one, in units of pixels."""
+    """A lens as ``r_d = r + Σ k r^p`` of the undistorted radius (of a fisheye its angle), in ``unit`` pixels."""
 
     powers: tuple[int, ...]
     coefficients: tuple[float, ...]  # k, for the scale of the centre
