@@ -176,13 +176,7 @@ def read_limited(path: str | Path, most: int, *, regular: bool = True) -> bytes:
 
 
 def read_text(path: str | Path, *, regular: bool = True) -> str:
-    """The text of a file of a reasonable size.
-
-    Parameters
-    ----------
-    regular : bool
-        Refuse pipes and devices, of which reading may not come to an end.
-    """
+    """The text of a file of a reasonable size; pipes and devices, which may never end, only if not ``regular``."""
     try:
         # Names of files that are not UTF-8 are written as they are, and come back as they were.
         return read_limited(path, MAX_FILE, regular=regular).decode("utf-8-sig", "surrogateescape")

@@ -25,21 +25,8 @@ class Arrivals:
     """Iterates over the frames of one source as they arrive.
 
     The iteration ends with a video, with the end of a list of names, and after ``idle`` seconds without a new frame;
-    that of a folder or camera goes on until it is interrupted otherwise.
-
-    Parameters
-    ----------
-    source : path or str
-        A folder, a video, the index of a camera, or what else OpenCV opens as a stream ("rtsp://…", "/dev/video0"); "-"
-        for names on ``names``.
-    names : text stream, optional
-        Names of images, one a line, for "-".
-    every : int
-        Of a video, camera or stream, every n-th frame.
-    idle : float or None
-        Seconds without a new frame after which the iteration ends; None: never.
-    frames_folder : callable
-        Gives the folder where frames of cameras and streams, which come only once, are written.
+    that of a folder or camera goes on until it is interrupted otherwise. The source is a folder, a video, the index of
+    a camera, what else OpenCV opens as a stream ("rtsp://…", "/dev/video0"), or "-" for names, one a line.
     """
 
     def __init__(
