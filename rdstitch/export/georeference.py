@@ -168,11 +168,6 @@ def georeference(
 
     ``to_output`` (N, 3, 3) takes normalized undistorted coordinates of each image to pixels of the output. Without
     ``epsg`` the map is that of the control points, else UTM on WGS 84.
-
-    Returns
-    -------
-    Georeference or None, str
-        And the reason where there is none.
     """
     source, std = (_CONTROL, _CONTROL_STD) if any(control) else (_GPS, POSITION_STD)
     if source == _GPS:

@@ -70,13 +70,7 @@ def write_strips(
     *,
     outputs: Outputs | None = None,
 ) -> Fingerprint:
-    """Write an image that comes in strips; see :func:`write_image`.
-
-    Returns
-    -------
-    Fingerprint
-        Size and digest of what was written.
-    """
+    """Write an image that comes in strips; see :func:`write_image`. Gives size and digest of what was written."""
     if outputs is None:
         with Outputs(overwrite=True) as alone:
             return write_strips(path, layout, strips, extra_tags, outputs=alone)
