@@ -42,9 +42,7 @@ class Arrivals:
         self._frames_folder = frames_folder
         self._seen: list[Frame] = []
         self._done: set[Path] = set()
-        self._not_whole: dict[
-            Path, tuple[int, int]
-        ] = {}  # files, and the size and time of change that they were read at
+        self._not_whole: dict[Path, tuple[int, int]] = {}  # files, and the state that they were read at
         path = Path(self._source)
         if self._source == "-":
             if names is None:
