@@ -110,17 +110,10 @@ def epsg_of(text: str) -> int | None:
 
 
 def utm(latitude: ArrayLike, longitude: ArrayLike, zone: int) -> FloatArray:
-    """UTM coordinates (N, 2) on WGS 84, m: easting and northing.
+    """UTM coordinates (N, 2) on WGS 84, m: easting and northing, of degrees (N,); the zone is negative in the south.
 
     Krüger's series to the third power of the third flattening (Karney 2011, equations 7-9, 11, 35): exact to 0.1 mm
     within a zone.
-
-    Parameters
-    ----------
-    latitude, longitude : array_like of shape (N,)
-        Degrees.
-    zone : int
-        1 to 60; negative in the south.
     """
     phi = np.radians(np.asarray(latitude, dtype=np.float64))
     away = np.radians(np.asarray(longitude, dtype=np.float64) - _central_meridian(abs(zone)))

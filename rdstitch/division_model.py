@@ -84,15 +84,10 @@ def undistort(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] 
 
 
 def distort(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
-    """Distort normalized points: the inverse of :func:`undistort`.
+    """Distort normalized points: the inverse of :func:`undistort`; NaN where no point of the domain maps to one.
 
     For λ alone in closed form, ``x_d = 2 x_u / (1 + sqrt(1 - 4 λ |x_u|²))``, which is stable at λ = 0 and at the
     centre; otherwise by Newton's method on the radius, with bisection where a step leaves the domain.
-
-    Returns
-    -------
-    ndarray of shape (..., 2)
-        Distorted points; NaN where no distorted point of the domain maps to the given one.
     """
     x = np.asarray(points, dtype=np.float64)
     radius2 = np.einsum("...i,...i->...", x, x)
@@ -176,13 +171,9 @@ def _fold_radius(distortion: float, higher: tuple[float, ...]) -> float:
 def nearest_one_parameter(radius2: FloatArray, distortion: float, higher: Sequence[float] = ()) -> tuple[float, float]:
     """The λ of the one-parameter model nearest to a lens, by least squares of measured radii; these are given squared.
 
-    The scale of the undistorted image is free, as no image of a plane shows it. So this is the λ that the
+    Given too is the factor by which undistorted points of the lens are to be *divided* before they are distorted with
+    it: the scale of the undistorted image is free, as no image of a plane shows it. So this is the λ that the
     estimation of one λ would find from points spread like those given.
-
-    Returns
-    -------
-    distortion, scale : float
-        λ, and the factor by which undistorted points of the lens are to be *divided* before they are distorted with it.
     """
     # With t the scale, the undistorted radius becomes r / (t g): the nearest model measures that at
     # r + r (t g - 1 - λ q) / (t g - 2 λ q) to first order, which is linear in t and λ but for the denominator.

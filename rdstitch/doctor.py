@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from rdstitch.camera import points_over
 from rdstitch.compositing import CompositePlan
 from rdstitch.errors import InputError, RegistrationError
 from rdstitch.features import FeatureOptions
@@ -231,11 +232,10 @@ def _overlap(registration: Registration) -> float | None:
     best = np.zeros(len(registration.sources))
     for fit in (fit for fit in alignment.links if fit.used):
         for first, second in ((fit.image1, fit.image2), (fit.image2, fit.image1)):
-            (width, height), other = alignment.cameras[first].image_size, alignment.cameras[second].image_size
-            grid = np.stack(np.meshgrid(np.linspace(0, width - 1, _GRID), np.linspace(0, height - 1, _GRID)), axis=-1)
+            own, other = alignment.cameras[first].image_size, alignment.cameras[second].image_size
             with np.errstate(invalid="ignore"):
-                moved = alignment.transfer(first, second, grid.reshape(-1, 2))
-                inside = ((moved >= 0) & (moved < other)).all(axis=1)
+                moved = alignment.transfer(first, second, points_over(own, _GRID))
+                inside = ((moved >= -0.5) & (moved < np.array(other) - 0.5)).all(axis=1)
             best[first] = max(best[first], inside.mean())
     return float(np.median(best[best > 0])) if (best > 0).any() else None
 

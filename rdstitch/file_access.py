@@ -139,6 +139,15 @@ def _as_os_error() -> Iterator[None]:
         raise OSError(f"cannot be fetched: {reason}") from error
 
 
+def file_state(path: str | Path) -> tuple[int, int] | None:
+    """Size, bytes, and time of the last change, ns: what changes with a file's content; None where there is none."""
+    try:
+        status = Path(path).stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns
+
+
 def open_regular(path: str | Path) -> BufferedReader:
     """Open a regular file for reading bytes, at once whatever lies there; or one that a URL names."""
     if is_url(path):
@@ -167,13 +176,7 @@ def read_limited(path: str | Path, most: int, *, regular: bool = True) -> bytes:
 
 
 def read_text(path: str | Path, *, regular: bool = True) -> str:
-    """The text of a file of a reasonable size.
-
-    Parameters
-    ----------
-    regular : bool
-        Refuse pipes and devices, of which reading may not come to an end.
-    """
+    """The text of a file of a reasonable size; pipes and devices, which may never end, only if not ``regular``."""
     try:
         # Names of files that are not UTF-8 are written as they are, and come back as they were.
         return read_limited(path, MAX_FILE, regular=regular).decode("utf-8-sig", "surrogateescape")

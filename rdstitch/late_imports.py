@@ -24,14 +24,4 @@ else:
         ),
     )
 
-__all__ = [
-    "csgraph",
-    "fft",
-    "linalg",
-    "ndimage",
-    "sparse",
-    "sparse_linalg",
-    "spatial",
-    "special",
-    "tifffile",
-]
+__all__ = ["csgraph", "fft", "linalg", "ndimage", "sparse", "sparse_linalg", "spatial", "special", "tifffile"]

@@ -193,10 +193,6 @@ def measurement_whitening(by_point: FloatArray, common: FloatArray | None = None
     common : ndarray of shape (N, 2), optional
         A random displacement of the transferred point besides, of one standard deviation, over that of the noise: its
         square is added to the covariance.
-
-    Returns
-    -------
-    ndarray of shape (N, 2, 2)
     """
     a, b = by_point[:, 0, :], by_point[:, 1, :]
     xx = (1.0 + np.einsum("ni,ni->n", a, a)) / 2.0

@@ -15,22 +15,13 @@ from tests.instances import Instances, PlanarInstances, general_instances, plana
 
 @dataclass(frozen=True)
 class SyntheticMatches:
-    """N matches between two images of a plane, some of them wrong.
+    """N matches between two images of a plane, some of them wrong."""
 
-    Attributes
-    ----------
-    points1, points2 : ndarray of shape (N, 2)
-        Measured pixels.
-    quality : ndarray of shape (N,)
-        What a matcher would say of each match, higher is better: right matches tend to score above wrong ones.
-    truth : RadialHomography
-        The true camera, homography, motion (None where it is free), and which matches are right.
-    """
-
-    points1: FloatArray
+    points1: FloatArray  # points1, points2: (N, 2): measured pixels
     points2: FloatArray
+    # (N,): what a matcher would say of each match, higher is better: right matches tend to score above wrong ones
     quality: FloatArray
-    truth: RadialHomography
+    truth: RadialHomography  # the true camera, homography, motion (None where it is free), and which matches are right
 
     @property
     def inliers(self) -> NDArray[np.bool_]:

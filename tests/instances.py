@@ -27,22 +27,12 @@ _MAX_ROUNDS = 200
 
 @dataclass(frozen=True)
 class Instances:
-    """B instances of k correspondences between two images of a plane.
+    """B instances of k correspondences between two images of a plane."""
 
-    Attributes
-    ----------
-    x1, x2 : ndarray of shape (B, k, 2)
-        Measured (distorted, noisy) points of image 1 and 2, focal-normalized.
-    homography : ndarray of shape (B, 3, 3)
-        ``p2(λ) ~ H p1(λ)`` with positive third coordinates.
-    distortion : ndarray of shape (B,)
-        λ, focal-normalized.
-    """
-
-    x1: FloatArray
+    x1: FloatArray  # x1, x2: (B, k, 2): measured (distorted, noisy) points of image 1 and 2, focal-normalized
     x2: FloatArray
-    homography: FloatArray
-    distortion: FloatArray
+    homography: FloatArray  # (B, 3, 3): ``p2(λ) ~ H p1(λ)`` with positive third coordinates
+    distortion: FloatArray  # (B,): λ, focal-normalized
 
     def __len__(self) -> int:
         return len(self.distortion)
@@ -75,25 +65,14 @@ class Instances:
 
 @dataclass(frozen=True)
 class PlanarInstances(Instances):
-    """Instances of planar motion: ``H = R2 Rz(φ) diag(1, 1, height) T R1'``.
+    """Instances of planar motion: ``H = R2 Rz(φ) diag(1, 1, height) T R1'``."""
 
-    Attributes
-    ----------
-    tilt, tilt2 : ndarray of shape (B, 2)
-        (ψ, θ) of image 1 and image 2, radians; the same unless separate tilts were requested.
-    yaw : ndarray of shape (B,)
-        φ, radians.
-    translation : ndarray of shape (B, 2)
-        (tx, ty), in units of the first camera's height above the plane.
-    height : ndarray of shape (B,)
-        Height of the second camera in units of the first's.
-    """
-
+    # tilt, tilt2: (B, 2): (ψ, θ) of image 1 and image 2, radians; the same unless separate tilts were requested
     tilt: FloatArray
     tilt2: FloatArray
-    yaw: FloatArray
-    translation: FloatArray
-    height: FloatArray
+    yaw: FloatArray  # (B,): φ, radians
+    translation: FloatArray  # (B, 2): (tx, ty), in units of the first camera's height above the plane
+    height: FloatArray  # (B,): height of the second camera in units of the first's
 
     def motion(self, index: int) -> PlanarMotion:
         """The motion of one instance whose two tilts are the same."""
@@ -240,17 +219,10 @@ def _visible_points(
 
 @dataclass(frozen=True)
 class RotationInstances(Instances):
-    """Instances of rotation: ``H = K R K⁻¹``, ``K = diag(g, g, 1)``.
+    """Instances of rotation: ``H = K R K⁻¹``, ``K = diag(g, g, 1)``."""
 
-    Attributes
-    ----------
-    rotation : ndarray of shape (B, 3, 3)
-    focal : ndarray of shape (B,)
-        g, in the unit of the points.
-    """
-
-    rotation: FloatArray
-    focal: FloatArray
+    rotation: FloatArray  # (B, 3, 3)
+    focal: FloatArray  # (B,): g, in the unit of the points
 
 
 def rotation_instances(

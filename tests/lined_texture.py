@@ -10,23 +10,12 @@ from rdstitch.synthetic.textures import LinearPixels, Texture
 
 @dataclass(frozen=True)
 class LinedTexture:
-    """A texture with straight lines painted on it: roads, joints, markings.
-
-    Attributes
-    ----------
-    texture : Texture
-    lines : ndarray of shape (L, 2, 2)
-        End points of each, texels.
-    width : float
-        Texels.
-    level : float
-        Grey of the lines, 0 to 1.
-    """
+    """A texture with straight lines painted on it: roads, joints, markings."""
 
     texture: Texture
-    lines: FloatArray
-    width: float = 6.0
-    level: float = 1.0
+    lines: FloatArray  # (L, 2, 2): end points of each, texels
+    width: float = 6.0  # texels
+    level: float = 1.0  # grey of the lines, 0 to 1
 
     @property
     def size(self) -> tuple[int, int]:

@@ -28,50 +28,23 @@ _NUCLEI_EVERY = 45.0
 
 @dataclass(frozen=True)
 class StageGrid:
-    """Tiles of a specimen on a stage, rendered on demand.
-
-    Attributes
-    ----------
-    rows, columns : int
-    tile : int
-        Side of a tile, pixels.
-    overlap : float
-        Share of a tile that its neighbour shows too, as the stage is told.
-    specimen : str
-        "fluorescence": bright nuclei on dark ground, in one channel; "brightfield": stained tissue on bright ground, in
-        three.
-    content : float
-        Share of the ground that shows any.
-    backlash : float
-        Pixels that rows taken from left to right are off to the left, and the others to the right.
-    jitter : float
-        Standard deviation of each place, pixels.
-    turn : float
-        Of the camera against the axes of the stage, radians.
-    shading : float
-        Share of the light that is missing where it is darkest.
-    offset : float
-        Counts of the camera without light.
-    distortion : float
-        λ of the lens.
-    electrons : float
-        That make a count; more are less noise.
-    seed : int
-    """
+    """Tiles of a specimen on a stage, rendered on demand."""
 
     rows: int = 10
     columns: int = 10
-    tile: int = 1024
-    overlap: float = 0.1
+    tile: int = 1024  # side of a tile, pixels
+    overlap: float = 0.1  # share of a tile that its neighbour shows too, as the stage is told
+    # "fluorescence": bright nuclei on dark ground, in one channel; "brightfield": stained tissue on bright ground, in
+    # three
     specimen: Specimen = "fluorescence"
-    content: float = 0.6
-    backlash: float = 8.0
-    jitter: float = 1.5
-    turn: float = 0.002
-    shading: float = 0.3
-    offset: float = 100.0
-    distortion: float = 0.0
-    electrons: float = 2.0
+    content: float = 0.6  # share of the ground that shows any
+    backlash: float = 8.0  # pixels that rows taken from left to right are off to the left, and the others to the right
+    jitter: float = 1.5  # standard deviation of each place, pixels
+    turn: float = 0.002  # of the camera against the axes of the stage, radians
+    shading: float = 0.3  # share of the light that is missing where it is darkest
+    offset: float = 100.0  # counts of the camera without light
+    distortion: float = 0.0  # λ of the lens
+    electrons: float = 2.0  # that make a count; more are less noise
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -38,6 +38,7 @@ def followed(
     printed: as the file that is written at the end has them.
     """
     from rdstitch.camera_files import CAMERA_SUFFIXES
+    from rdstitch.file_access import file_state
     from rdstitch.inputs.arrivals import Arrivals
     from rdstitch.outputs import check_output, temporary_folder
     from rdstitch.pipeline.follow import follow as follow_frames
@@ -60,7 +61,7 @@ def followed(
             check_output(other, stitch.overwrite, [source], suffixes=())
     if stitch.save_camera is not None:
         check_output(stitch.save_camera, stitch.overwrite, suffixes=CAMERA_SUFFIXES)
-    before = _state(preview)
+    before = file_state(preview) if preview else None
     with temporary_folder() as folder:
         arrivals = Arrivals(str(inputs[0]), frames_folder=lambda: folder, names=sys.stdin, every=every or 1, idle=idle)
         try:
@@ -72,16 +73,8 @@ def followed(
             reporter.note("interrupted: registering what has arrived; interrupt once more to give up")
         yield arrivals.inputs
     # What it was a sketch of is there now; a file that was there before and was not replaced is none of ours.
-    if preview is not None and _state(preview) != before:
+    if preview is not None and file_state(preview) != before:
         preview.unlink(missing_ok=True)
-
-
-def _state(file: Path | None) -> tuple[int, int] | None:
-    """Which file it is, and when it was changed; None where there is none."""
-    if file is None or not file.exists():
-        return None
-    status = file.stat()
-    return status.st_ino, status.st_mtime_ns
 
 
 def print_line(record: dict[str, object]) -> None:

@@ -203,15 +203,10 @@ def staged_beside(
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:
     """λ and the plan of a dry run, or the sidecar, to standard output; what the user must know to standard error."""
-    reporter.finish()
-    warn_of(result.registration, reporter)
-    if as_json:
-        from rdstitch.sidecar.write import sidecar
+    from rdstitch.sidecar.write import sidecar
 
-        _echo_json(sidecar(result))
-        return
-    _echo_lambda(result.registration)
-    if result.plan is not None:
+    report_registration(result.registration, reporter, partial(sidecar, result) if as_json else None)
+    if result.plan is not None and not as_json:
         show_plan(result.plan)
 
 
@@ -227,16 +222,19 @@ def show_plan(plan: "CompositePlan") -> None:
     click.echo(f"time: about {seconds_in_words(plan.seconds)} for compositing")
 
 
-def report_registration(registration: "Registration", reporter: Reporter, *, as_json: bool = False) -> None:
-    """λ, or the camera, to standard output; images left out to standard error."""
+def report_registration(
+    registration: "Registration", reporter: Reporter, content: Callable[[], Any] | None = None
+) -> None:
+    """λ, nan where it is not observable, or some content as JSON to standard output; warnings to standard error."""
+    from rdstitch.outputs import json_bytes
+
     reporter.finish()
     warn_of(registration, reporter)
-    if as_json:
-        from rdstitch.sidecar.write import plain
-
-        _echo_json(plain(registration.camera.as_dict()))
+    alignment = registration.alignment
+    if content is not None:
+        click.echo(json_bytes(content()), nl=False)
     else:
-        _echo_lambda(registration)
+        click.echo(f"{alignment.distortion:.6f}" if math.isfinite(alignment.distortion_std) else "nan")
 
 
 def warn_of(registration: "Registration", reporter: Reporter) -> None:
@@ -250,16 +248,3 @@ def warn_of(registration: "Registration", reporter: Reporter) -> None:
         reporter.tell(message)
     used = int(alignment.used.sum())
     reporter.log(f"{used} of {len(alignment.used)} images, rms {alignment.rms:.2f} pixels; {alignment.model_reason}")
-
-
-def _echo_json(content: Any) -> None:
-    from rdstitch.outputs import json_bytes
-
-    click.echo(json_bytes(content), nl=False)
-
-
-def _echo_lambda(registration: "Registration") -> None:
-    """λ, or nan where it is not observable."""
-    alignment = registration.alignment
-    observable = math.isfinite(alignment.distortion_std)
-    click.echo(f"{alignment.distortion:.6f}" if observable else "nan")

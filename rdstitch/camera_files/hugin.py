@@ -120,20 +120,11 @@ def hugin_project(camera: Camera) -> str:
 
 @dataclass(frozen=True)
 class Polynomial:
-    """A lens as ``r_d = r + Σ k r^p`` of the undistorted radius, of a fisheye the equidistant one, in units of pixels.
-
-    Attributes
-    ----------
-    powers : tuple of int
-    coefficients : tuple of float
-        k, for the scale of the centre.
-    focal : float
-        There, pixels.
-    """
+    """A lens as ``r_d = r + Σ k r^p`` of the undistorted radius (of a fisheye its angle), in ``unit`` pixels."""
 
     powers: tuple[int, ...]
-    coefficients: tuple[float, ...]
-    focal: float
+    coefficients: tuple[float, ...]  # k, for the scale of the centre
+    focal: float  # there, pixels
     fisheye: bool
     fit: LensFit
 

@@ -59,13 +59,7 @@ def fitted_lens(lens: LensModel, kind: str, size: tuple[int, int], field: str = 
 
 
 def fit_lens(forward: Forward, camera: Camera) -> tuple[Camera, LensFit]:
-    """Fit the division model to another lens model: with λ alone where that is enough, else with μ, else with ν too.
-
-    Returns
-    -------
-    Camera, LensFit
-        The camera with the lens, and what it costs.
-    """
+    """Fit the division model to another lens model: with λ alone where that is enough, else with μ, else with ν too."""
     straight, measured, weights = _rays(forward, camera)
     flat, bent = camera.normalize(straight), camera.normalize(measured)
     radius = np.linalg.norm(bent, axis=1)

@@ -164,15 +164,7 @@ _FITS: dict[str, tuple[Callable[[LensSamples], tuple[FloatArray, LensFit]], tupl
 
 
 def nearest_model(camera: Camera, *models: str, close: float = CLOSE) -> tuple[LensModel, LensFit]:
-    """Fit lens models to a camera: the first that is close to it, or else the one that is nearest.
-
-    Parameters
-    ----------
-    models : str
-        "two terms" or "polynomial" (k1, k2, and k3), "rational", "fisheye".
-    close : float
-        Largest distance, pixels.
-    """
+    """Fit lens models of :data:`_FITS` to a camera: the first that is so close, pixels, or else the nearest."""
     samples, found = LensSamples.of(camera), []
     for model in models:
         fit, places = _FITS[model]

@@ -16,6 +16,7 @@ from rdstitch.compositing.panorama_canvas import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.preparation import prepare_composite
+from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.tiles import ShareProgress
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
@@ -62,6 +63,10 @@ class FileComposite:
     path : Path
     fingerprint : Fingerprint
         Size and digest of the file.
+    seams : SeamMap or None
+        Which image owns what of the canvas before cropping; None without seams.
+    origin : (int, int)
+        Where the output begins in that canvas, pixels.
     """
 
     path: Path
@@ -69,6 +74,8 @@ class FileComposite:
     exposure: Exposure
     fingerprint: Fingerprint
     messages: tuple[Message, ...] = ()
+    seams: SeamMap | None = None
+    origin: tuple[int, int] = (0, 0)
 
     def __repr__(self) -> str:
         return f"<FileComposite {self.path}: {self.canvas.size[0]} x {self.canvas.size[1]} pixels>"
@@ -182,4 +189,6 @@ def compose_to_file(
         renderer.exposure,
         written,
         prepared.messages,
+        renderer.seams,
+        prepared.tiles.box[:2],
     )

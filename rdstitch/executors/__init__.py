@@ -25,17 +25,7 @@ _MAX_PENDING = 256  # tasks that have been submitted and whose results were not 
 
 
 def open_executor(workers: int, images: int, *, scheduler: str | None = None, store: Path | None = None) -> Executor:
-    """The executor for a set of so many images, to be used in a ``with`` block.
-
-    Parameters
-    ----------
-    workers : int
-        Tasks at the same time on this machine.
-    scheduler : str, optional
-        Address of a Dask scheduler, or "local"; see :class:`rdstitch.executors.dask_cluster.DaskExecutor`.
-    store : Path, optional
-        Folder of features and matches that the workers of that scheduler must see.
-    """
+    """The executor for a set of so many images, to be used in a ``with`` block; its workers must see the store."""
     if scheduler is not None:
         return DaskExecutor(scheduler, workers, store)
     if workers > 1 and images >= _PROCESSES_FROM and sys.executable:

@@ -164,25 +164,10 @@ def georeference(
     epsg: int | None = None,
     control: Sequence[Sequence[GroundControl]] = (),
 ) -> tuple[Georeference | None, str]:
-    """Place the output on the Earth, or say why that cannot be done.
+    """Place the output on the Earth, or say why that cannot be done; control points, where there are any, count alone.
 
-    Parameters
-    ----------
-    positions : sequence of GpsPosition or None
-        Of each image.
-    to_output : ndarray of shape (N, 3, 3)
-        Normalized undistorted coordinates of each image to pixels of the output.
-    names : sequence of str
-        Of the images.
-    epsg : int, optional
-        Of the map coordinates; None: that of the control points, else UTM on WGS 84.
-    control : sequence of sequence of GroundControl, optional
-        That each image shows; where there are any, positions do not count.
-
-    Returns
-    -------
-    Georeference or None, str
-        And the reason where there is none.
+    ``to_output`` (N, 3, 3) takes normalized undistorted coordinates of each image to pixels of the output. Without
+    ``epsg`` the map is that of the control points, else UTM on WGS 84.
     """
     source, std = (_CONTROL, _CONTROL_STD) if any(control) else (_GPS, POSITION_STD)
     if source == _GPS:

@@ -10,6 +10,7 @@ from typing import IO
 import cv2
 
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.file_access import file_state
 from rdstitch.inputs.find import images_in, is_rdstitch_output, natural_key
 from rdstitch.inputs.frame import Frame, Named, array_as_image
 from rdstitch.io.video import VIDEO_SUFFIXES, opened_capture, write_frame
@@ -24,21 +25,8 @@ class Arrivals:
     """Iterates over the frames of one source as they arrive.
 
     The iteration ends with a video, with the end of a list of names, and after ``idle`` seconds without a new frame;
-    that of a folder or camera goes on until it is interrupted otherwise.
-
-    Parameters
-    ----------
-    source : path or str
-        A folder, a video, the index of a camera, or what else OpenCV opens as a stream ("rtsp://…", "/dev/video0"); "-"
-        for names on ``names``.
-    names : text stream, optional
-        Names of images, one a line, for "-".
-    every : int
-        Of a video, camera or stream, every n-th frame.
-    idle : float or None
-        Seconds without a new frame after which the iteration ends; None: never.
-    frames_folder : callable
-        Gives the folder where frames of cameras and streams, which come only once, are written.
+    that of a folder or camera goes on until it is interrupted otherwise. The source is a folder, a video, the index of
+    a camera, what else OpenCV opens as a stream ("rtsp://…", "/dev/video0"), or "-" for names, one a line.
     """
 
     def __init__(
@@ -54,9 +42,7 @@ class Arrivals:
         self._frames_folder = frames_folder
         self._seen: list[Frame] = []
         self._done: set[Path] = set()
-        self._not_whole: dict[
-            Path, tuple[int, int]
-        ] = {}  # files, and the size and time of change that they were read at
+        self._not_whole: dict[Path, tuple[int, int]] = {}  # files, and the state that they were read at
         path = Path(self._source)
         if self._source == "-":
             if names is None:
@@ -86,7 +72,7 @@ class Arrivals:
 
         A file that has not changed for so long that it should be reported comes again only if it changes after all.
         """
-        if self._kind != "folder" or (state := _state(frame.path)) is None:
+        if self._kind != "folder" or (state := file_state(frame.path)) is None:
             return False
         self._not_whole[frame.path] = state
         if time.time() - state[1] / 1e9 > _GIVE_UP_SECONDS:
@@ -110,7 +96,7 @@ class Arrivals:
                 read_at = self._not_whole.get(path)
                 if path in self._done and read_at is None:
                     continue
-                state = _state(path)
+                state = file_state(path)
                 if state is None or (path in self._done and state == read_at):
                     continue
                 age, still = time.time() - state[1] / 1e9, states.get(path) == state
@@ -180,15 +166,6 @@ class Arrivals:
 
     def _is_over(self, last: float) -> bool:
         return self._idle is not None and time.monotonic() - last >= self._idle
-
-
-def _state(path: Path) -> tuple[int, int] | None:
-    """Size and time of the last change, ns; None where the file is gone again."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_size, status.st_mtime_ns
 
 
 def _read_lines(stream: IO[str], read: "queue.Queue[str | None]") -> None:

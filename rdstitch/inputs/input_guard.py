@@ -1,15 +1,15 @@
 """Files that change during a run, or whose pixels a decoder has doubts about: noticed once for all who read them."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import is_url, remote_status
+from rdstitch.file_access import file_state, is_url, remote_status
 from rdstitch.io.read import DecodedImage
 from rdstitch.messages import Message
 
-_Stamp = tuple[int | None, int, int | str]
+_Stamp = tuple[int, int] | str
 
 GuardNotes = tuple[dict[Path, _Stamp | None], dict[Path, str]]
 """Stamps of files, and why they may be damaged."""
@@ -75,11 +75,6 @@ class InputGuard:
 
 def _stamp(path: Path) -> _Stamp | None:
     """What changes with a file and is the same on every machine that sees it; None where it is gone."""
-    try:
-        if is_url(path):
-            _, size, key = remote_status(path)
-            return size, 0, key
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_size, status.st_mtime_ns, 0
+    with suppress(OSError):
+        return remote_status(path)[2] if is_url(path) else file_state(path)
+    return None

@@ -11,8 +11,9 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
-from rdstitch.file_access import canonical_text, read_text
+from rdstitch.file_access import canonical_text, file_state, read_text
 from rdstitch.inputs.source import Source
+from rdstitch.messages import shortened
 from rdstitch.orientation import turning_matrix
 from rdstitch.planar_motion import tilt_from_normal, turned_tilt
 
@@ -20,7 +21,6 @@ XMP = "xmp"
 """The value of ``attitude`` that stands for the images' own XMP."""
 
 _TILT_COLUMNS = ("name", "psi", "theta")
-_MAX_NAMED = 3  # images in a message
 _MAX_TILT = math.radians(80.0)  # beyond, hardly an image shows ground, and more likely angles mean something else
 _EARTH = 6_371_000.0  # m
 _TIME_COLUMNS = ("name", "timestamp")
@@ -59,9 +59,9 @@ def _of_images(sources: Sequence[Source]) -> list[tuple[float, float]]:
         psi, theta = tilt_from_normal(nadir).tolist()
         tilts.append((psi, theta))
     if lacking:
-        more = f" and {len(lacking) - _MAX_NAMED} more" if len(lacking) > _MAX_NAMED else ""
-        named = ", ".join(lacking[:_MAX_NAMED])
-        raise InputError(f"{named}{more}: no attitude of the camera can be read from the XMP; give a CSV file instead")
+        raise InputError(
+            f"{shortened(lacking)}: no attitude of the camera can be read from the XMP; give a CSV file instead"
+        )
     return tilts
 
 
@@ -125,12 +125,7 @@ def timestamps_of(sources: Sequence[Source], file: str | Path | None = None) -> 
         own = [(None if source.frame is None else source.frame.timestamp) for source in sources]
         times = [s.metadata.timestamp if known is None else known for s, known in zip(sources, own, strict=True)]
         return np.array([math.nan if time is None else time for time in times])
-    try:
-        status = Path(file).stat()
-        state = status.st_size, status.st_mtime_ns
-    except OSError:  # reading it says so
-        state = 0, 0
-    named = _read_times(file, state)
+    named = _read_times(file, file_state(file))
     if isinstance(named, list):
         numbers = [source.number(position) for position, source in enumerate(sources)]
         if max(numbers) >= len(named):
@@ -143,7 +138,7 @@ def timestamps_of(sources: Sequence[Source], file: str | Path | None = None) -> 
 
 
 @lru_cache(maxsize=1)  # frames that are followed ask one after the other
-def _read_times(file: str | Path, state: tuple[int, int]) -> list[float] | dict[str, float]:
+def _read_times(file: str | Path, state: tuple[int, int] | None) -> list[float] | dict[str, float]:
     """The times in order, or by the names of the images, of a file in a state."""
     lines = [line.strip() for line in read_text(file).splitlines()]
     lines = [line for line in lines if line and not line.startswith("#")]

@@ -48,13 +48,7 @@ def is_bag(path: Path) -> bool:
 def extract_images(
     path: Path, folder: Path, every: int | None = 1, topic: str | None = None
 ) -> tuple[list[Frame], Wanted]:
-    """Write images of a topic to a folder, losslessly, with number and time stamp (s) of the header.
-
-    Returns
-    -------
-    list of Frame, Wanted
-        The images, and which they are.
-    """
+    """Write images of a topic to a folder, losslessly, with number and time stamp (s) of the header."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore

@@ -1,8 +1,54 @@
-"""Colours of inks become sRGB, which is what images without a profile are taken for."""
+"""Colours that are no RGB: CIELAB and inks become sRGB, which is what images without a profile are taken for."""
 
 import io
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageCms
+
+from rdstitch.arrays import FloatArray
+
+_ROWS_AT_A_TIME = 128
+_WHITE = np.array([0.9642, 1.0, 0.8249])  # of D50, to which CIELAB in TIFF and in profiles refers
+# From XYZ of D50, adapted to D65 after Bradford, to linear sRGB (IEC 61966-2-1).
+_XYZ_TO_RGB = np.array(
+    [
+        [3.1338561, -1.6168667, -0.4906146],
+        [-0.9787684, 1.9161415, 0.0334540],
+        [0.0719453, -0.2289914, 1.4052427],
+    ]
+)
+_EDGE = 6.0 / 29.0  # where the cube root of CIE 1976 becomes a line
+
+
+def srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> NDArray[Any]:
+    """Samples of CIELAB (h, w, 3), 8 or 16 bits as TIFF stores them, as sRGB of the same type.
+
+    Parameters
+    ----------
+    signed : bool
+        Whether a* and b* are numbers with a sign, as TIFF's own CIELAB has them; else they are offset by half of their
+        range, as profiles have them.
+    """
+    rgb = np.empty_like(lab)
+    for top in range(0, len(lab), _ROWS_AT_A_TIME):
+        rows = slice(top, top + _ROWS_AT_A_TIME)
+        rgb[rows] = _srgb_of_lab(lab[rows], signed=signed)
+    return rgb
+
+
+def _srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> FloatArray:
+    full = np.iinfo(lab.dtype).max
+    unit = (full + 1) // 256
+    chroma = lab[..., 1:].view(f"i{lab.dtype.itemsize}") if signed else lab[..., 1:].astype(np.int64) - 128 * unit
+    y = (lab[..., 0] * (100.0 / (full if signed else 255 * unit)) + 16.0) / 116.0
+    cube = np.stack([y + chroma[..., 0] / (500.0 * unit), y, y - chroma[..., 1] / (200.0 * unit)], axis=-1)
+    xyz = np.where(cube > _EDGE, cube**3, 3.0 * _EDGE**2 * (cube - 4.0 / 29.0)) * _WHITE
+    linear = np.clip(xyz @ _XYZ_TO_RGB.T, 0.0, 1.0)
+    gamma = np.where(linear > 0.0031308, 1.055 * linear ** (1.0 / 2.4) - 0.055, 12.92 * linear)
+    samples: FloatArray = np.rint(gamma * full)
+    return samples
 
 
 def ink_transform(profile: bytes) -> ImageCms.ImageCmsTransform | None:

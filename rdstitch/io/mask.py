@@ -16,15 +16,10 @@ _OPAQUE = 255
 def mask_frame(
     path: str | Path, image: str | Path, size: tuple[int, int], orientation: int = 1, *, of_camera: bool = False
 ) -> int | None:
-    """Find out from its header whether, and in which frame, a mask fits to an image.
+    """Find out from its header by which orientation a mask is to be turned to fit to an image; None as it looks.
 
     What the camera sees in every image belongs to the stored frame, as its lens does; the mask of one image is as
     that looks. Where a mask fits in one of the two only, it belongs there.
-
-    Returns
-    -------
-    int or None
-        The orientation by which it is to be turned from how its file stores it; None where it is used as it looks.
     """
     own, (width, height) = read_metadata(path), size
     stored = turned_size(turned_size(own.size, inverse(own.orientation)), orientation)
@@ -40,15 +35,10 @@ def mask_frame(
 
 
 def read_mask(path: str | Path, size: tuple[int, int], frame: int | None = None) -> NDArray[np.uint8]:
-    """Read a mask as alpha for an image.
+    """Read a mask as alpha (height, width) for an image: 255 where the image counts, 0 where it is excluded.
 
     What is darker than half of the mask's brightest value is excluded, so that masks of 0 and 1, masks of 0 and 255,
     and lossily compressed ones all mean what they show. What is transparent in the mask is excluded, too.
-
-    Returns
-    -------
-    ndarray of shape (height, width), uint8
-        255 where the image counts, 0 where it is excluded.
     """
     mask = read_image(path)
     light = mask.pixels if mask.pixels.ndim == 2 else mask.pixels.max(axis=2)

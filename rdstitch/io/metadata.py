@@ -227,6 +227,8 @@ def _colour_profile(image: Image.Image) -> tuple[bytes, str]:
         return b"", f"its colour profile of {len(profile) / 1e6:.1f} MB is too large for PNG readers"
     if profile[_COLOUR_SPACE] == b"CMYK":
         return b"", "" if ink_transform(profile) else "its colour profile of inks (CMYK) cannot be used"
+    if profile[_COLOUR_SPACE] == b"Lab ":
+        return b"", ""
     return profile, ""
 
 

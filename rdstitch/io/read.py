@@ -16,7 +16,7 @@ from PIL import Image
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import open_regular
-from rdstitch.io.colour import without_inks
+from rdstitch.io.colour import srgb_of_lab, without_inks
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
 from rdstitch.io.ome_xml import read_ome
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, opened_image
@@ -104,7 +104,7 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
 
     JPEG, PNG, TIFF, WebP and whatever else Pillow reads, with 8 or 16 bit or floating-point samples; with optional
     packages also HEIC, and raw files, which become 16-bit sRGB. Of an animated or multi-page file the first image
-    counts. CMYK (by its profile) and palette colours become RGB. NaN or infinite samples of a floating-point
+    counts. CMYK (by its profile), CIELAB and palette colours become RGB. NaN or infinite samples of a floating-point
     file become transparent zeros.
 
     Parameters
@@ -249,11 +249,9 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
         if (planes := _channel_planes(tiff)) is not None:
             return planes, None
         kind = page.photometric
-        if kind in _LAB:
-            raise InputError(f"{file}: has the colours of CIELAB, which are not read; convert it to RGB")
         has_alpha = any(extra in (1, 2) for extra in page.extrasamples)
         try:
-            samples = page.asarray() if kind in _PLAIN else None
+            samples = page.asarray() if kind in (*_PLAIN, *_LAB) else None
         except ValueError as error:
             if "imagecodecs" not in str(error):
                 raise
@@ -275,6 +273,11 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
         raise ValueError(f"unexpected axes {axes}")
     if kind == tifffile.PHOTOMETRIC.MINISWHITE:
         samples = ~samples
+    if kind in _LAB:
+        if samples.dtype not in (np.uint8, np.uint16):
+            raise ValueError(f"CIELAB of type {samples.dtype}")
+        samples = samples.copy()
+        samples[..., :3] = srgb_of_lab(samples[..., :3], signed=kind == tifffile.PHOTOMETRIC.CIELAB)
     if samples.dtype == np.bool_:
         samples = samples.astype(np.uint8) * _OPAQUE
     if axes == "YXS" and has_alpha:

@@ -44,27 +44,13 @@ def write_image(
     background: int = 0,
     overwrite: bool = True,
 ) -> None:
-    """Write an image; the format follows the suffix.
+    """Write an image (H, W) or (H, W, C) in RGB order; the format follows the suffix.
+
+    Samples are uint8, uint16 or float32; the latter, and other than one or three channels, need TIFF. Alpha is 255
+    where the image is opaque.
 
     The same input gives the same bytes. JPEG has no transparency and 8 bits: what is transparent becomes
     ``background``, 16 bits are rounded to 8.
-
-    Parameters
-    ----------
-    path
-        ``.jpg``, ``.jpeg``, ``.png``, ``.tif``, ``.tiff``, ``.webp`` or ``.dzi``.
-    pixels : ndarray of shape (H, W) or (H, W, C), uint8, uint16 or float32
-        Colour in RGB order. Floating-point samples and other than one or three channels need TIFF.
-    alpha : ndarray of shape (H, W), uint8, optional
-        255 where the image is opaque.
-    metadata : Metadata, optional
-        Colour profile, EXIF and resolution to keep.
-    quality : int
-        Of JPEG and WebP, 1 to 100.
-    background : int
-        Grey of what is transparent, in a format without transparency: 0 black, 255 white.
-    overwrite : bool
-        Replace an existing file.
     """
     if pixels.ndim not in (2, 3):
         raise ArgumentError(f"expected pixels of shape (H, W) or (H, W, C), not {pixels.shape}")
@@ -84,13 +70,7 @@ def write_strips(
     *,
     outputs: Outputs | None = None,
 ) -> Fingerprint:
-    """Write an image that comes in strips; see :func:`write_image`.
-
-    Returns
-    -------
-    Fingerprint
-        Size and digest of what was written.
-    """
+    """Write an image that comes in strips; see :func:`write_image`. Gives size and digest of what was written."""
     if outputs is None:
         with Outputs(overwrite=True) as alone:
             return write_strips(path, layout, strips, extra_tags, outputs=alone)

@@ -46,23 +46,12 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class LocalAlignment:
-    """What local alignment found.
+    """What local alignment found."""
 
-    Attributes
-    ----------
-    fields : tuple of DisplacementField
-        One an image; empty where images are not aligned locally.
-    reason : str
-        Why they are, or are not.
-    cells : int
-        Of the grid along the longer side of an image; 0 without fields.
-    before, after : HeldOut or None
-        Residuals of held-out matches without and with fields; None where nothing was tried.
-    """
-
-    fields: tuple[DisplacementField, ...]
-    reason: str
-    cells: int = 0
+    fields: tuple[DisplacementField, ...]  # one an image; empty where images are not aligned locally
+    reason: str  # why they are, or are not
+    cells: int = 0  # of the grid along the longer side of an image; 0 without fields
+    # before, after: residuals of held-out matches without and with fields; None where nothing was tried
     before: HeldOut | None = None
     after: HeldOut | None = None
 

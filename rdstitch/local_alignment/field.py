@@ -26,17 +26,11 @@ class DisplacementField:
     """Displacements of one image.
 
     What the alignment expects at the measured pixels ``q`` is at ``q + field(q)``.
-
-    Attributes
-    ----------
-    image_size : (int, int)
-        Width and height of the image, pixels.
-    values : ndarray of shape (m, n, 2)
-        Displacement, pixels, at nodes spread evenly from the first to the last pixel of each row and column, m rows
-        of n.
     """
 
-    image_size: tuple[int, int]
+    image_size: tuple[int, int]  # width and height of the image, pixels
+    # (m, n, 2): displacement, pixels, at nodes spread evenly from the first to the last pixel of each row and column, m
+    # rows of n
     values: FloatArray
 
     def __post_init__(self) -> None:

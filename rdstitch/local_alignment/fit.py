@@ -44,38 +44,20 @@ Shapes = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True)
 class Stiffness:
-    """How freely fields bend.
+    """How freely fields bend."""
 
-    Attributes
-    ----------
-    cells : int
-        Of the grid, along the longer side of an image.
-    slope : float
-        Change of the displacement per pixel that is as likely as a residual of one robust scale.
-    """
-
-    cells: int
-    slope: float
+    cells: int  # of the grid, along the longer side of an image
+    slope: float  # change of the displacement per pixel that is as likely as a residual of one robust scale
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedFields:
-    """Displacement of each image on the plane or sphere, at the nodes of its grid.
-
-    Attributes
-    ----------
-    images : ImagesOnSurface
-    stiffness : Stiffness
-    shapes : tuple of (int, int)
-        Rows and columns of nodes of each image.
-    values : tuple of ndarray of shape (m n, D)
-        Pixels of the median image.
-    """
+    """Displacement of each image on the plane or sphere, at the nodes of its grid."""
 
     images: ImagesOnSurface
     stiffness: Stiffness
-    shapes: Shapes
-    values: tuple[FloatArray, ...]
+    shapes: Shapes  # rows and columns of nodes of each image
+    values: tuple[FloatArray, ...]  # (m n, D): pixels of the median image
 
     def explain(self, matches: PlacedMatches) -> tuple[FloatArray, FloatArray]:
         """What they leave over at matches, (M, D), and pixels (2 M, 2) where the alignment expects these."""

@@ -36,20 +36,13 @@ class ImagesOnSurface:
     """Where the alignment puts the images: on a plane, or on a sphere about a camera that turned on the spot.
 
     Places (..., D) are in pixels of the median image: (x, y) on the plane, points in space of the sphere.
-
-    Attributes
-    ----------
-    cameras : sequence of Camera
-    homographies : ndarray of shape (N, 3, 3)
-        Normalized undistorted coordinates of each image to the plane, or to directions.
-    on_sphere : bool
-    scale : float
-        Pixels of the median image per unit of the plane, or radian, at the images' centres; NaN if none is there.
     """
 
     cameras: Sequence[Camera]
+    # (N, 3, 3): normalized undistorted coordinates of each image to the plane, or to directions
     homographies: FloatArray
     on_sphere: bool
+    # pixels of the median image per unit of the plane, or radian, at the images' centres; NaN if none is there
     scale: float
 
     @classmethod
@@ -81,21 +74,11 @@ class ImagesOnSurface:
 
 @dataclass(frozen=True, eq=False)
 class PlacedMatches:
-    """Matches of one pair of images, or of many, one pair after the other.
+    """Matches of one pair of images, or of many, one pair after the other."""
 
-    Attributes
-    ----------
-    images : ndarray of shape (M, 2)
-        The two images of each match.
-    points : ndarray of shape (M, 2, 2)
-        Measured pixels in either.
-    places : ndarray of shape (M, 2, D)
-        Where the alignment puts either.
-    """
-
-    images: NDArray[np.intp]
-    points: FloatArray
-    places: FloatArray
+    images: NDArray[np.intp]  # (M, 2): the two images of each match
+    points: FloatArray  # (M, 2, 2): measured pixels in either
+    places: FloatArray  # (M, 2, D): where the alignment puts either
 
     def __len__(self) -> int:
         return len(self.images)

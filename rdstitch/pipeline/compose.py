@@ -286,13 +286,14 @@ def write_page(
     outputs: Outputs, output: str | Path, composed: Composed, images: Callable[[], Sequence[ViewedImage]]
 ) -> list[Message]:
     """Write the page of a ``.dzi`` output; others have none. A warning, where it cannot be written."""
-    page = viewer_path(output)
-    if page is None or composed.written is None:
+    page, written = viewer_path(output), composed.written
+    if page is None or written is None:
         return []
+
     gsd = None if composed.place is None else composed.place.gsd
 
     def stage() -> None:
-        text = viewer_page(output, composed.canvas.size, images(), gsd)
+        text = viewer_page(output, composed.canvas.size, images(), written.seams, written.origin, gsd)
         # Names of files need not be UTF-8.
         outputs.write(page, text.encode("utf-8", "backslashreplace"))
 

@@ -11,7 +11,7 @@ from rdstitch.report.geometry import residuals
 from rdstitch.report.svg import BLUE, RED, Markup, counted, drawing, element, label, line, path, section
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 720.0, 280.0, 60.0, 40.0, 24.0
-_RIGHT, _BASE = _WIDTH - 20.0, _HEIGHT - _BOTTOM
+_RIGHT, _BASE = _WIDTH - 36.0, _HEIGHT - _BOTTOM
 _SAMPLES = 200
 _CELLS = (16, 12)  # of the image, to say how much of it has matches
 _BAND = 2.0  # standard deviations on either side

@@ -64,15 +64,9 @@ def five_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
 
 @dataclass(frozen=True)
 class DirectionEquation(SampleArrays):
-    """The equation of :func:`five_point`.
+    """The equation of :func:`five_point`."""
 
-    Attributes
-    ----------
-    linear : ndarray of shape (2, 3, 3, b)
-        Constant and slope of α_1..3, of β_1..3, and of γ_1..3 with their factors.
-    """
-
-    linear: FloatArray
+    linear: FloatArray  # (2, 3, 3, b): constant and slope of α_1..3, of β_1..3, and of γ_1..3 with their factors
 
     @classmethod
     def of(cls, quadrangles: Quadrangles) -> "DirectionEquation":

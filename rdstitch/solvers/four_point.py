@@ -71,18 +71,12 @@ class QuarticEquation(SampleArrays):
     terms of ``det S = det H - v'Sv``,
 
     ``3 t2² - 3 A⁴ + 4 A² t2 - 4 |v|² (t2 + |v|²) + A (36 det H - 32 v'Sv) = 0``.
-
-    Attributes
-    ----------
-    linear : ndarray of shape (2, 17, b)
-        Constants and slopes: α_0..3, β_0..3, then for i = 1..3 the first two coordinates of p_j × p_k and the third
-        of p̂_i.
-    fixed : ndarray of shape (9, b)
-        What does not depend on λ: the third of p_j × p_k, the first two of p̂_i.
     """
 
+    # (2, 17, b): constants and slopes: α_0..3, β_0..3, then for i = 1..3 the first two coordinates of p_j × p_k and the
+    # third of p̂_i
     linear: FloatArray
-    fixed: FloatArray
+    fixed: FloatArray  # (9, b): what does not depend on λ: the third of p_j × p_k, the first two of p̂_i
 
     @classmethod
     def of(cls, quadrangles: Quadrangles) -> "QuarticEquation":
@@ -132,13 +126,9 @@ class SexticEquation(SampleArrays):
 
     ``α_0 α_1 α_2 α_3 G³ = β_0 β_1 β_2 β_3 F³`` with ``F = Σ β_i α_j α_k det(p̂_i, p_j, p_k) = tr H`` and G the same
     with the images exchanged.
-
-    Attributes
-    ----------
-    linear : ndarray of shape (2, 2, 7, b)
-        Constants and slopes; for each image its α, and the determinants of F (image 1) or G; sample.
     """
 
+    # (2, 2, 7, b): constants and slopes; for each image its α, and the determinants of F (image 1) or G; sample
     linear: FloatArray
 
     @classmethod

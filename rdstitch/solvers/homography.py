@@ -25,20 +25,11 @@ _COLLINEAR = 1e-9
 
 @dataclass(frozen=True)
 class Quadrangles(SampleArrays):
-    """Samples of four or more points, of which the first four have a homography for every λ.
+    """Samples of four or more points, of which the first four have a homography for every λ."""
 
-    Attributes
-    ----------
-    points : ndarray of shape (2, 2, k, b)
-    opposite : Lines
-        ``p_j × p_k`` of the first three points.
-    triangles : ndarray of shape (2, 2, 4, b)
-        ``α_0..3`` and ``β_0..3``, constants and slopes.
-    """
-
-    points: FloatArray
-    opposite: Lines
-    triangles: FloatArray
+    points: FloatArray  # (2, 2, k, b)
+    opposite: Lines  # ``p_j × p_k`` of the first three points
+    triangles: FloatArray  # (2, 2, 4, b): ``α_0..3`` and ``β_0..3``, constants and slopes
 
     @classmethod
     def of(cls, points: FloatArray) -> "Quadrangles":

@@ -18,18 +18,10 @@ _RING = [1, 2, 0, 1]
 
 @dataclass(frozen=True)
 class Lines(SampleArrays):
-    """Lines in both images.
+    """Lines in both images."""
 
-    Attributes
-    ----------
-    constant : ndarray of shape (3, 2, L, b)
-        Coordinate, image, line, sample.
-    slope : ndarray of shape (2, 2, L, b)
-        Derivative by λ of the first two coordinates.
-    """
-
-    constant: FloatArray
-    slope: FloatArray
+    constant: FloatArray  # (3, 2, L, b): coordinate, image, line, sample
+    slope: FloatArray  # (2, 2, L, b): derivative by λ of the first two coordinates
 
     @classmethod
     def through(cls, first: FloatArray, second: FloatArray) -> "Lines":

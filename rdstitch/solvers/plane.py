@@ -28,15 +28,9 @@ _MIN_SEPARATION = 1e-9
 
 @dataclass(frozen=True)
 class TiltRotations(SampleArrays):
-    """Rotations of the two images' tilts.
+    """Rotations of the two images' tilts."""
 
-    Attributes
-    ----------
-    matrices : ndarray of shape (3, 3, 2, 1, 1), or (3, 3, 2, 1, b) when each sample has its own
-        Row, column, image, any point, sample.
-    """
-
-    matrices: FloatArray
+    matrices: FloatArray  # (3, 3, 2, 1, 1), or: row, column, image, any point, sample
 
     @classmethod
     def from_tilt(cls, tilt: ArrayLike, count: int) -> Self:

@@ -23,21 +23,12 @@ from rdstitch.solvers.solutions import Solutions
 
 @dataclass(frozen=True)
 class RayPairs(SampleArrays):
-    """Pairs of rays, P of them in each sample.
+    """Pairs of rays, P of them in each sample."""
 
-    Attributes
-    ----------
-    dot, cross : ndarray of shape (2, P, b)
-        ``x_1 · x_2`` and ``(x_1 × x_2)²``; image, pair, sample.
-    depth : ndarray of shape (2, 2, P, b)
-        ``|x|²`` of the first and the second point: the slopes of their ``z``.
-    across : ndarray of shape (2, 2, 2, P, b)
-        Constants and slopes in λ of ``z_2 x_1 - z_1 x_2``; constant or slope, coordinate.
-    """
-
-    dot: FloatArray
+    dot: FloatArray  # dot, cross: (2, P, b): ``x_1 · x_2`` and ``(x_1 × x_2)²``; image, pair, sample
     cross: FloatArray
-    depth: FloatArray
+    depth: FloatArray  # (2, 2, P, b): ``|x|²`` of the first and the second point: the slopes of their ``z``
+    # (2, 2, 2, P, b): constants and slopes in λ of ``z_2 x_1 - z_1 x_2``; constant or slope, coordinate
     across: FloatArray
 
     @classmethod

@@ -118,22 +118,12 @@ def polish(equation: Equation, start: FloatArray, slope: FloatArray, half: Float
 
 @dataclass(frozen=True)
 class Brackets:
-    """Intervals in [-1, 1] that hold one root each, by polynomial.
+    """Intervals in [-1, 1] that hold one root each, by polynomial."""
 
-    Attributes
-    ----------
-    sample : ndarray of shape (M,), intp
-        Polynomial of each root, ascending.
-    left, right : ndarray of shape (M,)
-        Ends; equal for a double root, which has no sign change.
-    value_left, value_right : ndarray of shape (M,)
-        Values of the polynomial there, of opposite signs.
-    """
-
-    sample: IndexArray
-    left: FloatArray
+    sample: IndexArray  # (M,), intp: polynomial of each root, ascending
+    left: FloatArray  # left, right: (M,): ends; equal for a double root, which has no sign change
     right: FloatArray
-    value_left: FloatArray
+    value_left: FloatArray  # value_left, value_right: (M,): values of the polynomial there, of opposite signs
     value_right: FloatArray
 
     @classmethod

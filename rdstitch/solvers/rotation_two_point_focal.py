@@ -67,14 +67,9 @@ def rotation_two_point_focal(
 
 @dataclass(frozen=True)
 class _AngleEquation(SampleArrays):
-    """The equation of :func:`rotation_two_point_focal`, homogeneous in (1 - t, t).
+    """The equation of :func:`rotation_two_point_focal`, homogeneous in (1 - t, t)."""
 
-    Attributes
-    ----------
-    product, length, dot, cross : ndarray of shape (2, 1, b)
-        As in :class:`rdstitch.solvers.rays.RayPairs`; image, pair, sample.
-    """
-
+    # product, length, dot, cross: (2, 1, b): as in :class:`rdstitch.solvers.rays.RayPairs`; image, pair, sample
     product: FloatArray
     length: FloatArray
     dot: FloatArray

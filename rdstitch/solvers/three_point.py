@@ -114,15 +114,10 @@ def _in_front(points: FloatArray, state: FloatArray) -> BoolArray:
 
 @dataclass(frozen=True)
 class DistanceSystem(SampleArrays):
-    """The three equations of :func:`three_point`.
+    """The three equations of :func:`three_point`."""
 
-    Attributes
-    ----------
-    rows : ndarray of shape (8, 2, 3, b)
-        x, y, r² of each point, then constants of the three coordinates of the line opposite to it, and slopes of the
-        first two; image, point, sample.
-    """
-
+    # (8, 2, 3, b): x, y, r² of each point, then constants of the three coordinates of the line opposite to it, and
+    # slopes of the first two; image, point, sample
     rows: RealArray
 
     @classmethod

@@ -73,14 +73,9 @@ def three_point_similarity(
 
 @dataclass(frozen=True)
 class DistanceRatioEquation(SampleArrays):
-    """The equation of :func:`three_point_similarity`.
+    """The equation of :func:`three_point_similarity`."""
 
-    Attributes
-    ----------
-    linear : ndarray of shape (2, 6, 2, b)
-        Constants and slopes; the x of m_13 and m_12, their y, then w_2 and w_3; image, sample.
-    """
-
+    # (2, 6, 2, b): constants and slopes; the x of m_13 and m_12, their y, then w_2 and w_3; image, sample
     linear: FloatArray
 
     @classmethod

@@ -66,15 +66,9 @@ def two_point(
 
 @dataclass(frozen=True)
 class DistanceEquation(SampleArrays):
-    """``|m|² (ŵ_1 ŵ_2)² - |m̂|² (w_1 w_2)² = 0``.
+    """``|m|² (ŵ_1 ŵ_2)² - |m̂|² (w_1 w_2)² = 0``."""
 
-    Attributes
-    ----------
-    linear : ndarray of shape (2, 4, 2, b)
-        Constants and slopes; m_x, m_y, w_1, w_2; image, sample.
-    """
-
-    linear: FloatArray
+    linear: FloatArray  # (2, 4, 2, b): constants and slopes; m_x, m_y, w_1, w_2; image, sample
 
     @classmethod
     def of(cls, difference: FloatArray, depth: FloatArray) -> "DistanceEquation":

@@ -87,14 +87,8 @@ def best_place(
 ) -> FloatArray:
     """Choose the place with the best normalized cross-correlation of what two tiles (h, w) have in common there.
 
-    The first of the places stands unless another is better by more than chance.
-
-    Parameters
-    ----------
-    shifts : ndarray of shape (K, 2)
-        What each block of the overlap is displaced by besides, pixels.
-    places : sequence of ndarray of shape (2,)
-        Of the second tile in the first, pixels.
+    Places (2,) are those of the second tile in the first, pixels, and each block of the overlap is displaced by its
+    shift (K, 2) besides. The first of the places stands unless another is better by more than chance.
     """
     if len(places) == 1:
         return places[0]

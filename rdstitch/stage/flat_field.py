@@ -39,7 +39,7 @@ _BINS, _LEAST_BINS, _LEAST_IN_BIN = 24, 6, 16
 class Illumination:
     """The flat field that tiles show, or why they do not."""
 
-    field: FlatField | None  # none where the tiles do not show it better than by half of what it is
+    field: FlatField | None  # None where the tiles do not show it better than by half of what it is
     error: float  # its root mean square error, by how far two halves of the tiles differ
     shading: float  # largest share of the light that is missing
     dark: FloatArray  # (C,)

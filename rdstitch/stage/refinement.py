@@ -47,18 +47,7 @@ class BlockMatches:
 def refine(
     first: NDArray[Any], second: NDArray[Any], blocks: IntArray, transfer: Transfer, tolerance: float
 ) -> BlockMatches:
-    """Refine where blocks of the first tile are in the second.
-
-    Parameters
-    ----------
-    first, second : ndarray of shape (h, w)
-    blocks : ndarray of shape (K, 4)
-        Boxes in the first tile.
-    transfer : callable
-        Gives the places in the second tile, about, of points (N, 2) of the first; its lens is in it.
-    tolerance : float
-        By how much that may be wrong, pixels.
-    """
+    """Refine where blocks (K, 4) of the first tile (h, w) are in the second; ``tolerance`` pixels off at most."""
     matches = [match for block in blocks if (match := _refined(first, second, block, transfer, tolerance)) is not None]
     if not matches:
         return BlockMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2, 2)))

@@ -165,17 +165,10 @@ def focal_length(lens: Lens) -> float:
 
 
 def best_division_model(lens: Lens) -> tuple[Camera, float]:
-    """The one-parameter division model nearest to a lens, and how far it is from it.
+    """The one-parameter division model nearest to a lens, and how far it is from it, rms in pixels of the image.
 
     As :meth:`rdstitch.camera.Camera.one_parameter_fit` has it, of the division model with as many coefficients as
     describe the lens.
-
-    Returns
-    -------
-    camera : Camera
-        With the focal length of the lens, from which the scale of the fit may differ.
-    rms : float
-        Of the distances in the image, pixels.
     """
     exact, _ = fit_lens(lens.distort, Camera(lens.image_size, center=lens.center, focal=focal_length(lens)))
     distortion, rms, _ = exact.one_parameter_fit()

@@ -133,14 +133,7 @@ def pixels_of_texels(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> F
 
 
 def fit_to_plane(lens: Lens, poses: Poses, margin: int = 16) -> tuple[Poses, tuple[int, int]]:
-    """Move poses so that their images start ``margin`` texels inside the plane.
-
-    Returns
-    -------
-    poses : Poses
-    size : (int, int)
-        Width and height in texels of the plane that holds all images with the margin on every side.
-    """
+    """Move poses so that their images start ``margin`` texels inside the plane, and its width and height for them."""
     outlines = plane_outline(lens, poses.from_plane())
     if np.isnan(outlines).any():
         raise ArgumentError("an image sees beyond the horizon or beyond its lens; no plane can fill it")

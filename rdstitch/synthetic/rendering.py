@@ -130,13 +130,7 @@ class Sequence:
         return pixels_of_texels(self.lens, self.from_plane(index), points)
 
     def frame(self, index: int) -> NDArray[Any]:
-        """Render one image.
-
-        Returns
-        -------
-        ndarray of shape (h, w) or (h, w, 3)
-            uint8 or uint16; RGB. Black where the texture ends.
-        """
+        """Render one image, uint8 or uint16 (h, w) or RGB (h, w, 3), black where the texture ends."""
         width, height = self.lens.image_size
         settings = self.photometry
         rng = np.random.default_rng((self.seed, index))
@@ -185,10 +179,6 @@ class Sequence:
         ----------
         scale : float
             Size of the mask in units of the texture's size.
-
-        Returns
-        -------
-        ndarray of shape (h, w), bool
         """
         width, height = (max(1, round(n * scale)) for n in self.texture.size)
         mask = np.zeros((height, width), dtype=np.uint8)

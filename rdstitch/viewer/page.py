@@ -1,5 +1,7 @@
 """The page: OpenSeadragon's released file, our script, and the data, all in one HTML file beside the tiles."""
 
+import base64
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,12 +12,33 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+from PIL import Image
 
 from rdstitch.arrays import FloatArray
+from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.io.deepzoom import OVERLAP, TILE
 from rdstitch.outputs import tiles_folder
 
+_COLOUR = (0, 229, 255, 255)
 _CORNERS = 64  # of an outline, at most
+
+
+def seam_image(
+    seams: SeamMap, origin: tuple[int, int], size: tuple[int, int]
+) -> tuple[bytes, tuple[float, float, float, float]]:
+    """Seams as PNG, and the box (x, y, width, height) that it fills, pixels of the mosaic from its corner."""
+    factor = seams.factor
+    left, top = origin[0] // factor, origin[1] // factor
+    right, bottom = -(-(origin[0] + size[0]) // factor), -(-(origin[1] + size[1]) // factor)
+    labels = seams.labels[top:bottom, left:right]
+    samples = np.zeros((*labels.shape, 4), dtype=np.uint8)
+    # Where an image ends at nothing there is no seam.
+    samples[:, :-1][(labels[:, :-1] != labels[:, 1:]) & (np.minimum(labels[:, :-1], labels[:, 1:]) >= 0)] = _COLOUR
+    samples[:-1][(labels[:-1] != labels[1:]) & (np.minimum(labels[:-1], labels[1:]) >= 0)] = _COLOUR
+    x, y = float(left * factor - origin[0]), float(top * factor - origin[1])
+    stream = io.BytesIO()
+    Image.fromarray(samples).save(stream, "PNG", optimize=True)
+    return stream.getvalue(), (x, y, float(labels.shape[1] * factor), float(labels.shape[0] * factor))
 
 
 @dataclass(frozen=True)
@@ -35,9 +58,14 @@ def viewer_path(output: str | Path) -> Path | None:
 
 
 def viewer_page(
-    output: str | Path, size: tuple[int, int], images: Sequence[ViewedImage], gsd: float | None = None
+    output: str | Path,
+    size: tuple[int, int],
+    images: Sequence[ViewedImage],
+    seams: SeamMap | None = None,
+    origin: tuple[int, int] = (0, 0),
+    gsd: float | None = None,
 ) -> str:
-    """The page of a ``.dzi`` file, as HTML; its scale bar is in pixels without ``gsd``, metres that a pixel takes."""
+    """The page of a ``.dzi`` file, as HTML."""
     output = Path(output)
     data: dict[str, Any] = {
         "size": size,
@@ -55,11 +83,17 @@ def viewer_page(
         },
         "images": [_described(image) for image in images],
     }
+    if seams is not None:
+        shown, box = seam_image(seams, origin, size)
+        data["seams"] = "data:image/png;base64," + base64.b64encode(shown).decode("ascii")
+        data["seamsBox"] = box
     title = escape(output.name)
     # Inside a script, "</" would end it.
     text = json.dumps(data, ensure_ascii=True).replace("</", "<\\/")
     boxes = "".join(
-        f'<label><input type="checkbox" id="show-{name}" checked> {name}</label>' for name in ("outlines", "names")
+        f'<label><input type="checkbox" id="show-{name}"{checked}> {name}</label>'
+        for name, checked in (("outlines", " checked"), ("names", " checked"), ("seams", ""))
+        if name != "seams" or seams is not None
     )
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'

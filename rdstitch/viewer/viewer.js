@@ -14,6 +14,9 @@ const make = (name, parent, attributes) => {
 };
 const svg = make("svg", document.body, {});
 const drawing = make("g", svg, {});
+const seams = make("g", drawing, {});
+if (data.seams) make("image", seams, { href: data.seams, x: data.seamsBox[0], y: data.seamsBox[1],
+  width: data.seamsBox[2], height: data.seamsBox[3], preserveAspectRatio: "none" });
 make("rect", make("clipPath", drawing, { id: "mosaic" }), { width, height });
 const outlines = make("g", drawing, { "clip-path": "url(#mosaic)" });
 const names = document.getElementById("names");
@@ -93,6 +96,7 @@ const toggle = (id, node) => {
 };
 toggle("show-outlines", outlines);
 toggle("show-names", names);
+if (data.seams) toggle("show-seams", seams);
 document.getElementById("in").onclick = () => viewer.viewport.zoomBy(1.5);
 document.getElementById("out").onclick = () => viewer.viewport.zoomBy(1 / 1.5);
 document.getElementById("home").onclick = () => { viewer.viewport.setRotation(0); viewer.viewport.goHome(); };

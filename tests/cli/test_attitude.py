@@ -101,7 +101,7 @@ def test_images_without_attitude_are_named(rdstitch: Run, windy: Sequence, frame
     none = rdstitch(*arguments, *windy.write(tmp_path), status=3)
     assert f" {frames[0].name}: no attitude" in some.line
     assert paths[0].name not in some.line
-    assert "frame_0002.png and 3 more: no attitude" in none.line
+    assert "frame_0002.png, …: no attitude" in none.line
     assert not (tmp_path / "camera.json").exists()
 
 

@@ -1,5 +1,6 @@
 """The page beside a Deep Zoom image, and what the project's wheel weighs with it."""
 
+import io
 import json
 import re
 import shutil
@@ -10,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.io import read_image
+from rdstitch.viewer.page import seam_image
 from tests.cli.running import CACHED, Run
 
 _ROOT = Path(__file__).parents[2]
@@ -44,6 +47,7 @@ def test_the_page_knows_the_images_and_needs_no_network(
     assert (corners.max(axis=0) <= np.array(data["size"]) + 1).all()
     assert dict(data["images"][1]["facts"])["size"] == "400 x 300 pixels"
     assert frames[0].name in dict(data["images"][1]["facts"])["pairs"]
+    assert data["seams"].startswith("data:image/png;base64,")
     assert (tmp_path / data["tiles"]["Image"]["Url"] / "0" / "0_0.jpg").is_file()
     assert not re.search(r'(?:src|href)="https?:', text)
     assert "Redistribution and use in source and binary forms" in text
@@ -89,6 +93,23 @@ def test_the_scale_bar_has_a_round_length_that_fits(unit: float, length: float) 
     code = f"{found[0]} console.log(barLength({unit}, 150));"
     done = subprocess.run([node, "-e", code], capture_output=True, text=True, check=True)
     assert float(done.stdout) == pytest.approx(length)
+
+
+def test_seams_are_where_labels_change() -> None:
+    labels = np.full((4, 6), -1, dtype=np.int32)
+    labels[:3, :3], labels[:3, 3:5] = 0, 1
+    data, box = seam_image(SeamMap(labels, 2), (2, 0), (10, 8))
+    shown = read_shown(data)
+    assert box == (0.0, 0.0, 10.0, 8.0)
+    assert shown.shape == (4, 5)
+    assert np.argwhere(shown).tolist() == [[0, 1], [1, 1], [2, 1]]  # not where an image ends at nothing
+
+
+def read_shown(data: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Which pixels are opaque."""
+    from PIL import Image
+
+    return np.asarray(np.asarray(Image.open(io.BytesIO(data)))[..., 3] > 0)
 
 
 def test_other_formats_have_no_page(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

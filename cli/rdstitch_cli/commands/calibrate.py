@@ -49,13 +49,14 @@ def calibrate(
     from rdstitch.alignment.lens_description import describe_camera
     from rdstitch.camera_files import export_note
     from rdstitch.pipeline.recipes import calibrate as recipe
+    from rdstitch.sidecar.write import plain
 
     wanted = stitch_options(reporter, save_camera=output, **given)
     paths = options.resolve(inputs)
     report_page = Report(report, reporter, paths, given["overwrite"])
     with report_page.explaining():
         registration = recipe(paths, wanted, every=every, progress=report_page.progress, beside=report_page.stage)
-    report_registration(registration, reporter, as_json=as_json)
+    report_registration(registration, reporter, (lambda: plain(registration.camera.as_dict())) if as_json else None)
     for line in (
         *describe_camera(registration.alignment, registration.camera),
         *export_note(registration.camera, output),

@@ -6,19 +6,37 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
-from rdstitch.errors import InputError
 from rdstitch.io import read_image
 
 COLOURS = np.array([(200, 60, 60), (60, 200, 60), (40, 60, 200), (128, 128, 128), (250, 240, 200), (20, 25, 30)])
 PATCHES = np.repeat(np.repeat(COLOURS[None], 16, axis=0), 8, axis=1).astype(np.uint8)
 
 
-def test_cielab_is_refused(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "lab.tif", PATCHES, photometric="cielab")
-    with pytest.raises(InputError, match=r"lab\.tif: has the colours of CIELAB.*convert it to RGB"):
-        read_image(tmp_path / "lab.tif")
+def lab() -> NDArray[np.uint8]:
+    """The patches in CIELAB as TIFF stores it, a* and b* with a sign."""
+    profiles = ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB")
+    image = ImageCms.profileToProfile(Image.fromarray(PATCHES), *profiles, outputMode="LAB")
+    assert image is not None
+    return np.asarray(image)
+
+
+@pytest.mark.parametrize("kind", ["cielab", "icclab"])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_cielab(tmp_path: Path, kind: str, bits: int) -> None:
+    samples = lab().astype(np.uint16)
+    if kind == "icclab":
+        samples[..., 1:] ^= 128
+    if bits == 16:
+        samples *= 256
+        samples[..., 0] = samples[..., 0] // 256 * (257 if kind == "cielab" else 256)
+    tifffile.imwrite(tmp_path / "lab.tif", samples.astype(f"u{bits // 8}"), photometric=kind)
+    found = read_image(tmp_path / "lab.tif")
+    assert found.pixels.dtype == f"u{bits // 8}"
+    assert np.abs(found.pixels / (257.0 if bits == 16 else 1.0) - PATCHES).max() <= 2.0
+    assert found.metadata.icc_profile == b""
 
 
 def ink_profile() -> bytes:

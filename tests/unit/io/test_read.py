@@ -94,7 +94,7 @@ def test_alpha_is_apart(tmp_path: Path, colours: Samples) -> None:
     np.testing.assert_array_equal(image.alpha, alpha)
 
 
-@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "CMYK", "YCbCr", "I", "F", "I;16"])
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "CMYK", "YCbCr", "LAB", "I", "F", "I;16"])
 def test_every_mode_becomes_grey_or_rgb(tmp_path: Path, colours: Samples, mode: str) -> None:
     image = Image.fromarray(colours).convert("L" if mode in ("I;16", "F") else "RGB").convert(mode)
     image.save(tmp_path / "a.tif")
