@@ -42,16 +42,7 @@ _SIGNED_ORDERS = tuple(
 def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[AlignmentOptions, Message] | None:
     """Options without what the images contradict, or with the scatter that they show; and what the user should know.
 
-    Parameters
-    ----------
-    problem : Problem
-        With the given attitudes and tilt among its priors.
-    options : AlignmentOptions
-
-    Returns
-    -------
-    (AlignmentOptions, Message) or None
-        None where nothing is given, or the images agree with it as well as it is said to be known, or show no tilts.
+    None where nothing is given, or the images agree with it as well as it is said to be known, or show no tilts.
     """
     if options.attitudes is None and options.tilt is None:
         return None

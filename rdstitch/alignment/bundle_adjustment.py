@@ -63,13 +63,7 @@ class Parameters:
 
 @dataclass(frozen=True)
 class FreeParameters:
-    """Which parameters are estimated.
-
-    Attributes
-    ----------
-    poses : ndarray of shape (N, D), bool
-    lens : ndarray of shape (5,), bool
-    """
+    """Which parameters are estimated, of the poses (N, D) and of the lens (5,)."""
 
     poses: BoolArray
     lens: BoolArray

@@ -60,19 +60,8 @@ def independent_pairs(
     iterations: int = MAX_ITERATIONS,
 ) -> tuple[BundleAdjuster, Parameters]:
     """Return the adjustment of every link on its own, with the shared parameters in common, and where it starts.
-
-    Parameters
-    ----------
-    homographies : ndarray of shape (L, 3, 3)
-        Of the links, at ``lens``.
-    shared, lens
-        Where to start.
-    priors : Priors
-        On the shared parameters and the lens; those on the poses are not used.
-    attitudes : ndarray of shape (N, 2)
-        How the tilt of each image is known to differ from the shared one, radians.
-    iterations : int
-        Linearizations at most.
+    Of the links' homographies (L, 3, 3) at this lens, and of tilts that differ from the shared one by attitudes (N, 2),
+    radians. Priors on the poses are not used.
     """
     apart = observations.as_independent_pairs()
     count = 2 * len(apart)

@@ -116,16 +116,9 @@ def free_parameters(name: str) -> BoolArray:
 def choose_lens(
     observations: Observations, apart: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
 ) -> LensChoice:
-    """Choose a lens.
+    """Choose among lenses, keys of :data:`LENSES` from the simplest; none where the lens is given.
 
-    Parameters
-    ----------
-    observations : Observations
-    apart : BundleAdjustmentResult
-        Every link on its own with a homography, and λ free unless ``names`` is empty.
-    names : sequence of str
-        The lenses to choose among, keys of :data:`LENSES` from the simplest; none where the lens is given.
-    known : CameraPriors
+    ``apart`` is every link on its own with a homography, and λ free unless the lens is given.
     """
     if not names:
         return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")

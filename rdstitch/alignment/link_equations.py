@@ -80,19 +80,9 @@ def folds(lens: FloatArray, reach: float = 1.0) -> bool:
 def link_equations(
     observations: Observations, homographies: FloatArray, lens: FloatArray, width: float, free_lens: BoolArray
 ) -> LinkEquations:
-    """Linearize all transfer errors.
+    """Linearize all transfer errors, by the homographies (L, 3, 3) of the links and the free parameters of the lens.
 
-    Parameters
-    ----------
-    observations : Observations
-    homographies : ndarray of shape (L, 3, 3)
-        Of each link, from its first to its second image.
-    lens : ndarray of shape (5,)
-        λ, μ, ν and the shift of the distortion centre, in the half-diagonal frame.
-    width : float
-        Of :func:`robust_weight`, pixels.
-    free_lens : ndarray of shape (5,), bool
-        Parameters of the lens to differentiate by.
+    The weights are those of :func:`robust_weight`, with this width in pixels.
     """
     count, total = len(observations.points1), 10 + int(free_lens.sum())
     sums = np.zeros((len(observations), total, total))
@@ -181,17 +171,7 @@ def _chunks(start: NDArray[np.intp]) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class _Transferred:
-    """Correspondences of some links.
-
-    Attributes
-    ----------
-    derivatives : TransferJacobian
-    whitening : ndarray of shape (m, 2, 2)
-    error : ndarray of shape (2, m)
-        Half diagonals.
-    whitened : ndarray of shape (2, m)
-        Pixels.
-    """
+    """Correspondences of some links: whitenings (m, 2, 2), errors (2, m) in half diagonals, and whitened in pixels."""
 
     derivatives: TransferJacobian
     whitening: FloatArray

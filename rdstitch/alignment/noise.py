@@ -141,15 +141,9 @@ def _overdispersion(link: IntArray, points: FloatArray, residual: FloatArray, co
 
 
 def judge_relief(found: Coherence, model: str, links: int) -> ReliefTest:
-    """What the agreement of neighbours means for the scene.
+    """What the agreement of neighbours that a model leaves means for the scene.
 
-    Parameters
-    ----------
-    found : Coherence
-    model : str
-        Name of the model that left the residuals.
-    links : int
-        Pairs of images; what is as wide as the overlap of one pair alone, its homography and λ absorb.
+    What is as wide as the overlap of one pair alone, its homography and λ absorb.
     """
     agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} pixels in common)"
     relief = found.correlation > COHERENT_CORRELATION and found.relative_size > LARGE_RELIEF

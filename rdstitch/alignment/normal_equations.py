@@ -199,18 +199,7 @@ def chain(
 ) -> SparseNormalEquations:
     """Chain the equations of the links with the derivatives of the model, whose shared parameters the lens follows.
 
-    Parameters
-    ----------
-    equations : LinkEquations
-    observations : Observations
-    model : ModelMatrices
-        Of all N images.
-    homographies : ndarray of shape (L, 3, 3)
-        ``P_j P_i⁻¹`` of each link.
-    blocks : PoseBlocks
-        Of the pose parameters that may move.
-    weight : float
-        Of all equations: one over the variance of the errors.
+    The homographies are those of the links (L, 3, 3), the weight is one over the variance of the errors.
     """
     derivative = link_derivatives(observations, model, homographies, equations.gram.shape[1] - 9)
     size = model.by_pose.shape[1]

@@ -47,17 +47,7 @@ _POSSIBLE, _PARALLAX = 4.0, 0.005
 
 @dataclass(frozen=True)
 class ModelChoice:
-    """The model chosen.
-
-    Attributes
-    ----------
-    fit : Fit
-    reason : str
-    overdispersion : float
-        Of the errors that it leaves, see :class:`rdstitch.alignment.noise.Coherence`.
-    over_relief : bool
-        Whether it was chosen with heights of the ground that account for errors along the parallax.
-    """
+    """The model chosen, why, and whether with heights of the ground that account for errors along the parallax."""
 
     fit: Fit
     reason: str

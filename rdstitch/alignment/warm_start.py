@@ -15,16 +15,7 @@ from rdstitch.camera import Camera
 
 @dataclass(frozen=True)
 class WarmStart:
-    """The solution of an earlier alignment over a plane.
-
-    Attributes
-    ----------
-    model : PlanarModel
-    parameters : Parameters
-        Of the images that are to be aligned; heights relative to their median.
-    tilt_spread : float
-        Standard deviation of the tilts, radians; 0 where the model has none.
-    """
+    """The solution of an earlier alignment over a plane; heights are relative to their median."""
 
     model: PlanarModel
     parameters: Parameters
