@@ -15,7 +15,7 @@ from rdstitch.alignment.bundle_adjustment import (
     Parameters,
     sigma_of,
 )
-from rdstitch.alignment.initialization import independent_pairs
+from rdstitch.alignment.initialization import independent_pairs, nearest_pairs
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import (
@@ -25,6 +25,7 @@ from rdstitch.alignment.motion_models import (
     THETA,
     MotionModel,
     PlanarModel,
+    inverses,
 )
 from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.observations import Observations
@@ -224,13 +225,13 @@ class Problem:
     def _chained(self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None) -> Parameters:
         """Every link on its own, chained along the tree of the links trusted most."""
         o, attitudes = self.observations, self.camera_priors.attitudes
-        shared, lens, homographies = np.zeros(0), self.lens, self.homographies
+        shared, homographies = np.zeros(0), self.homographies
         if model.one_camera:
-            shared, lens, homographies = self._links_apart(SIMILARITY if model.free_tilts else model, others, start)
+            shared, homographies = self._links_apart(SIMILARITY if model.free_tilts else model, others, start)
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
         origin = model.origins(shared, attitudes[[tree.root]])[0]
         chained = tree.chained(homographies, o.image1, origin)
-        return Parameters(model.nearest_poses(chained, shared, attitudes), shared, lens)
+        return Parameters(model.nearest_poses(chained, shared, attitudes), shared, self.lens)
 
     def _upgraded(self, model: MotionModel) -> Parameters:
         """Chained homographies with the metric of the plane that makes them images of one camera."""
@@ -242,33 +243,21 @@ class Problem:
         return Parameters(upgraded.poses, shared, self.lens)
 
     def _links_apart(
-        self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Shared parameters, lens and homographies (L, 3, 3) of every link on its own under one camera.
+        self, model: MotionModel, others: Sequence[Fit], shared: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Shared parameters, and with these the homographies (L, 3, 3) under one camera that are nearest to the links.
 
-        From given shared parameters, those of another planar model, or the best of several.
+        The parameters are those given, those of another planar model, or the best of several.
         """
-        known = self.camera_priors
         planar = [other for other in others if other.model.one_camera]
-        if start is None and planar:
-            start = planar[-1].adjusted.parameters.shared
-        elif start is None:
+        if shared is None and planar:
+            shared = planar[-1].adjusted.parameters.shared
+        elif shared is None:
             adjuster, at = self._best_trial(model)
-            start = (at if len(self.observations) == 1 else adjuster.run(at).parameters).shared
-        if len(self.observations) == 1:  # which on its own is the whole
-            return start, self.lens, self.homographies
-        adjuster, at = independent_pairs(
-            model,
-            self.observations,
-            self.homographies,
-            start,
-            self.lens,
-            self.free_lens,
-            known.priors(model, self.count, _TILT_SPREAD_START),
-            known.attitudes,
-        )
-        apart = adjuster.run(at)
-        return apart.parameters.shared, apart.parameters.lens, apart.homographies
+            shared = (at if len(self.observations) == 1 else adjuster.run(at).parameters).shared
+        poses = nearest_pairs(model, self.observations, self.homographies, shared, self.camera_priors.attitudes)
+        matrices = model.matrices(poses, shared).matrices
+        return shared, matrices[1::2] @ inverses(matrices[0::2])
 
     def trial(self, model: MotionModel) -> BundleAdjustmentResult:
         """A few links on their own under one camera."""

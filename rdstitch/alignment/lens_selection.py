@@ -17,7 +17,7 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem, homography_apart
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.link_equations import whitened_errors
-from rdstitch.alignment.noise import Coherence, NoiseModel, coherence
+from rdstitch.alignment.noise import Coherence, NoiseModel, coherence, noise_of_links
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
@@ -140,8 +140,8 @@ def choose_lens(
         if name == "division3" and names[best] != "division2":
             break  # the next term of a series that is not needed
         fits.append(fit(free[index], fits[-1]))
-        errors = whitened_errors(observations, fits[-1].homographies, fits[-1].parameters.lens)
-        judge = _Judge(NoiseModel.of_independent_links(observations, errors), _parts(observations))
+        noise = noise_of_links(observations, fits[-1].homographies, fits[-1].parameters.lens)
+        judge = _Judge(noise, _parts(observations))
         added = int(free[index].sum() - free[best].sum())
         gains = judge.prefers(fits[index], fits[best], added, names[best])
         if gains and has_plausible_center(fits[index], observations):

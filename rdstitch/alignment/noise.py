@@ -182,20 +182,12 @@ class NoiseModel:
         Correspondences of links that fit.
     effective : float
         Independent observations.
-    common : float
-        Root mean square of what the errors of neighbours have in common, in diagonals of an image.
     """
 
     noise: float
     overdispersion: float
     counted: BoolArray
     effective: float
-    common: float
-
-    @classmethod
-    def of_independent_links(cls, observations: Observations, errors: FloatArray) -> "NoiseModel":
-        """From the whitened errors (M, 2) of links that were each fitted on their own, with a homography."""
-        return cls.of_errors(observations, errors, max(1.0 - 4.0 * len(observations) / max(len(errors), 1), 0.1))
 
     @classmethod
     def of_errors(cls, observations: Observations, errors: FloatArray, freedom: float = 1.0) -> "NoiseModel":
@@ -203,11 +195,10 @@ class NoiseModel:
         squared = squared_lengths(errors)
         sigma = sigma_of(squared[observations.scale_inliers_mask])
         inliers = squared <= (ALIGNMENT_WIDTH * sigma) ** 2
-        agreement = coherence(observations, errors, inliers)
+        overdispersion = shared_variance(observations, errors, inliers)
         counted = ~misfitting_links(squared, observations)[observations.link]
-        effective = max(2.0 * float((counted & inliers).sum()) / agreement.overdispersion, 2.0)
-        noise = math.hypot(sigma / math.sqrt(freedom), EXACTNESS)
-        return cls(noise, agreement.overdispersion, counted, effective, agreement.relative_size)
+        effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
+        return cls(math.hypot(sigma / math.sqrt(freedom), EXACTNESS), overdispersion, counted, effective)
 
     @property
     def price(self) -> float:
@@ -223,4 +214,5 @@ class NoiseModel:
 
 def noise_of_links(observations: Observations, homographies: FloatArray, lens: FloatArray) -> NoiseModel:
     """The noise that every link leaves on its own, with its homography (L, 3, 3)."""
-    return NoiseModel.of_independent_links(observations, whitened_errors(observations, homographies, lens))
+    errors = whitened_errors(observations, homographies, lens)
+    return NoiseModel.of_errors(observations, errors, max(1.0 - 4.0 * len(observations) / max(len(errors), 1), 0.1))
