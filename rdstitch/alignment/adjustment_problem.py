@@ -30,7 +30,6 @@ from rdstitch.alignment.motion_models import (
 from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors
-from rdstitch.alignment.warm_start import WarmStart
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
@@ -98,8 +97,6 @@ class Problem:
     camera_priors : CameraPriors
     overdispersion : float
         See :class:`BundleAdjuster`.
-    warm : WarmStart, optional
-        Where models over a plane start, instead of at chained links.
     """
 
     observations: Observations
@@ -111,7 +108,6 @@ class Problem:
     free_lens: BoolArray
     camera_priors: CameraPriors
     overdispersion: float = 1.0
-    warm: WarmStart | None = None
 
     def part(self, kept: BoolArray, images: IntArray | None = None) -> tuple["Problem", IntArray]:
         """The problem of some links (L,) between these images, or the largest group that they connect; and the images.
@@ -146,9 +142,6 @@ class Problem:
         if not others and not model.one_camera and self.count > _LONG_CHAIN:
             others = [self.fit(SIMILARITY)]
         starts = [self.taken_over(model, other) for other in others]
-        if self.warm is not None and isinstance(model, PlanarModel):
-            spread = self.warm.tilt_spread if model is self.warm.model else None
-            return self.refine(model, self._nearest(model, [self.warm.start_of(model), *starts]), spread)
         if model.any_tilt:
             starts.append(self._upgraded(model))
         elif not (others and model.free_tilts):
