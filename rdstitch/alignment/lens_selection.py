@@ -22,7 +22,6 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS
-from rdstitch.division_model import distort, undistort
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 LENSES: dict[str, tuple[str, ...]] = {
@@ -58,11 +57,6 @@ ENOUGH_IMAGES, _ENOUGH_IMAGES_OF_A_MOTION = 4, 3
 all of them. In fewer a tilt and a change of height stand for it, and pairs like those of ``examples.paper figure5`` are
 registered worse with it free."""
 
-WORTH_SAYING = 0.5
-"""Pixels that the corners of too few images may lie elsewhere, from which on that is said."""
-
-_RADII, _SCALE_STEPS, _SCALE_STEP = 64, 6, 1e-6
-
 _SUFFICIENT_LINKS = 8
 """Links from which on each is a part."""
 
@@ -88,8 +82,6 @@ class LensChoice:
     refinements : tuple of ndarray of shape (5,), bool
         What may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
         motion that is less regular. That μ is needed only pairs can say: it could stand for relief.
-    corner_shift : float
-        Pixels by which μ would move the corners, where too few images do not show whether it is needed.
     """
 
     name: str
@@ -97,7 +89,6 @@ class LensChoice:
     apart: BundleAdjustmentResult
     reason: str
     refinements: tuple[BoolArray, ...] = ()
-    corner_shift: float = 0.0
 
     def refined(self, free: BoolArray) -> Self:
         """With the parameters that were freed in the end."""
@@ -146,16 +137,11 @@ def choose_lens(
         gains = judge.prefers(fits[index], fits[best], added, names[best])
         if gains and has_plausible_center(fits[index], observations):
             best = index
-    reason, shift = _reason(names, fits, best), 0.0
+    reason = _reason(names, fits, best)
     if few:
         reason += "; too few images to find the distortion centre, which is taken to be the middle"
-        shift = _distance(fits[0], fits[1], float(np.median(observations.scale1))) if best == 0 else 0.0
-        if shift > WORTH_SAYING:
-            reason += (
-                f"; they do not show whether μ is needed, with which corners would lie {shift:.1f} pixels elsewhere"
-            )
     refinements = (CENTER,) if best == 0 and images >= _ENOUGH_IMAGES_OF_A_MOTION else ()
-    return LensChoice(names[best], free[best], fits[best], reason, refinements, shift)
+    return LensChoice(names[best], free[best], fits[best], reason, refinements)
 
 
 def _choose_by_some(
@@ -169,21 +155,6 @@ def _choose_by_some(
     if (choice.free != simplest).any():
         apart = homography_apart(observations, apart.homographies, start, choice.free, known)
     return replace(choice, apart=apart)
-
-
-def _distance(simple: BundleAdjustmentResult, rich: BundleAdjustmentResult, scale: float) -> float:
-    """Largest distance of the places at which two lenses measure the same rays, pixels, at the best common scale."""
-    radii = np.linspace(0.0, 1.0, _RADII + 1)[1:]
-    (distortion, *higher), other = rich.parameters.lens[:3].tolist(), float(simple.parameters.lens[0])
-    straight = undistort(np.column_stack([radii, np.zeros(_RADII)]), distortion, higher)
-    difference, factor = np.zeros(_RADII), 1.0
-    for _ in range(_SCALE_STEPS):
-        seen, more = (distort(k * straight, other)[:, 0] for k in (factor, factor * (1.0 + _SCALE_STEP)))
-        difference, slope = seen - radii, (more - seen) / _SCALE_STEP
-        known = np.isfinite(difference) & np.isfinite(slope)
-        # Radii count by the area that they stand for.
-        factor *= 1.0 - float((radii * slope * difference)[known].sum() / (radii * slope**2)[known].sum())
-    return float(np.nanmax(np.abs(difference))) * scale
 
 
 def _images(observations: Observations) -> int:
