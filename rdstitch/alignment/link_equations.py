@@ -21,9 +21,6 @@ from rdstitch.division_model import is_one_to_one
 from rdstitch.radial_homography import TransferJacobian, measurement_whitening, transfer_jacobian, whiten
 from rdstitch.robust.loss import robust_weight
 
-_CHUNK = 4096
-"""Correspondences linearized at a time: what stays in cache."""
-
 
 @dataclass(frozen=True)
 class LinkEquations:
@@ -87,7 +84,7 @@ def link_equations(
     count, total = len(observations.points1), 10 + int(free_lens.sum())
     sums = np.zeros((len(observations), total, total))
     squared, error, whitening = np.empty(count), np.empty((2, count)), np.empty((2, 2, count))
-    for first, last in _chunks(observations.start):
+    for first, last in observations.chunks:
         rows = slice(observations.start[first], observations.start[last])
         there = _transferred(observations, homographies, lens, first, last)
         squared[rows], error[:, rows] = squared_lengths(there.whitened.T), there.error
@@ -99,7 +96,7 @@ def link_equations(
 
 def whitened_errors(observations: Observations, homographies: FloatArray, lens: FloatArray) -> FloatArray:
     """Whitened transfer errors of all correspondences, pixels, shape (M, 2); NaN where there is none."""
-    chunks = _chunks(observations.start)
+    chunks = observations.chunks
     errors = [_transferred(observations, homographies, lens, *chunk).whitened for chunk in chunks]
     return np.concatenate([np.empty((2, 0)), *errors], axis=1).T
 
@@ -134,7 +131,7 @@ def linearized_errors(
     observations: Observations, homographies: FloatArray, lens: FloatArray, free_lens: BoolArray
 ) -> Iterator[LinearizedErrors]:
     """All links, some at a time: derivatives of all correspondences at once would be most of an alignment's memory."""
-    for first, last in _chunks(observations.start):
+    for first, last in observations.chunks:
         there = _transferred(observations, homographies, lens, first, last)
         found = there.derivatives
         by_homography = found.by_image[:, :, None] * found.lifted
@@ -161,12 +158,6 @@ def squared_lengths(errors: FloatArray) -> FloatArray:
     squared: FloatArray = errors[:, 0] ** 2 + errors[:, 1] ** 2
     squared[np.isnan(squared)] = np.inf
     return squared
-
-
-def _chunks(start: NDArray[np.intp]) -> list[tuple[int, int]]:
-    """Ranges of links with about :data:`_CHUNK` correspondences each."""
-    edges = np.unique(np.searchsorted(start, np.arange(0, start[-1] + _CHUNK, _CHUNK)).clip(max=len(start) - 1))
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,9 @@ from rdstitch.camera import Camera
 from rdstitch.matching.links import Link
 from rdstitch.matching.thinning import spread_choice
 
+_CHUNK = 4096
+"""Correspondences linearized at a time: what stays in cache."""
+
 _STATIC = 1.0
 """Pixels that the displacements of most correspondences of a link stay below where the camera stood still."""
 
@@ -91,6 +94,12 @@ class Observations:
         distance = np.linalg.norm(self.points2 - self.points1, axis=1) * self.scale1[self.link]
         moving = np.repeat(self.medians(distance) > _STATIC, np.diff(self.start))
         return moving if moving.any() else np.ones_like(moving)
+
+    @cached_property
+    def chunks(self) -> list[tuple[int, int]]:
+        """Ranges of links with about :data:`_CHUNK` correspondences each."""
+        edges = np.searchsorted(self.start, np.arange(0, self.start[-1] + _CHUNK, _CHUNK)).clip(max=len(self))
+        return list(itertools.pairwise(np.unique(edges).tolist()))
 
     @property
     def areas(self) -> FloatArray:
