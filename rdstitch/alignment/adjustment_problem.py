@@ -54,60 +54,29 @@ _MISFIT = 1.5
 
 @dataclass(frozen=True)
 class Fit:
-    """One model adjusted to a problem.
-
-    Attributes
-    ----------
-    model : MotionModel
-    adjusted : BundleAdjustmentResult
-    free_lens : ndarray of shape (5,), bool
-        Lens parameters that were estimated.
-    tilt_spread : float
-        Standard deviation of the images' own tilts, radians; 0 where the model has none.
-    overdispersion : float
-        Of the errors that it leaves, at least that of the problem; see :class:`BundleAdjuster`.
-    """
+    """One model adjusted to a problem."""
 
     model: MotionModel
     adjusted: BundleAdjustmentResult
-    free_lens: BoolArray
-    tilt_spread: float = 0.0
+    free_lens: BoolArray  # (5,): lens parameters that were estimated
+    tilt_spread: float = 0.0  # standard deviation of the images' own tilts, radians; 0 where the model has none
+    # of the errors that it leaves, at least that of the problem; see BundleAdjuster
     overdispersion: float = 1.0
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Connected images to be aligned.
+    """Connected images to be aligned."""
 
-    Attributes
-    ----------
-    observations : Observations
-        Links between the images 0 … N-1.
-    homographies : ndarray of shape (L, 3, 3)
-        Of the links, at the ``lens``.
-    trust : ndarray of shape (L,)
-        How much each link can be relied on to start with.
-    count : int
-        N.
-    reference : int
-        The image that fixes the gauge; -1 for none in particular, before :meth:`part`.
-    lens : ndarray of shape (4,)
-        Where to start.
-    free_lens : ndarray of shape (5,), bool
-    camera_priors : CameraPriors
-    overdispersion : float
-        See :class:`BundleAdjuster`.
-    """
-
-    observations: Observations
-    homographies: FloatArray
-    trust: FloatArray
-    count: int
-    reference: int
-    lens: FloatArray
-    free_lens: BoolArray
+    observations: Observations  # links between the images 0 … N-1
+    homographies: FloatArray  # (L, 3, 3): of the links, at the ``lens``
+    trust: FloatArray  # (L,): how much each link can be relied on to start with
+    count: int  # N
+    reference: int  # the image that fixes the gauge; -1 for none in particular, before part
+    lens: FloatArray  # (5,): where to start
+    free_lens: BoolArray  # (5,)
     camera_priors: CameraPriors
-    overdispersion: float = 1.0
+    overdispersion: float = 1.0  # see BundleAdjuster
 
     def part(self, kept: BoolArray, images: IntArray | None = None) -> tuple["Problem", IntArray]:
         """The problem of some links (L,) between these images, or the largest group that they connect; and the images.

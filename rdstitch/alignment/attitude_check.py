@@ -92,21 +92,11 @@ def _named(change: FloatArray) -> str:
 
 @dataclass(frozen=True)
 class _ShownTilts:
-    """What the images show of their tilts.
+    """What the images show of their tilts."""
 
-    Attributes
-    ----------
-    images : ndarray of shape (K,), intp
-        The images compared.
-    tilts : ndarray of shape (K, 2)
-        (ψ, θ), radians.
-    variances, axes : ndarray of shape (2 K,) and (2 K, 2 K)
-        Eigenvalues and eigenvectors of their covariance.
-    """
-
-    images: IntArray
-    tilts: FloatArray
-    variances: FloatArray
+    images: IntArray  # (K,): the images compared
+    tilts: FloatArray  # (K, 2): (ψ, θ), radians
+    variances: FloatArray  # variances, axes: (2 K,) and (2 K, 2 K): eigenvalues and eigenvectors of their covariance
     axes: FloatArray
 
     @classmethod

@@ -48,41 +48,19 @@ _CONFIDENT = 2.0
 
 @dataclass(frozen=True)
 class AdjustedImages:
-    """What the adjustment found, and what it was made from.
-
-    Attributes
-    ----------
-    cameras : sequence of Camera
-    links : sequence of Link
-    images : ndarray of shape (N,), intp
-        The images aligned, ascending; the problem numbers them 0 … N-1.
-    right : ndarray of shape (L,), bool
-        Links not taken for wrong.
-    problem : Problem
-        The final one.
-    choice : ModelChoice
-    lens : LensChoice
-        The lens, with the distortion centre if the motion model freed it.
-    observable : bool
-        Whether λ is observable, or known.
-    depth : bool
-        Whether that is because what few images show has depth.
-    options : AlignmentOptions
-    positions_disagree : str
-        Why the positions were not used; empty where they were, or where there are none.
-    """
+    """What the adjustment found, and what it was made from."""
 
     cameras: Sequence[Camera]
     links: Sequence[Link]
-    images: IntArray
-    right: BoolArray
-    problem: Problem
+    images: IntArray  # (N,): the images aligned, ascending; the problem numbers them 0 … N-1
+    right: BoolArray  # (L,): links not taken for wrong
+    problem: Problem  # the final one
     choice: ModelChoice
-    lens: LensChoice
-    observable: bool
-    depth: bool
+    lens: LensChoice  # the lens, with the distortion centre if the motion model freed it
+    observable: bool  # whether λ is observable, or known
+    depth: bool  # whether that is because what few images show has depth
     options: AlignmentOptions
-    positions_disagree: str
+    positions_disagree: str  # why the positions were not used; empty where they were, or where there are none
 
 
 def build_alignment(found: AdjustedImages) -> Alignment:

@@ -67,27 +67,14 @@ lenses takes memory and time for each of them."""
 
 @dataclass(frozen=True)
 class LensChoice:
-    """The lens chosen.
+    """The lens chosen."""
 
-    Attributes
-    ----------
-    name : str
-        A key of :data:`LENSES`.
-    free : ndarray of shape (5,), bool
-        Its parameters among :data:`rdstitch.camera.LENS_PARAMETERS`.
-    apart : BundleAdjustmentResult
-        Every link on its own with this lens.
-    reason : str
-        One sentence.
-    refinements : tuple of ndarray of shape (5,), bool
-        What may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
-        motion that is less regular. That μ is needed only pairs can say: it could stand for relief.
-    """
-
-    name: str
-    free: BoolArray
-    apart: BundleAdjustmentResult
-    reason: str
+    name: str  # a key of LENSES
+    free: BoolArray  # (5,): its parameters among LENS_PARAMETERS
+    apart: BundleAdjustmentResult  # every link on its own with this lens
+    reason: str  # one sentence
+    # what may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
+    # motion that is less regular. That μ is needed only pairs can say: it could stand for relief
     refinements: tuple[BoolArray, ...] = ()
 
     def refined(self, free: BoolArray) -> Self:
@@ -210,18 +197,10 @@ def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
 
 @dataclass(frozen=True)
 class _Judge:
-    """What the lenses are compared by.
+    """What the lenses are compared by."""
 
-    Attributes
-    ----------
-    noise : NoiseModel
-        Of the errors that the richer lens leaves.
-    part : ndarray of shape (M,), intp
-        The part of the observations that each correspondence falls into: its link, or a cell of it.
-    """
-
-    noise: NoiseModel
-    part: IntArray
+    noise: NoiseModel  # of the errors that the richer lens leaves
+    part: IntArray  # (M,): the part of the observations that each correspondence falls into: its link, or a cell of it
 
     def prefers(
         self, richer: BundleAdjustmentResult, simpler: BundleAdjustmentResult, added: int, simpler_name: str

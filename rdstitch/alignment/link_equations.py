@@ -24,27 +24,13 @@ from rdstitch.robust.loss import robust_weight
 
 @dataclass(frozen=True)
 class LinkEquations:
-    """Weighted, linearized transfer errors of all correspondences, summed per link.
+    """Weighted, linearized transfer errors of all correspondences, summed per link."""
 
-    Attributes
-    ----------
-    gram : ndarray of shape (L, 9 + K, 9 + K)
-        ``Σ w J'J`` by the entries of H and the K free parameters of the lens.
-    gradient : ndarray of shape (L, 9 + K)
-        ``Σ w J'r``.
-    squared : ndarray of shape (M,)
-        ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred.
-    whitening : ndarray of shape (M, 2, 2)
-        What makes r of an error in normalized coordinates.
-    error : ndarray of shape (M, 2)
-        That error; not finite where it cannot be transferred.
-    """
-
-    gram: FloatArray
-    gradient: FloatArray
-    squared: FloatArray
-    whitening: FloatArray
-    error: FloatArray
+    gram: FloatArray  # (L, 9 + K, 9 + K): ``Σ w J'J`` by the entries of H and the K free parameters of the lens
+    gradient: FloatArray  # (L, 9 + K): ``Σ w J'r``
+    squared: FloatArray  # (M,): ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred
+    whitening: FloatArray  # (M, 2, 2): what makes r of an error in normalized coordinates
+    error: FloatArray  # (M, 2): that error; not finite where it cannot be transferred
 
     @property
     def errors(self) -> FloatArray:
@@ -103,26 +89,14 @@ def whitened_errors(observations: Observations, homographies: FloatArray, lens: 
 
 @dataclass(frozen=True)
 class LinearizedErrors:
-    """Whitened transfer errors of some links with their derivatives, all in pixels; 0 where there is no transfer.
+    """Whitened transfer errors of some links with their derivatives, all in pixels; 0 where there is no transfer."""
 
-    Attributes
-    ----------
-    first, last : int
-        The links ``first`` to ``last - 1``, whose correspondences are ``rows``.
-    rows : slice
-    errors : ndarray of shape (m, 2)
-    jacobian : ndarray of shape (m, 2, 9 + K)
-        By the entries of H and the K free parameters of the lens.
-    by_point1, by_point2 : ndarray of shape (m, 2, 2)
-        By the measured points, half diagonals.
-    """
-
-    first: int
+    first: int  # first, last: the links ``first`` to ``last - 1``, whose correspondences are ``rows``
     last: int
     rows: slice
-    errors: FloatArray
-    jacobian: FloatArray
-    by_point1: FloatArray
+    errors: FloatArray  # (m, 2)
+    jacobian: FloatArray  # (m, 2, 9 + K): by the entries of H and the K free parameters of the lens
+    by_point1: FloatArray  # by_point1, by_point2: (m, 2, 2): by the measured points, half diagonals
     by_point2: FloatArray
 
 

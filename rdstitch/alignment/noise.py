@@ -41,25 +41,14 @@ _MIN_DISTANCE, _MAX_DISTANCE = 0.005, 0.25
 
 @dataclass(frozen=True)
 class Coherence:
-    """How much the residuals of neighbours agree.
+    """How much the residuals of neighbours agree."""
 
-    Attributes
-    ----------
-    correlation : float
-        Mean correlation of the residuals of nearest neighbours within a link.
-    size : float
-        Root mean square of the common part, pixels.
-    relative_size : float
-        The same in diagonals of an image.
-    overdispersion : float
-        How many times fewer independent observations there are than correspondences; at least 1. The product of two
-        things: the variance of the sum of the residuals in a part of an overlap, in units of that of independent
-        ones; and the number of links per image, since every link counts the same measured points again.
-    """
-
-    correlation: float
-    size: float
-    relative_size: float
+    correlation: float  # mean correlation of the residuals of nearest neighbours within a link
+    size: float  # root mean square of the common part, pixels
+    relative_size: float  # the same in diagonals of an image
+    # how many times fewer independent observations there are than correspondences; at least 1. The product of two
+    # things: the variance of the sum of the residuals in a part of an overlap, in units of that of independent ones;
+    # and the number of links per image, since every link counts the same measured points again
     overdispersion: float
 
 
@@ -170,24 +159,12 @@ _MAX_ERROR2 = 1e12  # px²: what cannot be transferred counts as this
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """The noise of a set of errors.
+    """The noise of a set of errors."""
 
-    Attributes
-    ----------
-    noise : float
-        Standard deviation of an error's coordinate when the model is right, pixels.
-    overdispersion : float
-        See :class:`rdstitch.alignment.noise.Coherence`.
-    counted : ndarray of shape (M,), bool
-        Correspondences of links that fit.
-    effective : float
-        Independent observations.
-    """
-
-    noise: float
-    overdispersion: float
-    counted: BoolArray
-    effective: float
+    noise: float  # standard deviation of an error's coordinate when the model is right, pixels
+    overdispersion: float  # see Coherence
+    counted: BoolArray  # (M,): correspondences of links that fit
+    effective: float  # independent observations
 
     @classmethod
     def of_errors(cls, observations: Observations, errors: FloatArray, freedom: float = 1.0) -> "NoiseModel":
