@@ -15,7 +15,7 @@ from rdstitch.alignment.bundle_adjustment import (
     Parameters,
     sigma_of,
 )
-from rdstitch.alignment.initialization import independent_pairs
+from rdstitch.alignment.initialization import independent_pairs, nearest_pairs
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import (
@@ -25,11 +25,11 @@ from rdstitch.alignment.motion_models import (
     THETA,
     MotionModel,
     PlanarModel,
+    inverses,
 )
 from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors
-from rdstitch.alignment.warm_start import WarmStart
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
@@ -54,63 +54,29 @@ _MISFIT = 1.5
 
 @dataclass(frozen=True)
 class Fit:
-    """One model adjusted to a problem.
-
-    Attributes
-    ----------
-    model : MotionModel
-    adjusted : BundleAdjustmentResult
-    free_lens : ndarray of shape (5,), bool
-        Lens parameters that were estimated.
-    tilt_spread : float
-        Standard deviation of the images' own tilts, radians; 0 where the model has none.
-    overdispersion : float
-        Of the errors that it leaves, at least that of the problem; see :class:`BundleAdjuster`.
-    """
+    """One model adjusted to a problem."""
 
     model: MotionModel
     adjusted: BundleAdjustmentResult
-    free_lens: BoolArray
-    tilt_spread: float = 0.0
+    free_lens: BoolArray  # (5,): lens parameters that were estimated
+    tilt_spread: float = 0.0  # standard deviation of the images' own tilts, radians; 0 where the model has none
+    # of the errors that it leaves, at least that of the problem; see BundleAdjuster
     overdispersion: float = 1.0
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Connected images to be aligned.
+    """Connected images to be aligned."""
 
-    Attributes
-    ----------
-    observations : Observations
-        Links between the images 0 … N-1.
-    homographies : ndarray of shape (L, 3, 3)
-        Of the links, at the ``lens``.
-    trust : ndarray of shape (L,)
-        How much each link can be relied on to start with.
-    count : int
-        N.
-    reference : int
-        The image that fixes the gauge; -1 for none in particular, before :meth:`part`.
-    lens : ndarray of shape (4,)
-        Where to start.
-    free_lens : ndarray of shape (5,), bool
-    camera_priors : CameraPriors
-    overdispersion : float
-        See :class:`BundleAdjuster`.
-    warm : WarmStart, optional
-        Where models over a plane start, instead of at chained links.
-    """
-
-    observations: Observations
-    homographies: FloatArray
-    trust: FloatArray
-    count: int
-    reference: int
-    lens: FloatArray
-    free_lens: BoolArray
+    observations: Observations  # links between the images 0 … N-1
+    homographies: FloatArray  # (L, 3, 3): of the links, at the ``lens``
+    trust: FloatArray  # (L,): how much each link can be relied on to start with
+    count: int  # N
+    reference: int  # the image that fixes the gauge; -1 for none in particular, before part
+    lens: FloatArray  # (5,): where to start
+    free_lens: BoolArray  # (5,)
     camera_priors: CameraPriors
-    overdispersion: float = 1.0
-    warm: WarmStart | None = None
+    overdispersion: float = 1.0  # see BundleAdjuster
 
     def part(self, kept: BoolArray, images: IntArray | None = None) -> tuple["Problem", IntArray]:
         """The problem of some links (L,) between these images, or the largest group that they connect; and the images.
@@ -145,9 +111,6 @@ class Problem:
         if not others and not model.one_camera and self.count > _LONG_CHAIN:
             others = [self.fit(SIMILARITY)]
         starts = [self.taken_over(model, other) for other in others]
-        if self.warm is not None and isinstance(model, PlanarModel):
-            spread = self.warm.tilt_spread if model is self.warm.model else None
-            return self.refine(model, self._nearest(model, [self.warm.start_of(model), *starts]), spread)
         if model.any_tilt:
             starts.append(self._upgraded(model))
         elif not (others and model.free_tilts):
@@ -224,13 +187,13 @@ class Problem:
     def _chained(self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None) -> Parameters:
         """Every link on its own, chained along the tree of the links trusted most."""
         o, attitudes = self.observations, self.camera_priors.attitudes
-        shared, lens, homographies = np.zeros(0), self.lens, self.homographies
+        shared, homographies = np.zeros(0), self.homographies
         if model.one_camera:
-            shared, lens, homographies = self._links_apart(SIMILARITY if model.free_tilts else model, others, start)
+            shared, homographies = self._links_apart(SIMILARITY if model.free_tilts else model, others, start)
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
         origin = model.origins(shared, attitudes[[tree.root]])[0]
         chained = tree.chained(homographies, o.image1, origin)
-        return Parameters(model.nearest_poses(chained, shared, attitudes), shared, lens)
+        return Parameters(model.nearest_poses(chained, shared, attitudes), shared, self.lens)
 
     def _upgraded(self, model: MotionModel) -> Parameters:
         """Chained homographies with the metric of the plane that makes them images of one camera."""
@@ -242,33 +205,21 @@ class Problem:
         return Parameters(upgraded.poses, shared, self.lens)
 
     def _links_apart(
-        self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Shared parameters, lens and homographies (L, 3, 3) of every link on its own under one camera.
+        self, model: MotionModel, others: Sequence[Fit], shared: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Shared parameters, and with these the homographies (L, 3, 3) under one camera that are nearest to the links.
 
-        From given shared parameters, those of another planar model, or the best of several.
+        The parameters are those given, those of another planar model, or the best of several.
         """
-        known = self.camera_priors
         planar = [other for other in others if other.model.one_camera]
-        if start is None and planar:
-            start = planar[-1].adjusted.parameters.shared
-        elif start is None:
+        if shared is None and planar:
+            shared = planar[-1].adjusted.parameters.shared
+        elif shared is None:
             adjuster, at = self._best_trial(model)
-            start = (at if len(self.observations) == 1 else adjuster.run(at).parameters).shared
-        if len(self.observations) == 1:  # which on its own is the whole
-            return start, self.lens, self.homographies
-        adjuster, at = independent_pairs(
-            model,
-            self.observations,
-            self.homographies,
-            start,
-            self.lens,
-            self.free_lens,
-            known.priors(model, self.count, _TILT_SPREAD_START),
-            known.attitudes,
-        )
-        apart = adjuster.run(at)
-        return apart.parameters.shared, apart.parameters.lens, apart.homographies
+            shared = (at if len(self.observations) == 1 else adjuster.run(at).parameters).shared
+        poses = nearest_pairs(model, self.observations, self.homographies, shared, self.camera_priors.attitudes)
+        matrices = model.matrices(poses, shared).matrices
+        return shared, matrices[1::2] @ inverses(matrices[0::2])
 
     def trial(self, model: MotionModel) -> BundleAdjustmentResult:
         """A few links on their own under one camera."""

@@ -1,6 +1,5 @@
 """The recipe of the global adjustment: consensus, match graph, choice of the model, adjustment."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -13,15 +12,14 @@ from rdstitch.alignment.adjustment_problem import (
 )
 from rdstitch.alignment.attitude_check import check_attitudes
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
-from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult, sigma_of
+from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.evidence import Evidence
 from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
 from rdstitch.alignment.lens_uncertainty import weigh_lens
 from rdstitch.alignment.link_equations import whitened_errors
-from rdstitch.alignment.motion_models import MODELS
-from rdstitch.alignment.noise import COHERENT_CORRELATION, EXACTNESS, LARGE_RELIEF, noise_of_links
+from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, noise_of_links
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.position_priors import hold_positions
@@ -29,7 +27,6 @@ from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
-from rdstitch.alignment.warm_start import WarmStart
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD, Camera
 from rdstitch.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
@@ -37,7 +34,6 @@ from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.matching.links import Link, in_alternate_directions
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 
 _UNCONFIRMED = 0.1
 """What the matches count in the spanning tree of a link without a consistent triangle, relative to one with."""
@@ -59,16 +55,12 @@ _LITTLE_DEPTH, _LITTLE_DEPTH_PX = 0.0003, 0.3
 """Diagonals of an image, and pixels: errors that neighbours share beside a lens, up to which there is no depth to speak
 of. Less than the noise of keypoints says nothing: published pairs with depth leave 0.6 to 1 pixel."""
 
-_AS_GOOD = 1.5
-"""Errors of an earlier alignment, in units of those of pairs on their own, up to which a later one starts there."""
-
 
 def align(
     cameras: Sequence[Camera],
     links: Sequence[Link],
     options: AlignmentOptions | None = None,
     *,
-    former: Alignment | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Alignment:
     """Align all images over one plane.
@@ -80,9 +72,6 @@ def align(
     links : sequence of Link
         The pairs that overlap, each once.
     options : AlignmentOptions, optional
-    former : Alignment, optional
-        Of the same cameras with the same options and other links. Where these agree with it, the adjustment starts
-        there, not at chained links.
     progress : callable, optional
         Called with the name of each stage as it begins.
 
@@ -127,9 +116,8 @@ def align(
         problem, overdispersion=noise_of_links(problem.observations, problem.homographies, problem.lens).overdispersion
     )
     if (doubt := check_attitudes(problem, options)) is not None:
-        return align(cameras, links, doubt[0], former=former, progress=progress).with_messages([doubt[1]])
-    earlier = _choose_from(former, cameras, problem, images, options, chosen.refinements)
-    choice = earlier or select_model(
+        return align(cameras, links, doubt[0], progress=progress).with_messages([doubt[1]])
+    choice = select_model(
         problem,
         options.models,
         chosen.refinements,
@@ -215,33 +203,6 @@ def _lens_start(cameras: Sequence[Camera], options: AlignmentOptions, votes: Con
 def _lens_of(camera: Camera) -> FloatArray:
     """The lens of a camera; the images' points are already relative to its centre."""
     return np.array([*camera.coefficients, 0.0, 0.0])
-
-
-def _choose_from(
-    former: Alignment | None,
-    cameras: Sequence[Camera],
-    problem: Problem,
-    images: IntArray,
-    options: AlignmentOptions,
-    refinements: Sequence[BoolArray],
-) -> ModelChoice | None:
-    """The choice from the solution of an earlier alignment; None where that does not explain every link any more."""
-    if former is None:
-        return None
-    warm = WarmStart.of(former, cameras, images, problem.lens, problem.free_lens)
-    if warm is None or options.attitudes is not None:
-        return None
-    squared, noise = (
-        problem.squared(warm.model, warm.parameters),
-        noise_of_links(problem.observations, problem.homographies, problem.lens).noise,
-    )
-    sigma = sigma_of(squared)
-    if misfitting_links(squared, problem.observations).any() or sigma > _AS_GOOD * math.hypot(noise, EXACTNESS):
-        return None
-    planar = [name for name in options.models if not MODELS[name].on_sphere]  # what came before was no turn
-    choice = select_model(replace(problem, warm=warm), planar, refinements)
-    costs = [robust_cost(errors, ALIGNMENT_WIDTH * sigma).sum() for errors in (choice.fit.adjusted.squared, squared)]
-    return choice if choice.fit.model is warm.model and costs[0] <= costs[1] else None
 
 
 def _is_depth(observations: Observations, bent: BundleAdjustmentResult, flat: BundleAdjustmentResult) -> bool:

@@ -42,16 +42,7 @@ _SIGNED_ORDERS = tuple(
 def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[AlignmentOptions, Message] | None:
     """Options without what the images contradict, or with the scatter that they show; and what the user should know.
 
-    Parameters
-    ----------
-    problem : Problem
-        With the given attitudes and tilt among its priors.
-    options : AlignmentOptions
-
-    Returns
-    -------
-    (AlignmentOptions, Message) or None
-        None where nothing is given, or the images agree with it as well as it is said to be known, or show no tilts.
+    None where nothing is given, or the images agree with it as well as it is said to be known, or show no tilts.
     """
     if options.attitudes is None and options.tilt is None:
         return None
@@ -101,21 +92,11 @@ def _named(change: FloatArray) -> str:
 
 @dataclass(frozen=True)
 class _ShownTilts:
-    """What the images show of their tilts.
+    """What the images show of their tilts."""
 
-    Attributes
-    ----------
-    images : ndarray of shape (K,), intp
-        The images compared.
-    tilts : ndarray of shape (K, 2)
-        (ψ, θ), radians.
-    variances, axes : ndarray of shape (2 K,) and (2 K, 2 K)
-        Eigenvalues and eigenvectors of their covariance.
-    """
-
-    images: IntArray
-    tilts: FloatArray
-    variances: FloatArray
+    images: IntArray  # (K,): the images compared
+    tilts: FloatArray  # (K, 2): (ψ, θ), radians
+    variances: FloatArray  # variances, axes: (2 K,) and (2 K, 2 K): eigenvalues and eigenvectors of their covariance
     axes: FloatArray
 
     @classmethod

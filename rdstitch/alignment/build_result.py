@@ -10,7 +10,7 @@ from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.lens_description import radius_std
-from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, WORTH_SAYING, LensChoice
+from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
 from rdstitch.alignment.lens_uncertainty import considered_covariance, sandwich_covariance
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
@@ -39,47 +39,28 @@ _RADII = np.linspace(0.05, 1.0, 20)
 _OVERRULED = 1.5
 """Ratio from which on EXIF was wrong, not rounded or of another focus."""
 
+_WORTH_SAYING = 0.5
+"""Pixels that the corners of too few images may lie elsewhere, from which on that is said."""
+
 _CONFIDENT = 2.0
 """Standard deviations within which the lens is taken to be known: 95 %."""
 
 
 @dataclass(frozen=True)
 class AdjustedImages:
-    """What the adjustment found, and what it was made from.
-
-    Attributes
-    ----------
-    cameras : sequence of Camera
-    links : sequence of Link
-    images : ndarray of shape (N,), intp
-        The images aligned, ascending; the problem numbers them 0 … N-1.
-    right : ndarray of shape (L,), bool
-        Links not taken for wrong.
-    problem : Problem
-        The final one.
-    choice : ModelChoice
-    lens : LensChoice
-        The lens, with the distortion centre if the motion model freed it.
-    observable : bool
-        Whether λ is observable, or known.
-    depth : bool
-        Whether that is because what few images show has depth.
-    options : AlignmentOptions
-    positions_disagree : str
-        Why the positions were not used; empty where they were, or where there are none.
-    """
+    """What the adjustment found, and what it was made from."""
 
     cameras: Sequence[Camera]
     links: Sequence[Link]
-    images: IntArray
-    right: BoolArray
-    problem: Problem
+    images: IntArray  # (N,): the images aligned, ascending; the problem numbers them 0 … N-1
+    right: BoolArray  # (L,): links not taken for wrong
+    problem: Problem  # the final one
     choice: ModelChoice
-    lens: LensChoice
-    observable: bool
-    depth: bool
+    lens: LensChoice  # the lens, with the distortion centre if the motion model freed it
+    observable: bool  # whether λ is observable, or known
+    depth: bool  # whether that is because what few images show has depth
     options: AlignmentOptions
-    positions_disagree: str
+    positions_disagree: str  # why the positions were not used; empty where they were, or where there are none
 
 
 def build_alignment(found: AdjustedImages) -> Alignment:
@@ -150,7 +131,7 @@ def build_alignment(found: AdjustedImages) -> Alignment:
         links=_link_fits(found, squared, agreeing),
         relief=relief,
         shape=_shape(found),
-        messages=_warnings(found, own),
+        messages=_warnings(found, own, considered),
     )
 
 
@@ -284,8 +265,8 @@ def _overruled_focal(found: AdjustedImages, camera: Camera) -> str | None:
     return f"the images show a focal length that is {times} in EXIF, which was not used; --focal gives the right one"
 
 
-def _warnings(found: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
-    """What the user should know of the whole."""
+def _warnings(found: AdjustedImages, camera: Camera, considered: FloatArray) -> tuple[Message, ...]:
+    """What the user should know of the whole, with the covariance (5, 5) of all parameters of a lens."""
     result: list[Message] = []
     # An image can be right whatever the lens is.
     image_only = found.options.layout_matters
@@ -297,8 +278,9 @@ def _warnings(found: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
         severity: Severity = "detail" if image_only else "failure" if found.depth else "warning"
         result.append(Message(text, severity=severity, code="lambda-not-observable"))
     elif len(found.images) < ENOUGH_IMAGES and found.problem.free_lens.any():
-        off = max(found.lens.corner_shift, _CONFIDENT * float(radius_std(camera, _RADII)[-1]))
-        if off > WORTH_SAYING:
+        every = replace(camera, lens_covariance=tuple(map(tuple, considered.tolist())))
+        off = _CONFIDENT * float(radius_std(every, _RADII)[-1])
+        if off > _WORTH_SAYING:
             text = (
                 f"from {len(found.images)} images the lens distortion is known to about {off:.2g} pixels at the "
                 f"corners; {ENOUGH_IMAGES} or more images, or --camera, make it surer"

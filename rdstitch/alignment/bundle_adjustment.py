@@ -30,21 +30,11 @@ WIDEST_START = 0.05
 
 @dataclass(frozen=True)
 class Parameters:
-    """The unknowns of the adjustment.
+    """The unknowns of the adjustment."""
 
-    Attributes
-    ----------
-    poses : ndarray of shape (N, ...)
-        In the model's own columns.
-    shared : ndarray of shape (S,)
-        The model's shared parameters.
-    lens : ndarray of shape (5,)
-        λ, μ, ν and the shift of the distortion centre, in the half-diagonal frame.
-    """
-
-    poses: FloatArray
-    shared: FloatArray
-    lens: FloatArray
+    poses: FloatArray  # (N, ...): in the model's own columns
+    shared: FloatArray  # (S,): the model's shared parameters
+    lens: FloatArray  # (5,): λ, μ, ν and the shift of the distortion centre, in the half-diagonal frame
 
     def retract(
         self, model: MotionModel, step_poses: FloatArray, step_shared: FloatArray, free_lens: BoolArray
@@ -63,13 +53,7 @@ class Parameters:
 
 @dataclass(frozen=True)
 class FreeParameters:
-    """Which parameters are estimated.
-
-    Attributes
-    ----------
-    poses : ndarray of shape (N, D), bool
-    lens : ndarray of shape (5,), bool
-    """
+    """Which parameters are estimated, of the poses (N, D) and of the lens (5,)."""
 
     poses: BoolArray
     lens: BoolArray
@@ -84,32 +68,15 @@ class FreeParameters:
 
 @dataclass(frozen=True)
 class BundleAdjustmentResult:
-    """Result of an adjustment.
-
-    Attributes
-    ----------
-    parameters : Parameters
-    matrices : ModelMatrices
-    homographies : ndarray of shape (L, 3, 3)
-        Of each link.
-    sigma : float
-        Standard deviation of an error's coordinate, pixels, from the median.
-    squared : ndarray of shape (M,)
-        ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred.
-    equations : LinkEquations
-        At the solution.
-    covariance : ndarray of shape (S', S')
-        Of the model's named parameters and the free parameters of the lens, priors included.
-    converged : bool
-    iterations : int
-    """
+    """Result of an adjustment."""
 
     parameters: Parameters
     matrices: ModelMatrices
-    homographies: FloatArray
-    sigma: float
-    squared: FloatArray
-    equations: LinkEquations
+    homographies: FloatArray  # (L, 3, 3): of each link
+    sigma: float  # standard deviation of an error's coordinate, pixels, from the median
+    squared: FloatArray  # (M,): ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred
+    equations: LinkEquations  # at the solution
+    # (S', S'): of the model's named parameters and the free parameters of the lens, priors included
     covariance: FloatArray
     converged: bool
     iterations: int
@@ -132,26 +99,15 @@ Revision = Callable[["BundleAdjuster", Parameters, float, FloatArray], "BundleAd
 
 @dataclass(frozen=True)
 class BundleAdjuster:
-    """The adjustment of one set of observations with one model.
-
-    Attributes
-    ----------
-    model : MotionModel
-    observations : Observations
-    free : FreeParameters
-    priors : Priors
-    overdispersion : float
-        Variance of sums of errors over that of independent ones; weighs the correspondences against the priors.
-    max_iterations : int
-        Linearizations at most.
-    """
+    """The adjustment of one set of observations with one model."""
 
     model: MotionModel
     observations: Observations
     free: FreeParameters
     priors: Priors
+    # variance of sums of errors over that of independent ones; weighs the correspondences against the priors
     overdispersion: float = 1.0
-    max_iterations: int = 60
+    max_iterations: int = 60  # linearizations at most
 
     def run(self, start: Parameters, revise: Revision | None = None) -> BundleAdjustmentResult:
         """Adjust.

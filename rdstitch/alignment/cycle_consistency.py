@@ -54,20 +54,8 @@ def cycle_consistency(
 
     One after the other, the link with the most contradictions is taken out together with its triangles, until every
     link left is confirmed at least as often as it is contradicted.
-
-    Parameters
-    ----------
-    apart : BundleAdjustmentResult
-        Every link on its own, with a homography.
-    observations : Observations
-    count : int
-        Number of images.
-
-    Returns
-    -------
-    suspect : ndarray of shape (L,), bool
-    confirmed : ndarray of shape (L,), intp
-        Triangles with each link that close, of those left.
+    Takes every link on its own, with a homography, and the number of images; also gives how many of the triangles left
+    with each link close, (L,).
     """
     suspect = np.zeros(len(observations), dtype=np.bool_)
     corners = triangles(count, observations.image1, observations.image2)
@@ -164,11 +152,6 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
 
     A model that is too rigid leaves larger errors in all links; a wrong pair stands out. What is usual is what half of
     the matches have, not half of the links: many pairs far apart may show a vehicle only, with few matches each.
-
-    Parameters
-    ----------
-    squared : ndarray of shape (M,)
-        ``|r|²``, px².
     """
     typical = link_medians(squared, observations)
     usual = _weighted_median(typical, np.where(np.isfinite(typical), observations.matches, 0))

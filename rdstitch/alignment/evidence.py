@@ -36,28 +36,14 @@ _SIZES = 14
 
 @dataclass(frozen=True)
 class Evidence:
-    """Cells of the overlaps of all links, by which hypotheses on the same observations are compared.
+    """Cells of the overlaps of all links, by which hypotheses on the same observations are compared."""
 
-    Attributes
-    ----------
-    cell, block : ndarray of shape (M,) and (C,), intp
-        The cell of each correspondence, and the block of each cell.
-    counts : ndarray of shape (C,)
-        Correspondences in each cell.
-    noise : float
-        Standard deviation of a coordinate of a keypoint's error, pixels.
-    farthest : float
-        Pixels that an error counts as at most.
-    weight : float
-        Independent links over links: every link measures the same keypoints again.
-    """
-
-    cell: IntArray
+    cell: IntArray  # cell, block: (M,) and (C,): the cell of each correspondence, and the block of each cell
     block: IntArray
-    counts: FloatArray
-    noise: float
-    farthest: float
-    weight: float
+    counts: FloatArray  # (C,): correspondences in each cell
+    noise: float  # standard deviation of a coordinate of a keypoint's error, pixels
+    farthest: float  # pixels that an error counts as at most
+    weight: float  # independent links over links: every link measures the same keypoints again
 
     @classmethod
     def of(cls, observations: Observations, errors: FloatArray) -> Self:
@@ -115,18 +101,9 @@ class Evidence:
 
 @dataclass(frozen=True)
 class ErrorCost:
-    """What errors say of a hypothesis.
+    """What errors say of a hypothesis."""
 
-    Attributes
-    ----------
-    cost : float
-        -2 log of their likelihood, up to a constant.
-    field : float
-        Size of what neighbours share, pixels of a coordinate.
-    count : float
-        Independent coordinates: all where there is noise only, a pair of them a cell or block where the field is large.
-    """
-
-    cost: float
-    field: float
+    cost: float  # -2 log of their likelihood, up to a constant
+    field: float  # size of what neighbours share, pixels of a coordinate
+    # independent coordinates: all where there is noise only, a pair of them a cell or block where the field is large
     count: float

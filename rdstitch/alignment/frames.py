@@ -63,10 +63,7 @@ def _turned_points(points: FloatArray, camera: Camera, orientation: int) -> Floa
 def turned_alignment(alignment: Alignment, orientations: Sequence[int], gravity: FloatArray | None) -> Alignment:
     """The same alignment of the images after orientations 1, 3, 6 and 8, in the frame of the reference as it is then.
 
-    Parameters
-    ----------
-    gravity : ndarray of shape (N, 3), or None
-        Direction down in the axes of the cameras of the turned images; NaN where it is not known.
+    Gravity (N, 3) is down in the axes of the cameras of the turned images; NaN where it is not known.
     """
     if all(orientation == 1 for orientation in orientations):
         return alignment

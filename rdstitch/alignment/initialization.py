@@ -1,8 +1,4 @@
-"""Where the global adjustment starts: every link on its own under one camera, then chained along a tree.
-
-The links are first adjusted with the lens and the tilt in common but without any consistency between them: the
-consensus of all pairs, robust because no wrong link can pull at another. Their motions are then chained.
-"""
+"""Every link on its own, with the lens and the camera in common: robust, because no wrong link can pull at another."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -57,31 +53,24 @@ def independent_pairs(
     free_lens: BoolArray,
     priors: Priors,
     attitudes: FloatArray,
-    iterations: int = MAX_ITERATIONS,
 ) -> tuple[BundleAdjuster, Parameters]:
     """Return the adjustment of every link on its own, with the shared parameters in common, and where it starts.
-
-    Parameters
-    ----------
-    homographies : ndarray of shape (L, 3, 3)
-        Of the links, at ``lens``.
-    shared, lens
-        Where to start.
-    priors : Priors
-        On the shared parameters and the lens; those on the poses are not used.
-    attitudes : ndarray of shape (N, 2)
-        How the tilt of each image is known to differ from the shared one, radians.
-    iterations : int
-        Linearizations at most.
+    Of the links' homographies (L, 3, 3) at this lens, and of tilts that differ from the shared one by attitudes (N, 2),
+    radians. Priors on the poses are not used.
     """
-    apart = observations.as_independent_pairs()
-    count = 2 * len(apart)
-    matrices = np.empty((count, 3, 3))
-    tilts = np.stack([attitudes[observations.image1], attitudes[observations.image2]], axis=1).reshape(-1, 2)
-    matrices[0::2] = model.origins(shared, tilts[0::2])
-    matrices[1::2] = homographies @ matrices[0::2]
-    start = Parameters(model.nearest_poses(matrices, shared, tilts), shared, lens)
-    none = Priors.none(model, count)
-    known = replace(none, shared=priors.shared, lens=priors.lens)
+    count = 2 * len(observations)
+    start = Parameters(nearest_pairs(model, observations, homographies, shared, attitudes), shared, lens)
+    known = replace(Priors.none(model, count), shared=priors.shared, lens=priors.lens)
     freedom = FreeParameters.fixing(model, count, list(range(0, count, 2)), free_lens)
-    return BundleAdjuster(model, apart, freedom, known, max_iterations=iterations), start
+    apart = observations.as_independent_pairs()
+    return BundleAdjuster(model, apart, freedom, known, max_iterations=MAX_ITERATIONS), start
+
+
+def nearest_pairs(
+    model: MotionModel, observations: Observations, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray
+) -> FloatArray:
+    """Poses of both images of every link, (2 L, ...), nearest to its homography (L, 3, 3); the first at the origin."""
+    tilts = attitudes[np.stack([observations.image1, observations.image2], axis=1)].reshape(-1, 2)
+    matrices = model.origins(shared, tilts)
+    matrices[1::2] = homographies @ matrices[0::2]
+    return model.nearest_poses(matrices, shared, tilts)

@@ -70,17 +70,8 @@ def _std(camera: Camera) -> FloatArray:
 def radius_std(camera: Camera, radii: FloatArray) -> FloatArray:
     """Standard deviation of where the lens measures the rays that it measures at some radii, pixels.
 
-    Up to the scale of the undistorted image, which no image of a plane shows.
-
-    Parameters
-    ----------
-    camera : Camera
-    radii : ndarray of shape (N,)
-        Half diagonals from the distortion centre, evenly spaced from the centre to the corner.
-
-    Returns
-    -------
-    ndarray of shape (N,)
+    Up to the scale of the undistorted image, which no image of a plane shows. The radii (N,) are half diagonals, evenly
+    spaced from the distortion centre to the corner.
     """
     if camera.lens_covariance is None:
         return np.zeros_like(radii)

@@ -17,12 +17,11 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem, homography_apart
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.link_equations import whitened_errors
-from rdstitch.alignment.noise import Coherence, NoiseModel, coherence
+from rdstitch.alignment.noise import Coherence, NoiseModel, coherence, noise_of_links
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS
-from rdstitch.division_model import distort, undistort
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 LENSES: dict[str, tuple[str, ...]] = {
@@ -58,11 +57,6 @@ ENOUGH_IMAGES, _ENOUGH_IMAGES_OF_A_MOTION = 4, 3
 all of them. In fewer a tilt and a change of height stand for it, and pairs like those of ``examples.paper figure5`` are
 registered worse with it free."""
 
-WORTH_SAYING = 0.5
-"""Pixels that the corners of too few images may lie elsewhere, from which on that is said."""
-
-_RADII, _SCALE_STEPS, _SCALE_STEP = 64, 6, 1e-6
-
 _SUFFICIENT_LINKS = 8
 """Links from which on each is a part."""
 
@@ -73,31 +67,15 @@ lenses takes memory and time for each of them."""
 
 @dataclass(frozen=True)
 class LensChoice:
-    """The lens chosen.
+    """The lens chosen."""
 
-    Attributes
-    ----------
-    name : str
-        A key of :data:`LENSES`.
-    free : ndarray of shape (5,), bool
-        Its parameters among :data:`rdstitch.camera.LENS_PARAMETERS`.
-    apart : BundleAdjustmentResult
-        Every link on its own with this lens.
-    reason : str
-        One sentence.
-    refinements : tuple of ndarray of shape (5,), bool
-        What may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
-        motion that is less regular. That μ is needed only pairs can say: it could stand for relief.
-    corner_shift : float
-        Pixels by which μ would move the corners, where too few images do not show whether it is needed.
-    """
-
-    name: str
-    free: BoolArray
-    apart: BundleAdjustmentResult
-    reason: str
+    name: str  # a key of LENSES
+    free: BoolArray  # (5,): its parameters among LENS_PARAMETERS
+    apart: BundleAdjustmentResult  # every link on its own with this lens
+    reason: str  # one sentence
+    # what may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
+    # motion that is less regular. That μ is needed only pairs can say: it could stand for relief
     refinements: tuple[BoolArray, ...] = ()
-    corner_shift: float = 0.0
 
     def refined(self, free: BoolArray) -> Self:
         """With the parameters that were freed in the end."""
@@ -116,16 +94,9 @@ def free_parameters(name: str) -> BoolArray:
 def choose_lens(
     observations: Observations, apart: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
 ) -> LensChoice:
-    """Choose a lens.
+    """Choose among lenses, keys of :data:`LENSES` from the simplest; none where the lens is given.
 
-    Parameters
-    ----------
-    observations : Observations
-    apart : BundleAdjustmentResult
-        Every link on its own with a homography, and λ free unless ``names`` is empty.
-    names : sequence of str
-        The lenses to choose among, keys of :data:`LENSES` from the simplest; none where the lens is given.
-    known : CameraPriors
+    ``apart`` is every link on its own with a homography, and λ free unless the lens is given.
     """
     if not names:
         return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")
@@ -147,22 +118,17 @@ def choose_lens(
         if name == "division3" and names[best] != "division2":
             break  # the next term of a series that is not needed
         fits.append(fit(free[index], fits[-1]))
-        errors = whitened_errors(observations, fits[-1].homographies, fits[-1].parameters.lens)
-        judge = _Judge(NoiseModel.of_independent_links(observations, errors), _parts(observations))
+        noise = noise_of_links(observations, fits[-1].homographies, fits[-1].parameters.lens)
+        judge = _Judge(noise, _parts(observations))
         added = int(free[index].sum() - free[best].sum())
         gains = judge.prefers(fits[index], fits[best], added, names[best])
         if gains and has_plausible_center(fits[index], observations):
             best = index
-    reason, shift = _reason(names, fits, best), 0.0
+    reason = _reason(names, fits, best)
     if few:
         reason += "; too few images to find the distortion centre, which is taken to be the middle"
-        shift = _distance(fits[0], fits[1], float(np.median(observations.scale1))) if best == 0 else 0.0
-        if shift > WORTH_SAYING:
-            reason += (
-                f"; they do not show whether μ is needed, with which corners would lie {shift:.1f} pixels elsewhere"
-            )
     refinements = (CENTER,) if best == 0 and images >= _ENOUGH_IMAGES_OF_A_MOTION else ()
-    return LensChoice(names[best], free[best], fits[best], reason, refinements, shift)
+    return LensChoice(names[best], free[best], fits[best], reason, refinements)
 
 
 def _choose_by_some(
@@ -176,21 +142,6 @@ def _choose_by_some(
     if (choice.free != simplest).any():
         apart = homography_apart(observations, apart.homographies, start, choice.free, known)
     return replace(choice, apart=apart)
-
-
-def _distance(simple: BundleAdjustmentResult, rich: BundleAdjustmentResult, scale: float) -> float:
-    """Largest distance of the places at which two lenses measure the same rays, pixels, at the best common scale."""
-    radii = np.linspace(0.0, 1.0, _RADII + 1)[1:]
-    (distortion, *higher), other = rich.parameters.lens[:3].tolist(), float(simple.parameters.lens[0])
-    straight = undistort(np.column_stack([radii, np.zeros(_RADII)]), distortion, higher)
-    difference, factor = np.zeros(_RADII), 1.0
-    for _ in range(_SCALE_STEPS):
-        seen, more = (distort(k * straight, other)[:, 0] for k in (factor, factor * (1.0 + _SCALE_STEP)))
-        difference, slope = seen - radii, (more - seen) / _SCALE_STEP
-        known = np.isfinite(difference) & np.isfinite(slope)
-        # Radii count by the area that they stand for.
-        factor *= 1.0 - float((radii * slope * difference)[known].sum() / (radii * slope**2)[known].sum())
-    return float(np.nanmax(np.abs(difference))) * scale
 
 
 def _images(observations: Observations) -> int:
@@ -246,18 +197,10 @@ def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
 
 @dataclass(frozen=True)
 class _Judge:
-    """What the lenses are compared by.
+    """What the lenses are compared by."""
 
-    Attributes
-    ----------
-    noise : NoiseModel
-        Of the errors that the richer lens leaves.
-    part : ndarray of shape (M,), intp
-        The part of the observations that each correspondence falls into: its link, or a cell of it.
-    """
-
-    noise: NoiseModel
-    part: IntArray
+    noise: NoiseModel  # of the errors that the richer lens leaves
+    part: IntArray  # (M,): the part of the observations that each correspondence falls into: its link, or a cell of it
 
     def prefers(
         self, richer: BundleAdjustmentResult, simpler: BundleAdjustmentResult, added: int, simpler_name: str

@@ -35,12 +35,6 @@ def sandwich_covariance(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResu
     """Covariance (S', S') of the model's named parameters and the free parameters of the lens.
 
     In no direction less than that of independent errors, nor than where errors agree within images.
-
-    Parameters
-    ----------
-    adjuster : BundleAdjuster
-    adjusted : BundleAdjustmentResult
-        Of this adjuster.
     """
     response, observations = LinearResponse.of(adjuster, adjusted), adjuster.observations
     influence, priors = _influence(response)

@@ -24,26 +24,13 @@ Fields = Callable[[LinearizedErrors], FloatArray]
 
 @dataclass(frozen=True)
 class LinearResponse:
-    """An adjustment, linearized at its solution.
-
-    Attributes
-    ----------
-    adjuster : BundleAdjuster
-    adjusted : BundleAdjustmentResult
-        Of this adjuster.
-    weight : ndarray of shape (M,)
-        What the square of each error counts in the normal equations.
-    curvature : float
-        Mean derivative of ``w r`` by r, in units of the mean of w: between 0 and 1.
-    normal : SparseNormalEquations
-        With the curvature in them.
-    """
+    """An adjustment, linearized at its solution."""
 
     adjuster: BundleAdjuster
-    adjusted: BundleAdjustmentResult
-    weight: FloatArray
-    curvature: float
-    normal: SparseNormalEquations
+    adjusted: BundleAdjustmentResult  # of this adjuster
+    weight: FloatArray  # (M,): what the square of each error counts in the normal equations
+    curvature: float  # mean derivative of ``w r`` by r, in units of the mean of w: between 0 and 1
+    normal: SparseNormalEquations  # with the curvature in them
 
     @classmethod
     def of(cls, adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> Self:

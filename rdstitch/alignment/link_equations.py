@@ -21,33 +21,16 @@ from rdstitch.division_model import is_one_to_one
 from rdstitch.radial_homography import TransferJacobian, measurement_whitening, transfer_jacobian, whiten
 from rdstitch.robust.loss import robust_weight
 
-_CHUNK = 4096
-"""Correspondences linearized at a time: what stays in cache."""
-
 
 @dataclass(frozen=True)
 class LinkEquations:
-    """Weighted, linearized transfer errors of all correspondences, summed per link.
+    """Weighted, linearized transfer errors of all correspondences, summed per link."""
 
-    Attributes
-    ----------
-    gram : ndarray of shape (L, 9 + K, 9 + K)
-        ``Σ w J'J`` by the entries of H and the K free parameters of the lens.
-    gradient : ndarray of shape (L, 9 + K)
-        ``Σ w J'r``.
-    squared : ndarray of shape (M,)
-        ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred.
-    whitening : ndarray of shape (M, 2, 2)
-        What makes r of an error in normalized coordinates.
-    error : ndarray of shape (M, 2)
-        That error; not finite where it cannot be transferred.
-    """
-
-    gram: FloatArray
-    gradient: FloatArray
-    squared: FloatArray
-    whitening: FloatArray
-    error: FloatArray
+    gram: FloatArray  # (L, 9 + K, 9 + K): ``Σ w J'J`` by the entries of H and the K free parameters of the lens
+    gradient: FloatArray  # (L, 9 + K): ``Σ w J'r``
+    squared: FloatArray  # (M,): ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred
+    whitening: FloatArray  # (M, 2, 2): what makes r of an error in normalized coordinates
+    error: FloatArray  # (M, 2): that error; not finite where it cannot be transferred
 
     @property
     def errors(self) -> FloatArray:
@@ -80,24 +63,14 @@ def folds(lens: FloatArray, reach: float = 1.0) -> bool:
 def link_equations(
     observations: Observations, homographies: FloatArray, lens: FloatArray, width: float, free_lens: BoolArray
 ) -> LinkEquations:
-    """Linearize all transfer errors.
+    """Linearize all transfer errors, by the homographies (L, 3, 3) of the links and the free parameters of the lens.
 
-    Parameters
-    ----------
-    observations : Observations
-    homographies : ndarray of shape (L, 3, 3)
-        Of each link, from its first to its second image.
-    lens : ndarray of shape (5,)
-        λ, μ, ν and the shift of the distortion centre, in the half-diagonal frame.
-    width : float
-        Of :func:`robust_weight`, pixels.
-    free_lens : ndarray of shape (5,), bool
-        Parameters of the lens to differentiate by.
+    The weights are those of :func:`robust_weight`, with this width in pixels.
     """
     count, total = len(observations.points1), 10 + int(free_lens.sum())
     sums = np.zeros((len(observations), total, total))
     squared, error, whitening = np.empty(count), np.empty((2, count)), np.empty((2, 2, count))
-    for first, last in _chunks(observations.start):
+    for first, last in observations.chunks:
         rows = slice(observations.start[first], observations.start[last])
         there = _transferred(observations, homographies, lens, first, last)
         squared[rows], error[:, rows] = squared_lengths(there.whitened.T), there.error
@@ -109,33 +82,21 @@ def link_equations(
 
 def whitened_errors(observations: Observations, homographies: FloatArray, lens: FloatArray) -> FloatArray:
     """Whitened transfer errors of all correspondences, pixels, shape (M, 2); NaN where there is none."""
-    chunks = _chunks(observations.start)
+    chunks = observations.chunks
     errors = [_transferred(observations, homographies, lens, *chunk).whitened for chunk in chunks]
     return np.concatenate([np.empty((2, 0)), *errors], axis=1).T
 
 
 @dataclass(frozen=True)
 class LinearizedErrors:
-    """Whitened transfer errors of some links with their derivatives, all in pixels; 0 where there is no transfer.
+    """Whitened transfer errors of some links with their derivatives, all in pixels; 0 where there is no transfer."""
 
-    Attributes
-    ----------
-    first, last : int
-        The links ``first`` to ``last - 1``, whose correspondences are ``rows``.
-    rows : slice
-    errors : ndarray of shape (m, 2)
-    jacobian : ndarray of shape (m, 2, 9 + K)
-        By the entries of H and the K free parameters of the lens.
-    by_point1, by_point2 : ndarray of shape (m, 2, 2)
-        By the measured points, half diagonals.
-    """
-
-    first: int
+    first: int  # first, last: the links ``first`` to ``last - 1``, whose correspondences are ``rows``
     last: int
     rows: slice
-    errors: FloatArray
-    jacobian: FloatArray
-    by_point1: FloatArray
+    errors: FloatArray  # (m, 2)
+    jacobian: FloatArray  # (m, 2, 9 + K): by the entries of H and the K free parameters of the lens
+    by_point1: FloatArray  # by_point1, by_point2: (m, 2, 2): by the measured points, half diagonals
     by_point2: FloatArray
 
 
@@ -144,7 +105,7 @@ def linearized_errors(
     observations: Observations, homographies: FloatArray, lens: FloatArray, free_lens: BoolArray
 ) -> Iterator[LinearizedErrors]:
     """All links, some at a time: derivatives of all correspondences at once would be most of an alignment's memory."""
-    for first, last in _chunks(observations.start):
+    for first, last in observations.chunks:
         there = _transferred(observations, homographies, lens, first, last)
         found = there.derivatives
         by_homography = found.by_image[:, :, None] * found.lifted
@@ -173,25 +134,9 @@ def squared_lengths(errors: FloatArray) -> FloatArray:
     return squared
 
 
-def _chunks(start: NDArray[np.intp]) -> list[tuple[int, int]]:
-    """Ranges of links with about :data:`_CHUNK` correspondences each."""
-    edges = np.unique(np.searchsorted(start, np.arange(0, start[-1] + _CHUNK, _CHUNK)).clip(max=len(start) - 1))
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
-
-
 @dataclass(frozen=True)
 class _Transferred:
-    """Correspondences of some links.
-
-    Attributes
-    ----------
-    derivatives : TransferJacobian
-    whitening : ndarray of shape (m, 2, 2)
-    error : ndarray of shape (2, m)
-        Half diagonals.
-    whitened : ndarray of shape (2, m)
-        Pixels.
-    """
+    """Correspondences of some links: whitenings (m, 2, 2), errors (2, m) in half diagonals, and whitened in pixels."""
 
     derivatives: TransferJacobian
     whitening: FloatArray

@@ -31,17 +31,7 @@ _OUTLYING = 0.3
 
 @dataclass(frozen=True)
 class MetricPoses:
-    """Poses of one camera.
-
-    Attributes
-    ----------
-    poses : ndarray of shape (N, 6)
-        In the columns of the planar models; tilts are those of the images less the shared one.
-    tilt : ndarray of shape (2,)
-        Shared (ψ, θ), radians: the median.
-    log_focal : float
-        Of the focal length in half diagonals.
-    """
+    """Poses (N, 6) of one camera, as the planar models have them, the shared tilt (2,), radians, and log f."""
 
     poses: FloatArray
     tilt: FloatArray

@@ -41,25 +41,14 @@ _MIN_DISTANCE, _MAX_DISTANCE = 0.005, 0.25
 
 @dataclass(frozen=True)
 class Coherence:
-    """How much the residuals of neighbours agree.
+    """How much the residuals of neighbours agree."""
 
-    Attributes
-    ----------
-    correlation : float
-        Mean correlation of the residuals of nearest neighbours within a link.
-    size : float
-        Root mean square of the common part, pixels.
-    relative_size : float
-        The same in diagonals of an image.
-    overdispersion : float
-        How many times fewer independent observations there are than correspondences; at least 1. The product of two
-        things: the variance of the sum of the residuals in a part of an overlap, in units of that of independent
-        ones; and the number of links per image, since every link counts the same measured points again.
-    """
-
-    correlation: float
-    size: float
-    relative_size: float
+    correlation: float  # mean correlation of the residuals of nearest neighbours within a link
+    size: float  # root mean square of the common part, pixels
+    relative_size: float  # the same in diagonals of an image
+    # how many times fewer independent observations there are than correspondences; at least 1. The product of two
+    # things: the variance of the sum of the residuals in a part of an overlap, in units of that of independent ones;
+    # and the number of links per image, since every link counts the same measured points again
     overdispersion: float
 
 
@@ -141,15 +130,9 @@ def _overdispersion(link: IntArray, points: FloatArray, residual: FloatArray, co
 
 
 def judge_relief(found: Coherence, model: str, links: int) -> ReliefTest:
-    """What the agreement of neighbours means for the scene.
+    """What the agreement of neighbours that a model leaves means for the scene.
 
-    Parameters
-    ----------
-    found : Coherence
-    model : str
-        Name of the model that left the residuals.
-    links : int
-        Pairs of images; what is as wide as the overlap of one pair alone, its homography and λ absorb.
+    What is as wide as the overlap of one pair alone, its homography and λ absorb.
     """
     agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} pixels in common)"
     relief = found.correlation > COHERENT_CORRELATION and found.relative_size > LARGE_RELIEF
@@ -176,32 +159,12 @@ _MAX_ERROR2 = 1e12  # px²: what cannot be transferred counts as this
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """The noise of a set of errors.
+    """The noise of a set of errors."""
 
-    Attributes
-    ----------
-    noise : float
-        Standard deviation of an error's coordinate when the model is right, pixels.
-    overdispersion : float
-        See :class:`rdstitch.alignment.noise.Coherence`.
-    counted : ndarray of shape (M,), bool
-        Correspondences of links that fit.
-    effective : float
-        Independent observations.
-    common : float
-        Root mean square of what the errors of neighbours have in common, in diagonals of an image.
-    """
-
-    noise: float
-    overdispersion: float
-    counted: BoolArray
-    effective: float
-    common: float
-
-    @classmethod
-    def of_independent_links(cls, observations: Observations, errors: FloatArray) -> "NoiseModel":
-        """From the whitened errors (M, 2) of links that were each fitted on their own, with a homography."""
-        return cls.of_errors(observations, errors, max(1.0 - 4.0 * len(observations) / max(len(errors), 1), 0.1))
+    noise: float  # standard deviation of an error's coordinate when the model is right, pixels
+    overdispersion: float  # see Coherence
+    counted: BoolArray  # (M,): correspondences of links that fit
+    effective: float  # independent observations
 
     @classmethod
     def of_errors(cls, observations: Observations, errors: FloatArray, freedom: float = 1.0) -> "NoiseModel":
@@ -209,11 +172,10 @@ class NoiseModel:
         squared = squared_lengths(errors)
         sigma = sigma_of(squared[observations.scale_inliers_mask])
         inliers = squared <= (ALIGNMENT_WIDTH * sigma) ** 2
-        agreement = coherence(observations, errors, inliers)
+        overdispersion = shared_variance(observations, errors, inliers)
         counted = ~misfitting_links(squared, observations)[observations.link]
-        effective = max(2.0 * float((counted & inliers).sum()) / agreement.overdispersion, 2.0)
-        noise = math.hypot(sigma / math.sqrt(freedom), EXACTNESS)
-        return cls(noise, agreement.overdispersion, counted, effective, agreement.relative_size)
+        effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
+        return cls(math.hypot(sigma / math.sqrt(freedom), EXACTNESS), overdispersion, counted, effective)
 
     @property
     def price(self) -> float:
@@ -229,4 +191,5 @@ class NoiseModel:
 
 def noise_of_links(observations: Observations, homographies: FloatArray, lens: FloatArray) -> NoiseModel:
     """The noise that every link leaves on its own, with its homography (L, 3, 3)."""
-    return NoiseModel.of_independent_links(observations, whitened_errors(observations, homographies, lens))
+    errors = whitened_errors(observations, homographies, lens)
+    return NoiseModel.of_errors(observations, errors, max(1.0 - 4.0 * len(observations) / max(len(errors), 1), 0.1))

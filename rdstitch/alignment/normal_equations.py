@@ -18,31 +18,16 @@ from rdstitch.late_imports import sparse, sparse_linalg
 
 @dataclass(frozen=True, eq=False)
 class PoseBlocks:
-    """The normal matrix of F free pose parameters, put together from blocks of L links.
+    """The normal matrix of F free pose parameters, put together from blocks of L links."""
 
-    Attributes
-    ----------
-    column : ndarray of shape (L, 2 D)
-        Which of the free parameters those of the link's two images are; F for those that are not free.
-    free : int
-        F.
-    kept : ndarray of shape (L, 2 D, 2 D), bool
-        Entries of the links' blocks between free parameters.
-    place : ndarray of shape (K,)
-        Where each of these is added in the E entries of the matrix.
-    indices, indptr : ndarray
-        Of the matrix by columns; all of its diagonal is stored.
-    diagonal : ndarray of shape (F,)
-        Where the diagonal lies in the entries.
-    """
-
+    # (L, 2 D): which of the free parameters those of the link's two images are; F for those that are not free
     column: IntArray
-    free: int
-    kept: BoolArray
-    place: IntArray
-    indices: IntArray
+    free: int  # F
+    kept: BoolArray  # (L, 2 D, 2 D): entries of the links' blocks between free parameters
+    place: IntArray  # (K,): where each of these is added in the E entries of the matrix
+    indices: IntArray  # indices, indptr: of the matrix by columns; all of its diagonal is stored
     indptr: IntArray
-    diagonal: IntArray
+    diagonal: IntArray  # (F,): where the diagonal lies in the entries
 
     @classmethod
     def of(cls, observations: Observations, free: BoolArray) -> Self:
@@ -88,26 +73,13 @@ _LEAST_DAMPING = 1e-12
 
 @dataclass(frozen=True)
 class SparseNormalEquations:
-    """``[A B; B' C] step = -gradient`` for poses and shared parameters, in that order.
+    """``[A B; B' C] step = -gradient`` for poses and shared parameters, in that order."""
 
-    Attributes
-    ----------
-    blocks : PoseBlocks
-        The pattern of A.
-    poses : ndarray of shape (E,)
-        The entries of A, (F, F), of the F free pose parameters.
-    coupling : ndarray of shape (F, S)
-        B.
-    shared : ndarray of shape (S, S)
-        C.
-    gradient_poses, gradient_shared : ndarray of shape (F,) and (S,)
-    """
-
-    blocks: PoseBlocks
-    poses: FloatArray
-    coupling: FloatArray
-    shared: FloatArray
-    gradient_poses: FloatArray
+    blocks: PoseBlocks  # the pattern of A
+    poses: FloatArray  # (E,): the entries of A, (F, F), of the F free pose parameters
+    coupling: FloatArray  # (F, S): B
+    shared: FloatArray  # (S, S): C
+    gradient_poses: FloatArray  # gradient_poses, gradient_shared: (F,) and (S,)
     gradient_shared: FloatArray
 
     def solve(self, damping: float) -> tuple[FloatArray, FloatArray]:
@@ -199,18 +171,7 @@ def chain(
 ) -> SparseNormalEquations:
     """Chain the equations of the links with the derivatives of the model, whose shared parameters the lens follows.
 
-    Parameters
-    ----------
-    equations : LinkEquations
-    observations : Observations
-    model : ModelMatrices
-        Of all N images.
-    homographies : ndarray of shape (L, 3, 3)
-        ``P_j P_i⁻¹`` of each link.
-    blocks : PoseBlocks
-        Of the pose parameters that may move.
-    weight : float
-        Of all equations: one over the variance of the errors.
+    The homographies are those of the links (L, 3, 3), the weight is one over the variance of the errors.
     """
     derivative = link_derivatives(observations, model, homographies, equations.gram.shape[1] - 9)
     size = model.by_pose.shape[1]

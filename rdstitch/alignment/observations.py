@@ -14,42 +14,29 @@ from rdstitch.camera import Camera
 from rdstitch.matching.links import Link
 from rdstitch.matching.thinning import spread_choice
 
+_CHUNK = 4096
+"""Correspondences linearized at a time: what stays in cache."""
+
 _STATIC = 1.0
 """Pixels that the displacements of most correspondences of a link stay below where the camera stood still."""
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Correspondences of L links, one after the other.
+    """Correspondences of L links, one after the other."""
 
-    Attributes
-    ----------
-    image1, image2 : ndarray of shape (L,), intp
-        Indices of the images of each link.
-    start : ndarray of shape (L + 1,), intp
-        Link l has the correspondences ``start[l]:start[l + 1]``.
-    points1, points2 : ndarray of shape (M, 2)
-        Measured, in half diagonals from the camera's distortion centre.
-    scale1, scale2 : ndarray of shape (L,)
-        Half the diagonal of each link's images, pixels.
-    matches : ndarray of shape (L,), intp
-        Correspondences that each link had before thinning.
-    reach : float
-        Radius in half diagonals out to which a lens must be one-to-one: the corners, unless a given one is not.
-    relief : ndarray of shape (M, 2), optional
-        By how much a standard deviation of the ground's height moves each point in the second image, over the
-        standard deviation of the noise, see :mod:`rdstitch.alignment.relief_weights`; none over a plane.
-    """
-
-    image1: IntArray
+    image1: IntArray  # image1, image2: (L,): indices of the images of each link
     image2: IntArray
-    start: IntArray
-    points1: FloatArray
+    start: IntArray  # (L + 1,): link l has the correspondences ``start[l]:start[l + 1]``
+    points1: FloatArray  # points1, points2: (M, 2): measured, in half diagonals from the camera's distortion centre
     points2: FloatArray
-    scale1: FloatArray
+    scale1: FloatArray  # scale1, scale2: (L,): half the diagonal of each link's images, pixels
     scale2: FloatArray
-    matches: IntArray
+    matches: IntArray  # (L,): correspondences that each link had before thinning
+    # radius in half diagonals out to which a lens must be one-to-one: the corners, unless a given one is not
     reach: float = 1.0
+    # (M, 2): by how much a standard deviation of the ground's height moves each point in the second image, over the
+    # standard deviation of the noise, see relief_weights; none over a plane
     relief: FloatArray | None = None
 
     @classmethod
@@ -91,6 +78,12 @@ class Observations:
         distance = np.linalg.norm(self.points2 - self.points1, axis=1) * self.scale1[self.link]
         moving = np.repeat(self.medians(distance) > _STATIC, np.diff(self.start))
         return moving if moving.any() else np.ones_like(moving)
+
+    @cached_property
+    def chunks(self) -> list[tuple[int, int]]:
+        """Ranges of links with about :data:`_CHUNK` correspondences each."""
+        edges = np.searchsorted(self.start, np.arange(0, self.start[-1] + _CHUNK, _CHUNK)).clip(max=len(self))
+        return list(itertools.pairwise(np.unique(edges).tolist()))
 
     @property
     def areas(self) -> FloatArray:

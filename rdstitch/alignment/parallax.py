@@ -21,14 +21,7 @@ _ASIDE = 0.3
 
 @dataclass(frozen=True)
 class Parallax:
-    """Of the images of an adjustment.
-
-    Attributes
-    ----------
-    adjuster : BundleAdjuster
-    adjusted : BundleAdjustmentResult
-        Of this adjuster, or with other weights.
-    """
+    """Of the images of an adjustment, by this adjuster or one with other weights."""
 
     adjuster: BundleAdjuster
     adjusted: BundleAdjustmentResult

@@ -14,20 +14,9 @@ _COLUMNS = 512  # of the inverse at a time
 
 
 def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray]:
-    """Covariances of x, y, height and yaw, in heights of the reference image and radians.
+    """Covariances of x, y, height and yaw by a planar fit, in heights of the reference image and radians.
 
-    Parameters
-    ----------
-    problem : Problem
-    fit : Fit
-        Of the problem, by a planar model.
-
-    Returns
-    -------
-    ndarray of shape (N, 4, 4)
-        Of each image; zero for the reference.
-    ndarray of shape (N, 4, 4)
-        Of each image (rows) with the first one (columns).
+    (N, 4, 4) of each image, zero for the reference; and the same of each image (rows) with the first one (columns).
     """
     adjuster, model, parameters = problem.adjuster_of(fit), fit.model, fit.adjusted.parameters
     assert isinstance(model, PlanarModel)

@@ -33,18 +33,7 @@ _MAX_GROWTH = 1.1
 def hold_positions(problem: Problem, fit: Fit) -> tuple[Problem, Fit, str]:
     """Adjust again with the positions as priors.
 
-    Parameters
-    ----------
-    problem : Problem
-    fit : Fit
-        Of the problem, without them.
-
-    Returns
-    -------
-    Problem, Fit
-        Those given where there are too few positions, or where the images disagree with them.
-    str
-        Why they do not count; empty where they do, or where there are too few.
+    What was given comes back where there are too few of them, or, with the reason, where the images disagree with them.
     """
     metres = problem.camera_priors.positions @ np.array([1.0, -1.0j])
     known = np.isfinite(metres)

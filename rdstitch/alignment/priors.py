@@ -37,15 +37,9 @@ _EXACT_STD = 1e-6
 
 @dataclass(frozen=True)
 class Prior:
-    """A mixture of normal distributions of one parameter; of none, it says nothing.
+    """A mixture of normal distributions of one parameter; of none, it says nothing."""
 
-    Attributes
-    ----------
-    parts : tuple of (float, float, float)
-        Weight, mean and standard deviation of each, the core first.
-    """
-
-    parts: tuple[tuple[float, float, float], ...] = ()
+    parts: tuple[tuple[float, float, float], ...] = ()  # weight, mean and standard deviation of each, the core first
 
     def cost(self, value: float) -> float:
         """Return -2 log of the density, relative to that of the core alone at its middle."""
@@ -124,21 +118,11 @@ TILT = Prior(((0.8, 0.0, math.radians(20.0)), (0.2, 0.0, math.radians(45.0))))
 
 @dataclass(frozen=True)
 class Priors:
-    """Priors on all that is adjusted.
+    """Priors on all that is adjusted."""
 
-    Attributes
-    ----------
-    shared : tuple of S priors
-        Of the model's named parameters, see :meth:`MotionModel.physical_parameters`.
-    lens : tuple of 5 priors
-        Of :data:`rdstitch.camera.LENS_PARAMETERS`.
-    poses, poses_precision : ndarray of shape (N, D)
-        Means and inverse variances; 0 where there is no prior.
-    """
-
-    shared: tuple[Prior, ...]
-    lens: tuple[Prior, ...]
-    poses: FloatArray
+    shared: tuple[Prior, ...]  # of the model's named parameters, see physical_parameters
+    lens: tuple[Prior, ...]  # of LENS_PARAMETERS
+    poses: FloatArray  # poses, poses_precision: (N, D): means and inverse variances; 0 where there is no prior
     poses_precision: FloatArray
 
     @classmethod
@@ -150,35 +134,19 @@ class Priors:
 
 @dataclass(frozen=True)
 class CameraPriors:
-    """Priors of the camera.
+    """Priors of the camera."""
 
-    Attributes
-    ----------
-    log_focal, log_focal_std : float
-        Of the logarithm of the focal length in half diagonals.
-    focal_source : str
-        Where it comes from, a key of :data:`rdstitch.camera.FOCAL_LOG_STD`.
-    tilt : (float, float)
-        (ψ, θ), radians.
-    tilt_known : bool
-    attitudes : ndarray of shape (N, 2)
-        How the tilt of each image differs from the shared one, radians; zeros where that is not known.
-    attitudes_std : float or None
-        Standard deviation of these, 0 for exact ones; None where they are not known.
-    positions : ndarray of shape (N, 2)
-        Metres east and north where each image was taken; NaN where that is not known.
-    places, places_precision : ndarray of shape (N, 2) and (N,)
-        What those say of the poses, and its inverse variance; see :mod:`rdstitch.alignment.position_priors`.
-    """
-
-    log_focal: float
+    log_focal: float  # log_focal, log_focal_std: of the logarithm of the focal length in half diagonals
     log_focal_std: float
-    focal_source: str
-    tilt: tuple[float, float]
+    focal_source: str  # where it comes from, a key of FOCAL_LOG_STD
+    tilt: tuple[float, float]  # (ψ, θ), radians
     tilt_known: bool
+    # (N, 2): how the tilt of each image differs from the shared one, radians; zeros where that is not known
     attitudes: FloatArray
-    attitudes_std: float | None
-    positions: FloatArray
+    attitudes_std: float | None  # standard deviation of these, 0 for exact ones; None where they are not known
+    positions: FloatArray  # (N, 2): metres east and north where each image was taken; NaN where that is not known
+    # places, places_precision: (N, 2) and (N,): what those say of the poses, and its inverse variance; see
+    # position_priors
     places: FloatArray | None = None
     places_precision: FloatArray | None = None
 

@@ -43,12 +43,7 @@ _NOISE_FIELDS = 16
 
 @dataclass(frozen=True)
 class ReliefField:
-    """Ground under the images of an adjustment.
-
-    Attributes
-    ----------
-    response : LinearResponse
-    """
+    """Ground under the images of an adjustment."""
 
     response: LinearResponse
 
@@ -144,12 +139,7 @@ class ReliefField:
 def _spectrum(left: FloatArray, found: FloatArray, std: FloatArray) -> FloatArray:
     """Mean squares (B,) of the heights of the bands of waves, in those of waves that are equally steep.
 
-    Parameters
-    ----------
-    left : ndarray of shape (D, B)
-        Agreement at each distance that each band leaves.
-    found, std : ndarray of shape (D,)
-        What was found, and its standard deviation.
+    By the agreement at each distance that each band leaves (D, B), what was found (D,), and its standard deviation.
     """
     steep = found[0] / float(left[0].mean()) if left[0].mean() > 0.0 else 0.0
     if steep <= 0.0:

@@ -42,14 +42,6 @@ def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[st
     """The model of one camera chosen again, with heights that account for errors, where such heights show.
 
     Without a free distortion centre, which over rough ground bends the whole as the ground bends the images.
-
-    Parameters
-    ----------
-    problem : Problem
-    choice : ModelChoice
-        Of this problem.
-    names : sequence of str
-        The models to choose among.
     """
     if not _is_rough(problem, choice.fit) or weighted_by_relief(problem, choice.fit) is problem:
         return choice
@@ -126,12 +118,7 @@ def _refined(problem: Problem, fit: Fit) -> Fit:
 def _scatter(errors: FloatArray, parallax: FloatArray, effective: float) -> float:
     """Standard deviation of the heights over that of the noise, in units per pixel; 0 where none is significant.
 
-    Parameters
-    ----------
-    errors, parallax : ndarray of shape (M, 2)
-        Whitened errors, pixels, and those of ground one unit higher.
-    effective : float
-        Independent coordinates of the errors.
+    By whitened errors (M, 2), pixels, those of ground one unit higher, and the number of independent coordinates.
     """
     length = np.linalg.norm(parallax, axis=1)
     moving = length > 0.0

@@ -20,22 +20,11 @@ _STEEP = np.cos(np.radians(30.0))
 
 
 def levelled(matrices: FloatArray, reference: int, gravity: FloatArray | None = None) -> FloatArray:
-    """Matrices from undistorted coordinates of each image to directions in a level frame.
+    """Matrices (N, 3, 3) from undistorted coordinates of each image to directions in a level frame.
 
     The frame has x to the right, y down, and z towards the middle of what the images show, or towards the reference
-    image where they show everything around.
-
-    Parameters
-    ----------
-    matrices : ndarray of shape (N, 3, 3)
-        ``diag(f, f, 1) R_i``, from directions in any frame to the images, all with the same f.
-    reference : int
-    gravity : ndarray of shape (N, 3), optional
-        Direction down in the axes of each camera, as it has measured it; NaN where it has not.
-
-    Returns
-    -------
-    ndarray of shape (N, 3, 3)
+    image where they show everything around. ``matrices`` are ``diag(f, f, 1) R_i``, from directions in any frame to the
+    images; gravity (N, 3) is down in the axes of each camera, NaN where it has not measured it.
     """
     focal = float(np.linalg.norm(matrices[0, 0]))
     rotations = matrices / np.array([[focal], [focal], [1.0]])

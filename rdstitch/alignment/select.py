@@ -47,17 +47,7 @@ _POSSIBLE, _PARALLAX = 4.0, 0.005
 
 @dataclass(frozen=True)
 class ModelChoice:
-    """The model chosen.
-
-    Attributes
-    ----------
-    fit : Fit
-    reason : str
-    overdispersion : float
-        Of the errors that it leaves, see :class:`rdstitch.alignment.noise.Coherence`.
-    over_relief : bool
-        Whether it was chosen with heights of the ground that account for errors along the parallax.
-    """
+    """The model chosen, why, and whether with heights of the ground that account for errors along the parallax."""
 
     fit: Fit
     reason: str
@@ -67,23 +57,12 @@ class ModelChoice:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A fit with its posterior score.
-
-    Attributes
-    ----------
-    fit : Fit
-    score : float
-        -2 log of the posterior, up to a constant of the problem.
-    field : float
-        Size of what the errors of neighbours share, pixels of a coordinate.
-    absurd : bool
-        Whether nobody would keep its layout.
-    """
+    """A fit with its posterior score."""
 
     fit: Fit
-    score: float
-    field: float
-    absurd: bool
+    score: float  # -2 log of the posterior, up to a constant of the problem
+    field: float  # size of what the errors of neighbours share, pixels of a coordinate
+    absurd: bool  # whether nobody would keep its layout
 
 
 @dataclass(frozen=True)

@@ -137,27 +137,17 @@ class _Prediction:
 
 @dataclass(frozen=True)
 class _Answers:
-    """How an adjustment answers E effects of unit size, and its S shared parameters: these as they are without effects.
-
-    Attributes
-    ----------
-    adjuster : BundleAdjuster
-    effects : sequence of Effect
-    poses, shared : ndarray of shape (F, E + S) and (S, E + S)
-        Steps of the free pose parameters, and of the shared ones.
-    information, gradient : ndarray of shape (E, E) and (E,)
-        On the sizes of the effects, by what the parameters do not absorb.
-    covariance : ndarray of shape (S, S)
-        Of the shared parameters without the effects.
-    """
+    """How an adjustment answers E effects of unit size, and its S shared parameters as they are without these."""
 
     adjuster: BundleAdjuster
     effects: Sequence[Effect]
+    # poses, shared: (F, E + S) and (S, E + S): steps of the free pose parameters, and of the shared ones
     poses: FloatArray
     shared: FloatArray
+    # information, gradient: (E, E) and (E,): on the sizes of the effects, by what the parameters do not absorb
     information: FloatArray
     gradient: FloatArray
-    covariance: FloatArray
+    covariance: FloatArray  # (S, S): of the shared parameters without the effects
 
     @classmethod
     def of(cls, problem: Problem, fit: Fit, effects: Sequence[Effect]) -> Self:

@@ -13,16 +13,7 @@ have as many as are looked for at the most."""
 
 
 def explain_unaligned(alignment: Alignment, paths: Sequence[str], keypoints: Sequence[int]) -> list[Message]:
-    """One message for each image that the alignment does not use.
-
-    Parameters
-    ----------
-    alignment : Alignment
-    paths : sequence of str
-        Of all its images.
-    keypoints : sequence of int
-        Number of features of each.
-    """
+    """One message for each image that the alignment does not use, by the paths of all and their numbers of features."""
     contradicting: dict[int, list[int]] = {}
     for fit in alignment.links:
         if not fit.used and fit.reason == CONTRADICTS:

@@ -38,23 +38,12 @@ _PATTERNS = 8
 
 @dataclass(frozen=True)
 class Effect:
-    """One thing that is not modelled.
+    """One thing that is not modelled."""
 
-    Attributes
-    ----------
-    cause : str
-        Which kind of thing it is.
-    correct : callable
-    std : float
-        How large it usually is, where nothing is known of it.
-    largest : float, optional
-        How large it is in an extreme case; no larger if not given.
-    """
-
-    cause: str
+    cause: str  # which kind of thing it is
     correct: Correction
-    std: float
-    largest: float | None = None
+    std: float  # how large it usually is, where nothing is known of it
+    largest: float | None = None  # how large it is in an extreme case; no larger if not given
 
     def displacement(self, points: FloatArray, images: IntArray) -> FloatArray:
         """Derivative (M, 2) of the corrected points by the size."""

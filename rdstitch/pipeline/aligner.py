@@ -139,10 +139,8 @@ class Aligner:
             return tilts
         return [(psi, theta) for psi, theta in turned_tilts(np.array(tilts), self._turns).tolist()]
 
-    def align(self, pairs: Sequence[PairRegistration], former: Alignment | None = None) -> AlignedPairs:
+    def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
         """Align the images by the pairs that were registered; from an earlier run where the cache has it.
-
-        A ``former`` alignment of other pairs of the images is where the new one starts, if these agree with it.
 
         Raises
         ------
@@ -150,10 +148,10 @@ class Aligner:
             When no pair was registered.
         """
         return_freed_memory()
-        aligned = AlignedPairs(tuple(pairs), self._aligned(pairs, former))
+        aligned = AlignedPairs(tuple(pairs), self._aligned(pairs))
         ground = over_rough_ground(pairs, self.threshold)
         if ground is not pairs and not self._explains(aligned.alignment, pairs, ground):
-            over = self._aligned(ground, None)
+            over = self._aligned(ground)
             if over.rms <= limit("error of rough ground") * self.threshold:  # else it is not one ground
                 aligned = replace(aligned, alignment=over, rough=True)
         return self.metric(aligned) if self.needs_poses else aligned
@@ -177,7 +175,7 @@ class Aligner:
         every = np.concatenate(errors)
         return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
 
-    def _aligned(self, pairs: Sequence[PairRegistration], former: Alignment | None) -> Alignment:
+    def _aligned(self, pairs: Sequence[PairRegistration]) -> Alignment:
         found = [pair for pair in pairs if pair.relation]
         most = most_matches_read(len(found), self.options)
         links = tuple(pair.link().thinned(most) for pair in found)
@@ -186,9 +184,8 @@ class Aligner:
         back, gravity = stored(self._turns), self.options.gravity
         cameras = tuple(camera.turned(own) for camera, own in zip(self.cameras, back, strict=True))
         links = tuple(turned_link(link, self.cameras, back) for link in links)
-        former = None if former is None else turned_alignment(former, back, None)
-        inputs = (cameras, self.cache.digest(links), self.options, self.cache.digest(former))
-        compute = partial(align, cameras, links, self.options, former=former)
+        inputs = (cameras, self.cache.digest(links), self.options)
+        compute = partial(align, cameras, links, self.options)
         alignment = self.cache.recall("alignment", inputs, compute)
         down = None if gravity is None else np.einsum("nij,nj->ni", turns(self._turns), np.asarray(gravity))
         return turned_alignment(alignment, self._turns, down)
@@ -211,7 +208,7 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
         pairs = tuple(sorted([*pairs, *found], key=lambda pair: (pair.image1, pair.image2)))
         if not any(pair.relation for pair in found):
             return replace(aligned, pairs=pairs)
-        aligned = aligner.align(pairs, alignment)
+        aligned = aligner.align(pairs)
     return aligned
 
 
@@ -226,7 +223,7 @@ def select_by_whole_lens(aligner: Aligner, aligned: AlignedPairs) -> AlignedPair
         if former.lens == "division" and not former.cameras[former.reference].higher:
             break
         selected = reselect_inliers(pairs, former, aligner.threshold)
-        aligned = aligner.align([selected.get(k, pair) for k, pair in enumerate(pairs)], former)
+        aligned = aligner.align([selected.get(k, pair) for k, pair in enumerate(pairs)])
         if _same_lens(*(found.cameras[found.reference] for found in (former, aligned.alignment))):
             break
     return aligned

@@ -88,7 +88,7 @@ def match_crossings(
         if all(new is old for new, old in zip(pairs, aligned.pairs, strict=True)):
             return aligned, {}
         try:
-            by_crossings = aligner.align(pairs, alignment)
+            by_crossings = aligner.align(pairs)
         except RegistrationError:
             return aligned, {}
     after = by_crossings.alignment

@@ -84,7 +84,7 @@ def test_a_centre_off_the_middle_is_found_alone() -> None:
 
 
 def test_a_pair_says_whether_it_shows_the_lens() -> None:
-    reasons, messages = [], []
+    messages = []
     for noise, per_link in ((0.05, 2000), (1.0, 60)):
         rng = np.random.default_rng(0)
         poses = grid(2, 1, (0.5, 0.35), 0.5, rng)
@@ -92,10 +92,7 @@ def test_a_pair_says_whether_it_shows_the_lens() -> None:
         given = scene(poses, lens=lens, rng=rng, noise=noise, focal=420.0, per_link=per_link, outliers=0.0)
         found = aligned(given)
         assert found.lens == "division"
-        reasons.append(found.lens_reason)
         messages.append([message for message in found.messages if message.code == "few-images"])
-    assert "whether μ is needed" not in reasons[0]
-    assert "whether μ is needed, with which corners would lie" in reasons[1]
     assert not messages[0]
     (message,) = messages[1]
     off = re.search("from 2 images the lens distortion is known to about ([0-9.]+) pixels at the", message.text)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment.link_equations import squared_lengths
-from rdstitch.alignment.noise import EXACTNESS, NoiseModel
-from tests.alignment_stubs import independent_errors, observations
+from rdstitch.alignment.noise import EXACTNESS, NoiseModel, noise_of_links
+from rdstitch.alignment.observations import Observations
+from tests.alignment_stubs import SHIFT, independent_errors, observations
 
 
 def test_the_noise_is_the_scatter_and_what_no_model_is_exact_to() -> None:
@@ -22,15 +23,19 @@ def test_the_noise_is_the_scatter_and_what_no_model_is_exact_to() -> None:
     assert found.price == pytest.approx(math.log(found.effective))
 
 
+def _of_links(seen: Observations) -> NoiseModel:
+    return noise_of_links(seen, np.tile(SHIFT, (len(seen), 1, 1)), np.zeros(5))
+
+
 def test_what_parameters_absorbed_is_added_to_the_noise() -> None:
     errors = independent_errors(each=12).reshape(-1, 2)
     seen = observations(errors.reshape(9, 12, 2))
-    whole, apart = NoiseModel.of_errors(seen, errors), NoiseModel.of_independent_links(seen, errors)
+    whole, apart = NoiseModel.of_errors(seen, errors), _of_links(seen)
     absorbed = 1.0 - 4.0 * 9 / (9 * 12)
     scatter = [math.sqrt(found.noise**2 - EXACTNESS**2) for found in (whole, apart)]
     assert scatter[1] == pytest.approx(scatter[0] / math.sqrt(absorbed))
     few = observations(errors.reshape(9, 12, 2)[:, :4])
-    least = NoiseModel.of_independent_links(few, errors.reshape(9, 12, 2)[:, :4].reshape(-1, 2))
+    least = _of_links(few)
     whole = NoiseModel.of_errors(few, errors.reshape(9, 12, 2)[:, :4].reshape(-1, 2))
     assert least.noise**2 - EXACTNESS**2 == pytest.approx((whole.noise**2 - EXACTNESS**2) / 0.1)
 
@@ -46,7 +51,7 @@ def test_links_that_do_not_fit_do_not_count() -> None:
 
 def test_the_misfit_is_robust() -> None:
     """``W² log(1 + r² / (σ W)²)`` over the overdispersion, W = 3.5: the square for small errors."""
-    found = NoiseModel(0.5, 2.0, np.ones(4, dtype=np.bool_), 100.0, 0.0)
+    found = NoiseModel(0.5, 2.0, np.ones(4, dtype=np.bool_), 100.0)
     misfit = found.misfit(np.array([0.0, 0.0025, 0.25 * 3.5**2, np.inf]))
     np.testing.assert_allclose(misfit[:3], [0.0, 0.005, 0.5 * 3.5**2 * math.log(2.0)], rtol=1e-3)
     assert np.isfinite(misfit[3])

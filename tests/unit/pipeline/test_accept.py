@@ -94,7 +94,7 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
 def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def aligned(aligner: Aligner, pairs: object, former: object) -> Any:
+    def aligned(aligner: Aligner, pairs: object) -> Any:
         asked.append(aligner.options.model)
         return SimpleNamespace(poses=None if aligner.options.model == "auto" else "poses", on_sphere=False)
 
@@ -110,7 +110,7 @@ def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest
 def test_rough_ground_that_nothing_fits_is_no_ground(monkeypatch: pytest.MonkeyPatch, rms: float, rough: bool) -> None:
     planes, ground = (_pairs_of_two() for _ in range(2))
 
-    def aligned(aligner: Aligner, pairs: object, former: object) -> Any:
+    def aligned(aligner: Aligner, pairs: object) -> Any:
         return SimpleNamespace(rms=1.0 if pairs is planes else rms)
 
     monkeypatch.setattr(Aligner, "_aligned", aligned)

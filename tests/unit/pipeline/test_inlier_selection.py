@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rdstitch.alignment import Alignment, AlignmentOptions
+from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import NO_CACHE
 from rdstitch.camera import Camera
@@ -96,12 +96,15 @@ def test_inliers_are_selected_once_more_only_where_the_lens_has_changed(
 ) -> None:
     aligner, pairs, _ = registered
     aligned, done = aligner.align(pairs), []
+    found = [aligned.alignment]
 
-    def moved(self: Aligner, pairs: list[PairRegistration], former: Alignment) -> AlignedPairs:
+    def moved(self: Aligner, pairs: list[PairRegistration]) -> AlignedPairs:
         done.append(pairs)
+        former = found[-1]
         by = change * np.sqrt(np.array(former.cameras[0].lens_covariance)[0, 0])
         cameras = tuple(replace(camera, distortion=camera.distortion + by) for camera in former.cameras)
-        return AlignedPairs(tuple(pairs), replace(former, cameras=cameras))
+        found.append(replace(former, cameras=cameras))
+        return AlignedPairs(tuple(pairs), found[-1])
 
     monkeypatch.setattr(Aligner, "align", moved)
     select_by_whole_lens(aligner, aligned)
