@@ -98,7 +98,8 @@ class Cache:
     def _file(self, stage: str, inputs: tuple[Any, ...]) -> Path:
         """Where the result of a stage is kept: its name is the digest of everything that it depends on."""
         assert self.folder is not None
-        name = digest((_FORMAT, software(), stage, inputs))
+        # A run has one software from beginning to end.
+        name = digest((_FORMAT, software() if self.temporary is None else {}, stage, inputs))
         return self.folder / stage / name[:2] / name[2:]
 
     def _keep(self, file: Path, value: Any) -> bool:

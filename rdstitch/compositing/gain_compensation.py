@@ -167,12 +167,12 @@ def _fit_fields(
 ) -> tuple[FloatArray, FloatArray]:
     """Fields (N, B, B, C) beside gains and vignetting, and the errors (M, C)."""
     (rows, channels), nodes = values.shape, _NODES**2
-    columns, entries = np.empty((rows, 2, 4), dtype=np.intp), np.empty((rows, 2, 4))
+    columns, entries = np.empty((rows, 2, 4), dtype=np.int32), np.empty((rows, 2, 4))
     for end, image, chosen in cells.by_image():
         places, shares = bilinear_weights(cameras[image], cells.points[end, chosen], _NODES)
         columns[chosen, end], entries[chosen, end] = image * nodes + places, (1 - 2 * end) * shares
     shape = (rows, len(cameras) * nodes)
-    design = sparse.csr_array((entries.ravel(), columns.ravel(), 8 * np.arange(rows + 1)), shape=shape)
+    design = sparse.csr_array((entries.ravel(), columns.ravel(), 8 * np.arange(rows + 1, dtype=np.int32)), shape=shape)
     # What one image alone is brighter by is to vanish: neighbours count by the share that they have in common.
     around = cells.overlap + sparse.eye_array(len(cameras))
     wanted = -(around @ log_gain) / around.sum(axis=1)[:, None] if balanced else np.zeros_like(log_gain)
@@ -220,26 +220,24 @@ def _solve(
 ) -> FloatArray:
     """Weighted least squares with a prior, by conjugate gradients, in memory that grows with the number of images.
 
-    The columns are solved side by side: a product with the design is most of a step, and one serves them all.
+    The columns are solved side by side: a product with the matrix is most of a step, and one serves them all.
     """
     precision, expected, inverse = prior
-    transposed, weight = sparse.csr_array(design.T), weight[:, None]
-
-    def normal(x: FloatArray) -> FloatArray:
-        return np.asarray(transposed @ (weight * (design @ x)) + precision @ x)
-
-    right = transposed @ (weight * values) + expected
-    x, left = start, right - normal(start)
+    weighted = sparse.csr_array(design.T * weight)
+    # No larger than the design, whose rows every step would go through twice otherwise.
+    normal = sparse.csr_array(weighted @ design + precision)
+    right = weighted @ values + expected
+    x, left = start, right - normal @ start
     enough = _TOLERANCE * np.linalg.norm(right, axis=0)
     direction, previous = np.zeros_like(x), np.ones(x.shape[1])
     for _ in range(_MAX_STEPS):
         going = np.linalg.norm(left, axis=0) > enough
         if not going.any():
             break
-        better = np.einsum("ij,njc->nic", inverse, left.reshape(-1, len(inverse), x.shape[1])).reshape(x.shape)
+        better = (inverse @ left.reshape(-1, len(inverse), x.shape[1])).reshape(x.shape)
         now = (left * better).sum(axis=0)
         direction = better + now / previous * direction
-        along = normal(direction)
+        along = normal @ direction
         step = np.where(going, now, 0.0) / np.where(going, (direction * along).sum(axis=0), 1.0)
         x, left, previous = x + step * direction, left - step * along, np.where(going, now, 1.0)
     return x

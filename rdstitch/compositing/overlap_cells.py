@@ -62,17 +62,18 @@ class Cells:
 def compare_overlaps(survey: Survey) -> Cells | None:
     """Compare all images that lie over each other; None where no two show the same."""
     pairs, count = survey.pairs(), len(survey.tiles)
+    areas = [0 if tile is None else np.count_nonzero(tile.inside) for tile in survey.tiles]
     shares, found = np.zeros(len(pairs)), []
     for index, (i, j) in enumerate(pairs.tolist()):
         a, b, box, seen = survey.overlap(i, j)
-        shares[index] = seen.sum() / min(a.inside.sum(), b.inside.sum())
+        shares[index] = np.count_nonzero(seen) / min(areas[i], areas[j])
         side = max(2, round(max(*seen.shape, *a.inside.shape, *b.inside.shape) / _CELLS))
         step = max(1, side // _SAMPLES)
         few = np.s_[::step, ::step]
         (va, bright_a), (vb, bright_b) = (_samples(cut(tile.pixels, tile.box, box)[few]) for tile in (a, b))
-        lit = seen[few] & (np.minimum(va, vb) > (_DARKEST if a.pixels.dtype.kind == "u" else 0.0)).all(axis=-1)
-        layers = np.concatenate([va, vb, bright_a[..., None], bright_b[..., None]], axis=-1)
-        for which in (lit & ~(bright_a | bright_b), lit & (bright_a | bright_b)):
+        lit = seen[few] & (np.minimum(va, vb) > (_DARKEST if a.pixels.dtype.kind == "u" else 0.0)).all(axis=0)
+        layers = np.concatenate([va, vb, [bright_a, bright_b]])
+        for which in filter(np.any, (lit & ~(bright_a | bright_b), lit & (bright_a | bright_b))):
             means = _cell_means(which, layers, side // step)
             means[:, :2] = means[:, :2] * step + box[:2]
             found.append((np.full(len(means), index), means))
@@ -93,21 +94,21 @@ def compare_overlaps(survey: Survey) -> Cells | None:
 
 
 def _samples(pixels: NDArray[Any]) -> tuple[FloatArray, BoolArray]:
-    """Samples as share of the full range (h, w, C), and which pixels are clipped (h, w)."""
-    values = pixels.astype(np.float64) / full_scale(pixels.dtype)
-    return values, np.asarray((values > (_BRIGHTEST if pixels.dtype.kind == "u" else np.inf)).any(axis=-1))
+    """Samples as share of the full range (C, h, w), and which pixels are clipped (h, w)."""
+    values = np.ascontiguousarray(np.moveaxis(pixels, -1, 0)) / full_scale(pixels.dtype)
+    return values, np.asarray((values > (_BRIGHTEST if pixels.dtype.kind == "u" else np.inf)).any(axis=0))
 
 
-def _cell_means(which: BoolArray, values: NDArray[Any], side: int) -> FloatArray:
-    """Mean x, y (pixels of the box) and values (h, w, K) of every cell of which more than half counts, (M, 2 + K).
+def _cell_means(which: BoolArray, values: FloatArray, side: int) -> FloatArray:
+    """Mean x, y (pixels of the box) and values (K, h, w) of every cell of which more than half counts, (M, 2 + K).
 
     As products with matrices of ones and zeros, which are many times faster than sums along short axes.
     """
-    height, width = which.shape
-    y, x = np.indices((height, width), dtype=np.float64)[..., None]
-    weighted = np.concatenate([np.ones_like(x), x, y, values], axis=-1) * which[..., None]
-    rows, columns = (np.arange(n) // side == np.arange(-(-n // side))[:, None] for n in (height, width))
-    summed = rows.astype(np.float64) @ weighted.reshape(height, -1)
-    sums = (columns.astype(np.float64) @ summed.reshape(-1, width, weighted.shape[-1])).reshape(-1, weighted.shape[-1])
-    sums = sums[sums[:, 0] > side**2 / 2]
-    return np.asarray(sums[:, 1:] / sums[:, :1])
+    weight = which.astype(np.float64)
+    rows, columns = (1.0 * (np.arange(n) // side == np.arange(-(-n // side))[:, None]) for n in which.shape)
+    down, across = (cells * np.arange(cells.shape[1]) for cells in (rows, columns))
+    count, x, y = (a @ weight @ b.T for a, b in ((rows, columns), (rows, across), (down, columns)))
+    sums = rows @ (values * weight) @ columns.T
+    used = count > side**2 / 2
+    means: FloatArray = np.column_stack([x[used], y[used], *sums[:, used]]) / count[used][:, None]
+    return means

@@ -120,21 +120,19 @@ def fit_fields(
 def _solve(
     design: "sparse.csr_array", weight: FloatArray, prior: "sparse.csr_array", residual: FloatArray, start: FloatArray
 ) -> FloatArray:
-    """All coordinates (nodes, D) of the fields, from near ones, by conjugate gradients.
-
-    The matrix of the normal equations, by far the largest array, is never made.
-    """
-    weighted, across = weight[:, None], design.T
+    """All coordinates (nodes, D) of the fields, from near ones, by conjugate gradients."""
+    weighted = sparse.csr_array(design.T * weight)
+    # Hardly larger than the design, which each iteration would go through twice otherwise.
+    matrix = sparse.csr_array(weighted @ design + prior)
 
     def normal(values: FloatArray) -> FloatArray:
-        nodes = values.reshape(start.shape)
-        return np.asarray(across @ (weighted * (design @ nodes)) + prior @ nodes).ravel()
+        return np.concatenate([matrix @ one for one in values.reshape(start.shape[::-1])])
 
-    diagonal = np.repeat(design.power(2).T @ weight + prior.diagonal(), start.shape[1])
+    diagonal = np.tile(matrix.diagonal(), start.shape[1])
     operator = sparse_linalg.LinearOperator((diagonal.size, diagonal.size), normal, dtype=np.float64)
-    solution, _ = sparse_linalg.cg(operator, (across @ (weighted * residual)).ravel(), start.ravel(), rtol=_TOLERANCE,
+    solution, _ = sparse_linalg.cg(operator, (weighted @ residual).T.ravel(), start.T.ravel(), rtol=_TOLERANCE,
                                    maxiter=_MAX_ITERATIONS, M=sparse.diags_array(1.0 / diagonal))  # fmt: skip
-    return np.asarray(solution).reshape(start.shape)
+    return np.asarray(solution).reshape(start.shape[::-1]).T
 
 
 def _expected(

@@ -133,3 +133,10 @@ def test_the_digest_of_many_values_takes_the_memory_of_one(tmp_path: Path) -> No
     assert tracemalloc.get_traced_memory()[1] < 8 * values[0].nbytes
     tracemalloc.stop()
     assert name != Cache(tmp_path / "cache").digest(values[:-1])
+
+
+def test_the_cache_of_one_run_reads_no_sources(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "sources_digest", lambda _: pytest.fail("read"))
+    kept = Cache.for_this_run()
+    assert kept.recall("stage", ("input",), lambda: 1) == 1
+    assert kept.recall("stage", ("input",), lambda: 2) == 1
