@@ -10,32 +10,19 @@ from rdstitch.synthetic.textures import LinearPixels, Texture
 
 @dataclass(frozen=True)
 class LinedTexture:
-    """A texture with straight lines painted on it: roads, joints, markings.
-
-    Attributes
-    ----------
-    texture : Texture
-    lines : ndarray of shape (L, 2, 2)
-        End points of each, texels.
-    width : float
-        Texels.
-    level : float
-        Grey of the lines, 0 to 1.
-    """
+    """A texture with straight lines painted on it: roads, joints, markings."""
 
     texture: Texture
-    lines: FloatArray
+    lines: FloatArray  # end points, texels; shape (L, 2, 2)
     width: float = 6.0
     level: float = 1.0
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height, texels."""
         return self.texture.size
 
     @property
     def channels(self) -> int:
-        """1 for grey, 3 for RGB."""
         return self.texture.channels
 
     def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:

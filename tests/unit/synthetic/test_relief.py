@@ -17,7 +17,6 @@ from rdstitch.synthetic import (
     pair_poses,
     sequence_over,
 )
-from tests.lined_texture import LinedTexture
 
 LENS = Camera((320, 240), -0.2, focal=260.0)
 
@@ -116,15 +115,3 @@ def test_ground_as_high_as_the_camera_is_refused() -> None:
     relief = hills((100, 100), 1, height=50.0)
     with pytest.raises(ArgumentError, match="the camera only 40"):
         relief.seen_from(np.array([50.0, 50.0]), 40.0, np.zeros((3, 2)))
-
-
-def test_lines_are_straight_and_the_same_in_every_region() -> None:
-    lines = np.array([[(20.0, 30.0), (180.0, 90.0)]])
-    texture = LinedTexture(blank((200, 120), 0.2), lines, width=5.0)
-    whole = texture.region(0, 0, 200, 120)
-    np.testing.assert_array_equal(texture.region(50, 20, 150, 100), whole[20:100, 50:150])
-    # The centre of gravity of each column lies on the line.
-    light = whole[:, 40:160, 0] - np.float32(0.2)
-    middle = (light * np.arange(120)[:, None]).sum(axis=0) / light.sum(axis=0)
-    np.testing.assert_allclose(middle, 30.0 + (np.arange(40, 160) - 20.0) * 60.0 / 160.0, atol=0.05)
-    assert whole.max() == 1.0
