@@ -279,7 +279,7 @@ def test_the_order_of_links_does_not_matter() -> None:
 def test_links_need_no_more_matches_than_are_read(most: int, read: int | None) -> None:
     rng = np.random.default_rng(5)
     given = scene(grid(5, 4, (0.4, 0.3), 0.1, rng), per_link=220, rng=rng)
-    options = AlignmentOptions(most=most)
+    options = AlignmentOptions(most=most, lens="division")
     assert most_matches_read(len(given.links), options) == read
     few = align(given.cameras, [link.thinned(read) for link in given.links], options)
     every = align(given.cameras, given.links, options)

@@ -31,7 +31,7 @@ def test_standard_deviations_are_what_poses_scatter_by() -> None:
         given = scene(poses, focal=FOCAL, guess=guess, tilt=(0.1, -0.05), rng=rng, per_link=80)
         p = given.poses
         truth = PlanarPoses(p[:, YAW], p[:, [X, Y]], np.exp(p[:, LOG_HEIGHT]), p[:, [PSI, THETA]])
-        options = AlignmentOptions(model="similarity", pose_covariance=True)
+        options = AlignmentOptions(model="similarity", lens="division", pose_covariance=True)
         path = Trajectory.from_alignment(align(given.cameras, given.links, options))
         assert path.covariance is not None
         np.testing.assert_allclose(path.covariance[0], 0.0, atol=1e-12)
