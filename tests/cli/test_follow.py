@@ -42,7 +42,6 @@ def _written_as(image: Path, file: Path) -> Path:
 
 
 def _line(process: "subprocess.Popen[bytes]") -> dict[str, Any]:
-    assert process.stdout is not None
     line = process.stdout.readline()
     assert line, process.stderr.read().decode() if process.stderr else ""
     record: dict[str, Any] = json.loads(line)
@@ -108,7 +107,6 @@ def test_an_interrupt_ends_with_what_has_arrived(drive: list[Path], folder: Path
 def test_names_on_standard_input_are_taken_as_they_come(drive: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "path.csv"
     process = start("trajectory", "-", "-o", output, "--follow", *FAST, stdin=subprocess.PIPE)
-    assert process.stdin is not None
     for image in [*drive[:5], tmp_path / "missing.png"]:
         process.stdin.write(f"{image}\n".encode())
         process.stdin.flush()

@@ -196,7 +196,6 @@ def test_of_a_large_tiff_an_overview_is_read(
 
 
 def _decoded(address: str | None) -> NDArray[np.uint8]:
-    assert address is not None
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))))
 
 

@@ -52,7 +52,6 @@ def test_units_of_distortion_agree(distortion: float, width: int, height: int) -
     undistorted = camera.undistort(corner) - camera.center
     np.testing.assert_allclose(undistorted, (corner - camera.center) / (1.0 + distortion), rtol=1e-9)
     in_px = np.hypot(*(corner - camera.center))
-    assert camera.distortion_focal is not None
     np.testing.assert_allclose(camera.distortion_px * in_px**2, distortion, atol=1e-12)
     np.testing.assert_allclose(camera.distortion_focal * (in_px / focal) ** 2, distortion, atol=1e-12)
 
@@ -77,8 +76,6 @@ def test_a_camera_turns_with_its_image(orientation: int) -> None:
     x, y = np.round(upright.center).astype(int)
     assert (u[y, x], v[y, x]) == (410.0, 290.0)
     back = upright.turned(inverse(orientation))
-    assert upright.tilt is not None
-    assert back.tilt is not None
     down = rotation_from_tilt(upright.tilt)[:, 2]
     expected = turning_matrix(orientation) @ rotation_from_tilt((0.1, -0.05))[:2, 2]
     np.testing.assert_allclose(down[:2], expected, atol=1e-12)

@@ -65,7 +65,6 @@ def test_more_links_give_what_they_give_without_the_earlier_alignment(
 
 def _misplaced(former: Alignment) -> Alignment:
     """One image lies a tenth of the height elsewhere."""
-    assert former.poses is not None
     position = former.poses.position.copy()
     position[5] += 0.1
     poses = PlanarPoses(former.poses.yaw, position, former.poses.height, former.poses.tilt)
@@ -81,7 +80,6 @@ def _of_another_lens(former: Alignment) -> Alignment:
 
 
 def _of_another_focal_length(former: Alignment) -> Alignment:
-    assert former.focal is not None
     return replace(former, focal=1.3 * former.focal)
 
 

@@ -113,7 +113,6 @@ def test_keyframes_that_came_before_the_map_are_given_their_place_later(tracked:
     assert revised
     assert revised[0].number == 0
     pose = revised[0].pose
-    assert pose is not None
     np.testing.assert_allclose([pose.x, pose.y, pose.yaw, pose.height], [0.0, 0.0, 0.0, 1.0], atol=1e-9)
     assert all(result.placement is not None for result in revised)
 
