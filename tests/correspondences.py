@@ -36,16 +36,15 @@ def correspondences(
     distortion: float = -0.25,
     motion: str = "rigid",
     max_tilt: float = 0.1,
-    max_height_change: float = 0.25,
     overlap: float = 0.3,
     noise: float = 0.7,
     outliers: float = 0.3,
 ) -> SyntheticMatches:
     """Random matches of two images of a plane, in random order.
 
-    ``focal`` is 1.2 half diagonals if not given; ``motion`` "rigid", "similarity" (heights change by up to
-    ``max_height_change``) or "homography" (free motion before a tilted plane). Tilts are uniform in ±``max_tilt``
-    radians; ``outliers`` is the share of matches that lie anywhere in both images.
+    ``focal`` is 1.2 half diagonals if not given; ``motion`` "rigid", "similarity" (heights change by up to a quarter)
+    or "homography" (free motion before a tilted plane). Tilts are uniform in ±``max_tilt`` radians; ``outliers`` is the
+    share of matches that lie anywhere in both images.
     """
     half_diagonal = float(np.hypot(*image_size)) / 2
     f = 1.2 * half_diagonal if focal is None else focal
@@ -64,7 +63,7 @@ def correspondences(
     if motion == "homography":
         drawn = general_instances(1, right, max_angle=max_tilt, **shared)
     else:
-        change = max_height_change if motion == "similarity" else 0.0
+        change = 0.25 if motion == "similarity" else 0.0
         drawn = planar_instances(1, right, max_tilt=max_tilt, height=(1.0 - change, 1.0 + change), **shared)
 
     rng = np.random.default_rng((seed, 1))

@@ -16,7 +16,7 @@ from rdstitch.cache import Cache
 
 
 @pytest.fixture(autouse=True)
-def _forgetsoftware() -> Iterator[None]:
+def _forget_software() -> Iterator[None]:
     """The digest of the sources is computed once a process."""
     cache.software.cache_clear()
     yield
