@@ -12,34 +12,15 @@ from rdstitch.errors import ArgumentError
 
 @dataclass(frozen=True)
 class TrajectoryError:
-    """How far a trajectory is from the truth.
+    """How far a trajectory is from the truth."""
 
-    Attributes
-    ----------
-    translation : float
-        Median error of the relative translations, as a share of their length, in heights.
-    translation_rms : float
-        Root mean square error of the relative translations over their root mean square length.
-    translation_in_own_unit : float
-        As ``translation``, after the best scale: the height in pixels is known only as well as the focal length.
-    rotation : float
-        Median error of the relative rotations, radians.
-    rotation_rms : float
-        Root mean square of the same.
-    drift : float
-        Root mean square distance of the positions from the true ones after the best similarity, as a share of the
-        length of the path.
-    scale : float
-        Length unit of the estimate in that of the truth, of the best similarity.
-    """
-
-    translation: float
-    translation_rms: float
-    translation_in_own_unit: float
-    rotation: float
+    translation: float  # median error of the relative translations, as a share of their length, in heights
+    translation_rms: float  # root mean square error of them over their root mean square length
+    translation_in_own_unit: float  # after the best scale: the height in px is known as well as the focal length
+    rotation: float  # median error of the relative rotations, radians
     rotation_rms: float
-    drift: float
-    scale: float
+    drift: float  # root mean square distance of positions after the best similarity, as a share of the path's length
+    scale: float  # length unit of the estimate in that of the truth, of the best similarity
 
 
 def compare_trajectories(estimate: Trajectory, truth: Trajectory, step: int = 1) -> TrajectoryError:
@@ -47,11 +28,6 @@ def compare_trajectories(estimate: Trajectory, truth: Trajectory, step: int = 1)
 
     Relative motions are compared as the earlier frame sees them, in units of its height, so that neither the frame
     nor the unit of either trajectory matters.
-
-    Raises
-    ------
-    ArgumentError
-        When fewer than ``step + 1`` frames are in both.
     """
     common, own, other = np.intersect1d(estimate.frame, truth.frame, return_indices=True)
     if len(common) <= step:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.frame import Frame, as_inputs
 
 _OPTIONS = rdstitch.StitchOptions(workers=1, features=rdstitch.FeatureOptions(max_features=600))
-_RGB = rdstitch.StitchOptions(workers=1, features=rdstitch.FeatureOptions(max_features=600), channel_order="rgb")
+_RGB = replace(_OPTIONS, channel_order="rgb")
+_DRY = replace(_OPTIONS, dry_run=True)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +102,7 @@ def test_a_generator_that_reuses_its_buffer(arrays: list[NDArray[np.uint8]], of_
             buffer[:] = array
             yield buffer
 
-    assert rdstitch.pano(stream(), options=_OPTIONS).distortion == of_files.distortion
+    assert rdstitch.pano(stream(), options=_DRY).distortion == of_files.distortion
 
 
 def test_arrays_mix_with_paths_and_the_sidecar_names_them(
@@ -116,7 +118,7 @@ def test_arrays_mix_with_paths_and_the_sidecar_names_them(
 
 def test_a_single_path_is_one_input(frames: list[Path], of_files: rdstitch.StitchResult) -> None:
     for single in (str(frames[0].parent), frames[0].parent):
-        assert rdstitch.pano(single, options=_OPTIONS).distortion == of_files.distortion
+        assert rdstitch.pano(single, options=_DRY).distortion == of_files.distortion
     with pytest.raises(ArgumentError, match="two different images"):
         rdstitch.mosaic(str(frames[0]))
     with pytest.raises(InputError, match=r"no_such\.jpg"):
@@ -133,7 +135,7 @@ def test_undistort_takes_and_gives_arrays(arrays: list[NDArray[np.uint8]], frame
 
 
 def test_the_cache_knows_arrays_by_their_content(arrays: list[NDArray[np.uint8]], tmp_path: Path) -> None:
-    options = rdstitch.StitchOptions(workers=1, features=_OPTIONS.features, cache=tmp_path)
+    options = replace(_DRY, cache=tmp_path)
     first = rdstitch.pano(arrays[:2], options=options)
     kept = sum(len(files) for _, _, files in os.walk(tmp_path))
     assert rdstitch.pano(arrays[:2], options=options).distortion == first.distortion
