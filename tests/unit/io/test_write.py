@@ -18,13 +18,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
-from rdstitch.io import (
-    Layout,
-    Metadata,
-    read_image,
-    write_image,
-    write_strips,
-)
+from rdstitch.io import Layout, Metadata, read_image, write_image, write_strips
 
 Pixels = NDArray[Any]
 

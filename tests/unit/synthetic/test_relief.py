@@ -6,17 +6,7 @@ import pytest
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
-from rdstitch.synthetic import (
-    RELIEFS,
-    Poses,
-    Relief,
-    Sequence,
-    blank,
-    ground,
-    hills,
-    pair_poses,
-    sequence_over,
-)
+from rdstitch.synthetic import RELIEFS, Poses, Relief, Sequence, blank, ground, hills, pair_poses, sequence_over
 
 LENS = Camera((320, 240), -0.2, focal=260.0)
 
