@@ -1,6 +1,5 @@
 """Observations and fits made up for tests of decisions: nothing is adjusted, errors are as given."""
 
-import math
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -10,10 +9,8 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.motion_models import MotionModel
-from rdstitch.alignment.noise import NoiseModel
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import FloatArray
-from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 SCALE = 500.0
 """Half diagonals of all images, pixels."""
@@ -52,13 +49,6 @@ def adjusted(
     )
     found: BundleAdjustmentResult = made
     return found
-
-
-def even_errors(noise: NoiseModel, misfit: float) -> FloatArray:
-    """Squared errors (M,), all alike, whose misfit adds up to a number."""
-    each = misfit * noise.overdispersion / int(noise.counted.sum())
-    squared = noise.noise**2 * ALIGNMENT_WIDTH**2 * math.expm1(each / ALIGNMENT_WIDTH**2)
-    return np.full(len(noise.counted), squared)
 
 
 def _focal_cost(parameters: Any) -> float:

@@ -33,7 +33,6 @@ def corners_of(files: Sequence[Path], board: tuple[int, int]) -> FloatArray:
     grids = []
     for file in files:
         grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        assert grey is not None
         found, corners = cv2.findChessboardCorners(grey, board)
         if found:
             corners = cv2.cornerSubPix(grey, corners, _WINDOW, (-1, -1), (3, 50, 1e-4))

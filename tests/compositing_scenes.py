@@ -69,7 +69,6 @@ def _rendered(
     lens = Camera(size, distortion=distortion, focal=0.8 * size[0])
     poses = grid_poses(lens, columns, rows, overlap=overlap, yaw=0.12, shift=0.08, tilt=(0.04, -0.03), seed=seed)
     rendering = sequence_over(partial(ground, seed=seed + 1, channels=channels), lens, poses, photometry=photometry)
-    assert lens.focal is not None
     scale = np.diag([lens.scale / lens.focal] * 2 + [1.0])
     matrices = np.stack([np.linalg.inv(rendering.from_plane(i)) @ scale for i in range(len(rendering))])
     cameras = [lens] * len(rendering)

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.errors import ArgumentError
 from rdstitch.radial_homography import RadialHomography
 from tests.instances import Instances, PlanarInstances, general_instances, planar_instances
 
@@ -17,11 +16,10 @@ from tests.instances import Instances, PlanarInstances, general_instances, plana
 class SyntheticMatches:
     """N matches between two images of a plane, some of them wrong."""
 
-    points1: FloatArray  # points1, points2: (N, 2): measured pixels
+    points1: FloatArray  # measured pixels
     points2: FloatArray
-    # (N,): what a matcher would say of each match, higher is better: right matches tend to score above wrong ones
-    quality: FloatArray
-    truth: RadialHomography  # the true camera, homography, motion (None where it is free), and which matches are right
+    quality: FloatArray  # as a matcher would score them: right matches tend to be above wrong ones
+    truth: RadialHomography  # with the motion where it is planar, and which matches are right
 
     @property
     def inliers(self) -> NDArray[np.bool_]:
@@ -38,35 +36,15 @@ def correspondences(
     distortion: float = -0.25,
     motion: str = "rigid",
     max_tilt: float = 0.1,
-    max_height_change: float = 0.25,
     overlap: float = 0.3,
     noise: float = 0.7,
     outliers: float = 0.3,
 ) -> SyntheticMatches:
-    """Random matches of two images of a plane.
+    """Random matches of two images of a plane, in random order.
 
-    Parameters
-    ----------
-    focal : float, optional
-        Focal length, pixels; 1.2 times half the diagonal if not given.
-    distortion : float
-        λ in the half-diagonal frame.
-    motion : str
-        "rigid" (planar motion), "similarity" (and the height changes by up to ``max_height_change``), or "homography"
-        (free motion before a tilted plane).
-    max_tilt : float
-        Radians. ψ and θ are uniform in ± this; free motion tilts plane and camera by as much.
-    overlap : float
-        Least share of image 1 that image 2 sees, roughly.
-    noise : float
-        Standard deviation in pixels of the normal noise on both images' points.
-    outliers : float
-        Share of wrong matches: points that lie anywhere in both images.
-
-    Returns
-    -------
-    SyntheticMatches
-        In random order.
+    ``focal`` is 1.2 half diagonals if not given; ``motion`` "rigid", "similarity" (heights change by up to a quarter)
+    or "homography" (free motion before a tilted plane). Tilts are uniform in ±``max_tilt`` radians; ``outliers`` is the
+    share of matches that lie anywhere in both images.
     """
     half_diagonal = float(np.hypot(*image_size)) / 2
     f = 1.2 * half_diagonal if focal is None else focal
@@ -84,11 +62,9 @@ def correspondences(
     drawn: Instances
     if motion == "homography":
         drawn = general_instances(1, right, max_angle=max_tilt, **shared)
-    elif motion in ("rigid", "similarity"):
-        change = max_height_change if motion == "similarity" else 0.0
-        drawn = planar_instances(1, right, max_tilt=max_tilt, height=(1.0 - change, 1.0 + change), **shared)
     else:
-        raise ArgumentError(f"motion must be rigid, similarity or homography, not {motion!r}")
+        change = 0.25 if motion == "similarity" else 0.0
+        drawn = planar_instances(1, right, max_tilt=max_tilt, height=(1.0 - change, 1.0 + change), **shared)
 
     rng = np.random.default_rng((seed, 1))
     points1, points2 = (half * rng.uniform(-1.0, 1.0, (count, 2)) for _ in range(2))

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.division_model import distort
-from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 from rdstitch.radial_homography import lift, project
 from rdstitch.solvers.solutions import Solutions
@@ -27,26 +26,18 @@ _MAX_ROUNDS = 200
 
 @dataclass(frozen=True)
 class Instances:
-    """B instances of k correspondences between two images of a plane."""
+    """B instances of k correspondences between two images of a plane; points and λ are focal-normalized."""
 
-    x1: FloatArray  # x1, x2: (B, k, 2): measured (distorted, noisy) points of image 1 and 2, focal-normalized
+    x1: FloatArray  # measured, noisy; shape (B, k, 2)
     x2: FloatArray
-    homography: FloatArray  # (B, 3, 3): ``p2(λ) ~ H p1(λ)`` with positive third coordinates
-    distortion: FloatArray  # (B,): λ, focal-normalized
+    homography: FloatArray  # p2(λ) ~ H p1(λ) with positive third coordinates; shape (B, 3, 3)
+    distortion: FloatArray
 
     def __len__(self) -> int:
         return len(self.distortion)
 
     def best_errors(self, solutions: Solutions) -> tuple[FloatArray, FloatArray]:
-        """Errors of the solution nearest to the truth in λ, one a sample.
-
-        Returns
-        -------
-        distortion_error : ndarray of shape (B,)
-            ``|λ - λ_true|``; inf where a sample has no solution.
-        homography_error : ndarray of shape (B,)
-            Frobenius distance of the same solution's H from the truth, both of unit norm, up to sign.
-        """
+        """Errors of λ and of H (of unit norm, up to sign) of each sample's solution nearest in λ; inf where none is."""
         distortion_error = np.full(len(self), np.inf)
         homography_error = np.full(len(self), np.inf)
         sample = solutions.sample
@@ -67,12 +58,11 @@ class Instances:
 class PlanarInstances(Instances):
     """Instances of planar motion: ``H = R2 Rz(φ) diag(1, 1, height) T R1'``."""
 
-    # tilt, tilt2: (B, 2): (ψ, θ) of image 1 and image 2, radians; the same unless separate tilts were requested
-    tilt: FloatArray
-    tilt2: FloatArray
-    yaw: FloatArray  # (B,): φ, radians
-    translation: FloatArray  # (B, 2): (tx, ty), in units of the first camera's height above the plane
-    height: FloatArray  # (B,): height of the second camera in units of the first's
+    tilt: FloatArray  # (ψ, θ) of image 1, radians; shape (B, 2)
+    tilt2: FloatArray  # of image 2: the same unless separate tilts were requested
+    yaw: FloatArray  # φ, radians
+    translation: FloatArray  # in heights of the first camera above the plane; shape (B, 2)
+    height: FloatArray  # of the second camera, in heights of the first
 
     def motion(self, index: int) -> PlanarMotion:
         """The motion of one instance whose two tilts are the same."""
@@ -99,30 +89,9 @@ def planar_instances(
 ) -> PlanarInstances:
     """Random planar motion over a plane, seen by a tilted camera with radial distortion.
 
-    Parameters
-    ----------
-    count, points : int
-        B and k: instances, and correspondences in each.
-    distortion : (float, float)
-        Range of λ, uniform.
-    max_tilt : float
-        ψ and θ are uniform in ± this many radians.
-    separate_tilts : bool
-        Whether image 2 has a tilt of its own.
-    yaw, translation, height : (float, float)
-        Ranges of φ (radians), of the length of t (its direction is uniform) and of the second camera's height,
-        all uniform, but thinned where the images have too little in common.
-    half_size : (float, float)
-        Half width and half height of the images, focal lengths.
-    overlap : float
-        Least share of image 1 that image 2 sees, roughly; motions with less are drawn again.
-    noise : float
-        Standard deviation of the normal noise added to both images' points, focal lengths.
-
-    Returns
-    -------
-    PlanarInstances
-        Points uniform over the part of image 1 that is visible in image 2 and well below the horizon.
+    λ, yaw (radians), length of the translation and height are uniform in their ranges, tilts in ±``max_tilt`` radians;
+    motions after which image 2 sees less than ``overlap`` of image 1, roughly, are drawn again. Points are uniform over
+    the part of image 1 that is visible in image 2 and well below the horizon, with normal ``noise`` in both images.
     """
     rng = np.random.default_rng(seed)
     lam = rng.uniform(*distortion, count)
@@ -191,8 +160,6 @@ def _visible_points(
     """Draw points of image 1 and where image 2 sees them, both noisy, and H; motions without enough are drawn again."""
     count, drawn = len(distortion), int(np.ceil(points / overlap))
     half = np.asarray(half_size)
-    if np.min(1.0 + distortion * np.sum(half**2), initial=1.0) <= 0.0:
-        raise ArgumentError(f"a distortion of {np.min(distortion):g} folds the corners of images this large")
     x1, x2 = np.empty((count, points, 2)), np.empty((count, points, 2))
     h = np.empty((count, 3, 3))
     missing = np.arange(count)
@@ -214,15 +181,15 @@ def _visible_points(
         x2[missing] = np.take_along_axis(seen, first, axis=1)
         h[missing] = motion
         missing = missing[~enough]
-    raise ArgumentError("these ranges give images that have too few points in common")
+    raise ValueError("these ranges give images that have too few points in common")
 
 
 @dataclass(frozen=True)
 class RotationInstances(Instances):
     """Instances of rotation: ``H = K R K⁻¹``, ``K = diag(g, g, 1)``."""
 
-    rotation: FloatArray  # (B, 3, 3)
-    focal: FloatArray  # (B,): g, in the unit of the points
+    rotation: FloatArray  # shape (B, 3, 3)
+    focal: FloatArray  # g, in the unit of the points
 
 
 def rotation_instances(
@@ -240,16 +207,7 @@ def rotation_instances(
 ) -> RotationInstances:
     """Random rotations of a camera with radial distortion about its centre.
 
-    Parameters
-    ----------
-    angle : (float, float)
-        Range of the angle between the optical axes, radians; their direction is uniform.
-    roll : float
-        The camera is turned about its axis by up to ± this, radians.
-    focal : (float, float)
-        Range of g, in the unit of the points.
-    half_size : (float, float)
-        Half width and half height of the images, in the unit of the points.
+    ``angle`` is that between the optical axes, in any direction; ``roll`` the largest turn about the axis, radians.
     """
     rng = np.random.default_rng(seed)
     lam = rng.uniform(*distortion, count)

@@ -13,18 +13,16 @@ class LinedTexture:
     """A texture with straight lines painted on it: roads, joints, markings."""
 
     texture: Texture
-    lines: FloatArray  # (L, 2, 2): end points of each, texels
-    width: float = 6.0  # texels
-    level: float = 1.0  # grey of the lines, 0 to 1
+    lines: FloatArray  # end points, texels; shape (L, 2, 2)
+    width: float = 6.0
+    level: float = 1.0
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height, texels."""
         return self.texture.size
 
     @property
     def channels(self) -> int:
-        """1 for grey, 3 for RGB."""
         return self.texture.channels
 
     def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.errors import ArgumentError
 
 Specimen = Literal["fluorescence", "brightfield"]
 
@@ -32,24 +31,18 @@ class StageGrid:
 
     rows: int = 10
     columns: int = 10
-    tile: int = 1024  # side of a tile, pixels
+    tile: int = 1024  # side, pixels
     overlap: float = 0.1  # share of a tile that its neighbour shows too, as the stage is told
-    # "fluorescence": bright nuclei on dark ground, in one channel; "brightfield": stained tissue on bright ground, in
-    # three
-    specimen: Specimen = "fluorescence"
+    specimen: Specimen = "fluorescence"  # bright nuclei on dark ground; or stained tissue on bright ground, in colour
     content: float = 0.6  # share of the ground that shows any
-    backlash: float = 8.0  # pixels that rows taken from left to right are off to the left, and the others to the right
+    backlash: float = 8.0  # pixels that rows from left to right are off to the left, and the others to the right
     jitter: float = 1.5  # standard deviation of each place, pixels
     turn: float = 0.002  # of the camera against the axes of the stage, radians
     shading: float = 0.3  # share of the light that is missing where it is darkest
     offset: float = 100.0  # counts of the camera without light
-    distortion: float = 0.0  # λ of the lens
+    distortion: float = 0.0
     electrons: float = 2.0  # that make a count; more are less noise
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.rows < 1 or self.columns < 1 or not 0.0 < self.overlap < 1.0:
-            raise ArgumentError("a grid has a row, a column and an overlap between 0 and 1 at least")
 
     def __len__(self) -> int:
         """Number of tiles, row by row."""
@@ -95,11 +88,6 @@ class StageGrid:
     def channels(self) -> int:
         """Samples of a pixel."""
         return 3 if self.specimen == "brightfield" else 1
-
-    @property
-    def name(self) -> str:
-        """Pattern of the file names, as ``--grid`` takes it."""
-        return "r{row}c{col}"
 
     def render(self, index: int) -> NDArray[np.uint16]:
         """One tile as the camera gives it, (tile, tile) or (tile, tile, 3), counts of 12 bits."""

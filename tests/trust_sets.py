@@ -137,7 +137,6 @@ def trust_set(seed: int, kind: str | None = None) -> TrustSet:
 
 def _odd_lens(lens: Camera, rng: np.random.Generator) -> Lens:
     """Much the same lens, with its axis off the centre of the image, or with a profile of another kind."""
-    assert lens.focal is not None
     kind = int(rng.integers(3))
     if kind == 0:
         x, y = np.array(lens.center) + lens.scale * rng.normal(0.0, 0.02, 2)
@@ -178,14 +177,12 @@ def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -
     lens, usable, damaged = sequence.lens, False, False
     if kind == "mixed lenses":
         assert isinstance(lens, Camera)
-        assert lens.focal is not None
         zoomed = replace(lens, distortion=lens.distortion / 3 - 0.1 * (lens.distortion > -0.1), focal=1.3 * lens.focal)
         other = replace(sequence, lens=zoomed)
         # A camera that is zoomed in sees the plane from as high as before.
         taken = frozenset(range(3, 5))
     elif kind == "mixed by one":
         assert isinstance(lens, Camera)
-        assert lens.focal is not None
         zoom, bend = OTHERS[int(rng.integers(len(OTHERS)))]
         bend = -bend if lens.distortion < -0.1 else bend
         changed = replace(lens, distortion=lens.distortion / zoom**2 - bend, focal=zoom * lens.focal)
@@ -193,7 +190,6 @@ def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -
         taken = frozenset({int(rng.choice([0, len(sequence) // 2, len(sequence) - 1]))})
     elif kind in SPOILED:
         assert isinstance(lens, Camera)
-        assert lens.focal is not None
         how = str(rng.choice(["zoomed", "other ground", "blurred", "noisy", "aslant", "pattern", "damaged"]))
         usable = how in ("blurred", "noisy", "aslant")
         if how == "zoomed":

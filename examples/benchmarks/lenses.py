@@ -30,7 +30,6 @@ from rdstitch.synthetic import BrownLens, FisheyeLens, Sequence, grid_poses, gro
 from rdstitch.synthetic.lenses import Lens
 
 NAMES = ("fisheye 90", "fisheye 120", "fisheye 140", "phone", "action camera", "one parameter")
-RANDOM = ("random fisheye", "random Brown", "random one parameter")
 _FISHEYES = {90: (0.0, 0.0), 120: (0.05, -0.03), 140: (-0.02, 0.05)}
 _BROWN = {  # focal length in half diagonals, k1, k2, k3, p1, p2, and the offset in shares of width and height
     "phone": ((1.5, 0.08, -0.15, 0.08, 0.0005, -0.0004), (0.0125, -0.0125)),

@@ -15,6 +15,8 @@ _PATCHES = 5000
 _BATCH = 256
 # A patch whose refinement leaves the peak it started from has lost its way.
 _FARTHEST_FROM_PEAK = 1.5
+# Patches with a smaller standard deviation have no texture and are left out; what is less alike counts as not found.
+_LEAST_CONTRAST, _LEAST_CORRELATION = 0.02, 0.7
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,6 @@ def patch_displacements(
     patch: int = 33,
     search: int = 16,
     spacing: int | None = None,
-    least_contrast: float = 0.02,
-    least_correlation: float = 0.7,
 ) -> Displacements:
     """Look for patches of an image in another one that shows nearly the same.
 
@@ -56,8 +56,7 @@ def patch_displacements(
     ``image``, ``other``: in [0, 1]; shape (h, w). ``valid``: where ``image`` and ``other`` mean something; a patch must
     lie inside with all its px; shape (h, w). ``patch``: side of a patch, px; odd. ``spacing``: distance between
     patches, px; if not given, 24 or what makes some 5,000 patches. ``search``: largest displacement along each axis,
-    px. ``least_contrast``: patches with a smaller standard deviation have no texture and are left out.
-    ``least_correlation``: what is less alike counts as not found.
+    px.
     """
     half = patch // 2
     step = max(24, int(np.sqrt(image.size / _PATCHES))) if spacing is None else spacing
@@ -68,7 +67,7 @@ def patch_displacements(
     y, x = y[keep], x[keep]
     windows = np.lib.stride_tricks.sliding_window_view(image, (patch, patch))
     templates = windows[y - half, x - half].copy() if len(x) else np.empty((0, patch, patch), np.float32)
-    textured = templates.std(axis=(1, 2)) >= least_contrast
+    textured = templates.std(axis=(1, 2)) >= _LEAST_CONTRAST
     templates, y, x = templates[textured], y[textured], x[textured]
     center = np.column_stack([x, y]).astype(np.float64)
 
@@ -85,7 +84,7 @@ def patch_displacements(
     for first in range(0, len(center), _BATCH):
         part = np.s_[first : first + _BATCH]
         displacement[part], correlation[part] = _refine(templates[part], layers, center[part], peak[part])
-    lost = (np.abs(displacement - peak) > _FARTHEST_FROM_PEAK).any(axis=1) | ~(correlation >= least_correlation)
+    lost = (np.abs(displacement - peak) > _FARTHEST_FROM_PEAK).any(axis=1) | ~(correlation >= _LEAST_CORRELATION)
     displacement[lost] = np.nan
     return Displacements(center, displacement, correlation)
 

@@ -7,57 +7,28 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
-from rdstitch.errors import ArgumentError
 
 
 @dataclass(frozen=True)
 class TrajectoryError:
-    """How far a trajectory is from the truth.
+    """How far a trajectory is from the truth."""
 
-    Attributes
-    ----------
-    translation : float
-        Median error of the relative translations, as a share of their length, in heights.
-    translation_rms : float
-        Root mean square error of the relative translations over their root mean square length.
-    translation_in_own_unit : float
-        As ``translation``, after the best scale: the height in pixels is known only as well as the focal length.
-    rotation : float
-        Median error of the relative rotations, radians.
-    rotation_rms : float
-        Root mean square of the same.
-    drift : float
-        Root mean square distance of the positions from the true ones after the best similarity, as a share of the
-        length of the path.
-    scale : float
-        Length unit of the estimate in that of the truth, of the best similarity.
-    """
-
-    translation: float
-    translation_rms: float
-    translation_in_own_unit: float
-    rotation: float
-    rotation_rms: float
-    drift: float
-    scale: float
+    translation: float  # median error of the relative translations, as a share of their length, in heights
+    translation_in_own_unit: float  # after the best scale: the height in px is known as well as the focal length
+    rotation: float  # median error of the relative rotations, radians
+    drift: float  # root mean square distance of positions after the best similarity, as a share of the path's length
+    scale: float  # length unit of the estimate in that of the truth, of the best similarity
 
 
-def compare_trajectories(estimate: Trajectory, truth: Trajectory, step: int = 1) -> TrajectoryError:
+def compare_trajectories(estimate: Trajectory, truth: Trajectory) -> TrajectoryError:
     """Compare a trajectory with the true one, over the frames that both have.
 
     Relative motions are compared as the earlier frame sees them, in units of its height, so that neither the frame
     nor the unit of either trajectory matters.
-
-    Raises
-    ------
-    ArgumentError
-        When fewer than ``step + 1`` frames are in both.
     """
-    common, own, other = np.intersect1d(estimate.frame, truth.frame, return_indices=True)
-    if len(common) <= step:
-        raise ArgumentError(f"only {len(common)} frames are in both trajectories")
+    _, own, other = np.intersect1d(estimate.frame, truth.frame, return_indices=True)
     a, b = _chosen(estimate, own), _chosen(truth, other)
-    (move_a, turn_a), (move_b, turn_b) = _relative(a, step), _relative(b, step)
+    (move_a, turn_a), (move_b, turn_b) = _relative(a), _relative(b)
     off = np.linalg.norm(move_a - move_b, axis=1)
     size = np.linalg.norm(move_b, axis=1)
     unit = float(np.vdot(move_a, move_b) / max(float(np.vdot(move_a, move_a)), 1e-300))
@@ -71,10 +42,8 @@ def compare_trajectories(estimate: Trajectory, truth: Trajectory, step: int = 1)
     distance = np.abs(factor * centred_a - centred_b)
     return TrajectoryError(
         translation=float(np.median(off[moving] / size[moving])) if moving.any() else 0.0,
-        translation_rms=float(np.sqrt(np.mean(off**2) / max(float(np.mean(size**2)), 1e-300))),
         translation_in_own_unit=float(np.median(off_scaled[moving] / size[moving])) if moving.any() else 0.0,
         rotation=float(np.median(turn)),
-        rotation_rms=float(np.sqrt(np.mean(turn**2))),
         drift=float(np.sqrt(np.mean(distance**2))) / max(b.length, 1e-300),
         scale=float(np.abs(factor)),
     )
@@ -86,9 +55,9 @@ def _chosen(trajectory: Trajectory, rows: NDArray[np.intp]) -> Trajectory:
     return Trajectory(t.frame[rows], t.position[rows], t.yaw[rows], t.height[rows])
 
 
-def _relative(path: Trajectory, step: int) -> tuple[FloatArray, FloatArray]:
-    """Translations (F - step, 2), in heights, and rotations to the ``step``-th frame after each, as that sees them."""
-    move = path.position[step:] - path.position[:-step]
-    c, s = np.cos(path.yaw[:-step]), np.sin(path.yaw[:-step])
+def _relative(path: Trajectory) -> tuple[FloatArray, FloatArray]:
+    """Translations (F - step, 2), in heights, and rotations to the next frame, as each sees them."""
+    move = np.diff(path.position, axis=0)
+    c, s = np.cos(path.yaw[:-1]), np.sin(path.yaw[:-1])
     turned = np.stack([c * move[:, 0] - s * move[:, 1], s * move[:, 0] + c * move[:, 1]], axis=1)
-    return turned / path.height[:-step, None], path.yaw[step:] - path.yaw[:-step]
+    return turned / path.height[:-1, None], np.diff(path.yaw)

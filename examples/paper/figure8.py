@@ -12,13 +12,7 @@ from typing import Any
 import numpy as np
 
 from examples.judging import fit_similarity
-from examples.paper.common.charts import (
-    before_and_after,
-    off_grid,
-    rendered_chart,
-    seen_corners,
-    undistorted,
-)
+from examples.paper.common.charts import before_and_after, off_grid, rendered_chart, seen_corners, undistorted
 from examples.paper.common.drives import Drive, drive, estimated_links
 from examples.paper.common.plain_ransac import all_solvers, best_of
 from examples.paper.common.report import Pixels, Report, Table

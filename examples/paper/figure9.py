@@ -15,12 +15,7 @@ from examples.paper.common.plain_ransac import all_solvers, best_of
 from examples.paper.common.report import Report, Table
 from examples.paper.common.settings import Settings
 from rdstitch.alignment import align
-from rdstitch.alignment.bundle_adjustment import (
-    BundleAdjuster,
-    BundleAdjustmentResult,
-    FreeParameters,
-    Parameters,
-)
+from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, FreeParameters, Parameters
 from rdstitch.alignment.motion_models import RIGID, YAW, X, Y
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Prior, Priors

@@ -11,7 +11,6 @@ PAIRS = 20
 
 def _estimate(matches: SyntheticMatches, *, tilt: bool, seed: int = 0) -> rdstitch.RadialHomography:
     motion = matches.truth.motion
-    assert motion is not None
     return rdstitch.estimate_radial_homography(
         matches.points1,
         matches.points2,

@@ -17,6 +17,8 @@ from jsonschema import Draft202012Validator
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera, CameraRecord
+from rdstitch.features import FeatureOptions
+from rdstitch.options import StitchOptions
 from rdstitch.radial_homography import project
 from rdstitch.records import convert
 from rdstitch.sidecar.schema import json_schema
@@ -42,6 +44,8 @@ _cache = tempfile.TemporaryDirectory(prefix="rdstitch-tests-")
 # For tests of what comes before and after registration: the same images are registered once in a process of tests.
 CACHE = ("--cache", _cache.name)
 CACHED = (*FAST, *CACHE)
+OPTIONS = StitchOptions(workers=1, features=FeatureOptions(max_features=600), cache=Path(_cache.name))
+"""What ``CACHED`` says, for the library."""
 
 
 _MADE = re.compile(r", \d+\.\d s$")

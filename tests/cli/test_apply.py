@@ -86,7 +86,6 @@ def _written(frames: list[Path], folder: Path, names: list[str], factor: float =
     folder.mkdir()
     for frame, name in zip(frames, names, strict=True):
         image = cv2.imread(str(frame))
-        assert image is not None
         if band is not None:
             image = image[..., band]
         assert cv2.imwrite(str(folder / name), cv2.resize(image, None, fx=factor, fy=factor))
@@ -99,7 +98,6 @@ def test_images_of_another_size(rdstitch: Run, frames: list[Path], stitched: Pat
     _apply(rdstitch, _sidecar(stitched), large, tmp_path / "large.tif", err="")
     small, twice = read_image(stitched), read_image(tmp_path / "large.tif")
     assert np.abs(np.array(twice.pixels.shape[:2]) - 2 * np.array(small.pixels.shape[:2])).max() <= 2
-    assert small.alpha is not None
     height, width = small.pixels.shape[:2]
     reduced = cv2.resize(twice.pixels, (width, height), interpolation=cv2.INTER_AREA)
     inside = cv2.erode(small.alpha, np.ones((15, 15), np.uint8)) > 0

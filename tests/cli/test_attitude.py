@@ -55,7 +55,7 @@ def test_measured_tilts_are_used(windy: Sequence, tmp_path: Path, error: float, 
     assert registration.alignment.used.all()
     assert registration.alignment.model != "homography"
     assert abs(registration.alignment.distortion - lens.distortion) < 0.005
-    difference = np.degrees(registration.alignment.poses.tilt - windy.poses.tilt)  # type: ignore[union-attr]
+    difference = np.degrees(registration.alignment.poses.tilt - windy.poses.tilt)
     assert np.abs(difference).max() < (0.01 if std == 0.0 else 1.0)
     assert len(path.position) == len(paths)
 
@@ -88,7 +88,6 @@ def test_drones_write_tilts_into_their_images(windy: Sequence, tmp_path: Path, s
     alignment = registration.alignment
     assert alignment.used.all()
     assert abs(alignment.distortion - lens.distortion) < 0.005
-    assert alignment.poses is not None
     assert np.degrees(np.abs(alignment.poses.tilt - windy.poses.tilt)).max() < (0.01 if std == 0.0 else 1.0)
 
 

@@ -23,7 +23,6 @@ _DOCUMENT = Path(__file__).parents[2] / "docs" / "guide.md"
 
 def _example() -> str:
     found = re.search(r"```toml\n(.*?)```", _DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
-    assert found is not None
     return found[1]
 
 

@@ -32,7 +32,6 @@ def test_faults_are_found(frames: list[Path], stranger: Path, tmp_path: Path) ->
         shutil.copy(frame, tmp_path)
     shutil.copy(stranger, tmp_path / "stranger.png")
     sharp = cv2.imread(str(frames[1]))
-    assert sharp is not None
     cv2.imwrite(str(tmp_path / "blurred.png"), cv2.GaussianBlur(sharp, (0, 0), 3.0))
     cv2.imwrite(str(tmp_path / "burnt.png"), np.minimum(sharp * 3.0, 255).astype(np.uint8))
     cv2.imwrite(str(tmp_path / "dark.png"), sharp // 20)

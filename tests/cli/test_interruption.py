@@ -44,7 +44,6 @@ def test_an_interrupted_run_ends_its_workers_and_can_be_continued(strip: Path, t
     options = ("-j", "2", "--max-features", "200", "-v", "--cache", tmp_path / "cache")
     arguments = ("calibrate", strip, "-o", tmp_path / "camera.json", *options)
     process = start(*arguments)
-    assert process.stderr is not None
     while not process.stderr.readline().startswith(b"rdstitch: comparing"):
         assert process.poll() is None
     workers = _children(process.pid)
@@ -69,9 +68,7 @@ def test_debug_shows_where(capsys: pytest.CaptureFixture[str], place: Path) -> N
 
 def test_nobody_reads_the_output(place: Path) -> None:
     process = start("pano", place / "a.png", place / "b.png", "-o", place / "out.png", *FAST)
-    assert process.stdout is not None
     process.stdout.close()
-    assert process.stderr is not None
     said = process.stderr.read()
     process.stderr.close()
     assert process.wait() == 141
@@ -83,7 +80,6 @@ def test_nobody_reads_the_output(place: Path) -> None:
 def test_termination_leaves_nothing_behind(place: Path, signal_number: int) -> None:
     before = state_of(place)
     process = start("pano", place / "a.png", place / "b.png", "-o", place / "out.png", "-v", *FAST)
-    assert process.stderr is not None
     assert process.stderr.readline().startswith(b"rdstitch: detecting")
     process.send_signal(signal_number)
     done = finished(process)
@@ -98,7 +94,6 @@ def test_killed_at_any_moment(place: Path, attempt: int) -> None:
     assert finished(start(*command, "--max-size", "100")).status == 0
     old = (place / "out.png").read_bytes()
     process = start(*command, "-v")
-    assert process.stderr is not None
     assert process.stderr.readline()
     time.sleep(random.Random(attempt).uniform(0.0, 1.5))
     process.kill()

@@ -35,7 +35,6 @@ def test_writes_image_sidecar_and_camera_and_prints_lambda(
 
     written = read_image(output)
     assert [*written.pixels.shape[1::-1]] == record["output"]["size"]
-    assert written.alpha is not None
     numbers = alignment_error(sequence, transfers(record), model="homography")
     assert numbers.median < 1.0
     seen = compare_with_plane(

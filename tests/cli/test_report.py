@@ -24,8 +24,9 @@ from rdstitch.progress import StageTimer
 from rdstitch.report import geometry as thumbnails
 from rdstitch.report import report_page, write_report
 from rdstitch.report.pairs import matched
+from rdstitch.stitch_result import StitchResult
 from rdstitch.verification.findings import Finding
-from tests.cli.running import CACHED, Run
+from tests.cli.running import CACHED, OPTIONS, Run
 
 _VOID = {"meta", "img"}
 _SECTIONS = ["Summary", "Warnings and left-out images", "Mosaic", "Match graph", "Votes on λ", "Lens curve"]
@@ -90,6 +91,11 @@ def reported(frames: list[Path], stranger: Path, tmp_path_factory: pytest.TempPa
     return report
 
 
+@pytest.fixture(scope="module")
+def pair(frames: list[Path]) -> StitchResult:
+    return pano(frames[:2], options=OPTIONS)
+
+
 def test_a_mosaic_has_every_section(reported: Path, stranger: Path, frames: list[Path]) -> None:
     page = _checked(reported.read_text(encoding="utf-8"))
     assert page.headings == _SECTIONS
@@ -106,7 +112,7 @@ def test_a_mosaic_has_every_section(reported: Path, stranger: Path, frames: list
 
 
 def test_displacements_are_told_of_each_image(frames: list[Path]) -> None:
-    options = StitchOptions(workers=1, local_alignment=6)
+    options = replace(OPTIONS, local_alignment=6)
     result = pano(frames[:2], options=options)
     told = report_page(result).split("<h2>Local alignment</h2>")[1].split("</section>")[0]
     assert all(f"<td>{frame.name}</td><td>up to {field.largest:.1f} pixels</td>" in told
@@ -116,19 +122,18 @@ def test_displacements_are_told_of_each_image(frames: list[Path]) -> None:
     assert "the alignment puts them: switched off" in off
 
 
-def test_the_numbers_are_those_of_the_result(frames: list[Path]) -> None:
-    result = pano(frames[:2], options=StitchOptions(workers=1))
-    page = _checked(report_page(result))
-    (fit,) = result.registration.alignment.links
-    assert f"{fit.inliers} of {result.registration.pairs[0].relation.inliers.sum()} inliers" in page.text
-    assert f"{result.distortion:.6f} ± {result.registration.alignment.distortion_std:.6f}" in page.text
-    assert "{} x {} pixels".format(*result.canvas.size) in page.text
+def test_the_numbers_are_those_of_the_result(pair: StitchResult) -> None:
+    page = _checked(report_page(pair))
+    (fit,) = pair.registration.alignment.links
+    assert f"{fit.inliers} of {pair.registration.pairs[0].relation.inliers.sum()} inliers" in page.text
+    assert f"{pair.distortion:.6f} ± {pair.registration.alignment.distortion_std:.6f}" in page.text
+    assert "{} x {} pixels".format(*pair.canvas.size) in page.text
     assert "They were not measured." in page.text
     # One pair is best and worst.
     assert "The pair: " in page.text
-    assert result.composite is not None
+    assert pair.composite is not None
     # Outlines and the pair over them; nothing is drawn twice.
-    graph = report_page(result).split("<h2>Match graph</h2>")[1].split("</section>")[0]
+    graph = report_page(pair).split("<h2>Match graph</h2>")[1].split("</section>")[0]
     assert (graph.count("<path"), graph.count("<line"), graph.count("<circle")) == (2, 1, 2)
 
 
@@ -183,7 +188,7 @@ def test_names_are_escaped_and_vanished_images_do_not_matter(frames: list[Path],
 def test_of_a_large_tiff_an_overview_is_read(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    result = pano(frames[:2], tmp_path / "large.tif", StitchOptions(workers=1, composite=CompositeOptions(scale=3.0)))
+    result = pano(frames[:2], tmp_path / "large.tif", replace(OPTIONS, composite=CompositeOptions(scale=3.0)))
     whole = _decoded(thumbnails.of_mosaic(result, 300))
     monkeypatch.setattr(preview, "_OVERVIEW_FROM", 1000)
     monkeypatch.setattr(preview, "read_image", None)
@@ -196,7 +201,6 @@ def test_of_a_large_tiff_an_overview_is_read(
 
 
 def _decoded(address: str | None) -> NDArray[np.uint8]:
-    assert address is not None
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))))
 
 
@@ -229,7 +233,7 @@ def test_a_browser_shows_it(reported: Path, tmp_path: Path) -> None:
 
 
 def test_the_best_pair_has_many_matches(frames: list[Path]) -> None:
-    result = pano(frames, options=StitchOptions(workers=1))
+    result = pano(frames, options=OPTIONS)
     links = result.registration.alignment.links
     few = replace(links[0], inliers=22, rms=0.001)
     alignment = replace(result.registration.alignment, links=(few, *links[1:]))
@@ -240,13 +244,12 @@ def test_the_best_pair_has_many_matches(frames: list[Path]) -> None:
 
 
 def test_an_image_larger_than_any_cameras_is_shown_or_said_to_be_too_large(
-    frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pair: StitchResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    result = pano(frames, options=StitchOptions(composite=CompositeOptions(scale=0.5)))
     monkeypatch.setattr("rdstitch.io.opening._MAX_MEGAPIXELS", 0.01)
     for suffix, shown in ((".jpg", True), (".png", False)):
         file = tmp_path / f"large{suffix}"
-        Image.new("RGB", result.canvas.size, (10, 200, 30)).save(file)
-        page = report_page(replace(result, composite=None, output=file))
+        Image.new("RGB", pair.canvas.size, (10, 200, 30)).save(file)
+        page = report_page(replace(pair, composite=None, output=file))
         assert ("too large to be shown here" in page) is not shown
         assert "Match graph" in page

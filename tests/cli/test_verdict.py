@@ -55,7 +55,6 @@ def test_two_images_of_two_lenses_are_noticed(rdstitch: Run, tmp_path: Path) -> 
     found = re.search(
         r"two lenses or zooms are mixed: (\w+\.png) \(λ about (-0\.\d+)\) and (\w+\.png) \((-0\.\d+)\)", done.line
     )
-    assert found is not None
     seen = {found[1]: float(found[2]), found[3]: float(found[4])}
     assert seen == {"own_0.png": pytest.approx(-0.2, abs=0.02), "other_1.png": pytest.approx(-0.12, abs=0.02)}
     assert not (tmp_path / "out.png").exists()

@@ -29,7 +29,6 @@ def page(rdstitch: Run, frames: list[Path], tmp_path: Path) -> Path:
 
 def _data(page: Path) -> dict[str, Any]:
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text(encoding="utf-8"))
-    assert found is not None
     data: dict[str, Any] = json.loads(found[1])
     return data
 
@@ -89,7 +88,6 @@ def test_the_scale_bar_has_a_round_length_that_fits(unit: float, length: float) 
     script = (_ROOT / "rdstitch" / "viewer" / "viewer.js").read_text(encoding="utf-8")
     assert subprocess.run([node, "--check", "-"], input=script, text=True, check=False).returncode == 0
     found = re.search(r"^const barLength = .*?^};", script, re.MULTILINE | re.DOTALL)
-    assert found is not None
     code = f"{found[0]} console.log(barLength({unit}, 150));"
     done = subprocess.run([node, "-e", code], capture_output=True, text=True, check=True)
     assert float(done.stdout) == pytest.approx(length)

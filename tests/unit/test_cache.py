@@ -16,7 +16,7 @@ from rdstitch.cache import Cache
 
 
 @pytest.fixture(autouse=True)
-def _forgetsoftware() -> Iterator[None]:
+def _forget_software() -> Iterator[None]:
     """The digest of the sources is computed once a process."""
     cache.software.cache_clear()
     yield
@@ -122,7 +122,6 @@ def test_the_store_of_a_killed_run_is_removed_by_the_next(tmp_path: Path, monkey
     (left,) = tmp_path.iterdir()
     kept = Cache.for_this_run()
     assert not left.exists()
-    assert kept.folder is not None
     assert kept.folder.exists()
 
 

@@ -5,12 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rdstitch.alignment.bundle_adjustment import (
-    BundleAdjuster,
-    BundleAdjustmentResult,
-    FreeParameters,
-    Parameters,
-)
+from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, FreeParameters, Parameters
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors, whitened_errors
 from rdstitch.alignment.motion_models import MODELS, MotionModel, inverses

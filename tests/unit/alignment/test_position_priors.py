@@ -39,7 +39,6 @@ def _without(relief: float) -> Alignment:
 
 def _bend(found: Alignment, given: Scene) -> float:
     """Largest distance of an image from its place after a similarity, in lengths of the strip."""
-    assert found.poses is not None
     a, b = (places @ [1.0, 1.0j] for places in (found.poses.position, given.poses[:, [X, Y]]))
     a, b = a - a.mean(), b - b.mean()
     return float(np.abs(b - np.vdot(a, b) / np.vdot(a, a) * a).max() / np.ptp(b.real))

@@ -67,7 +67,6 @@ def test_heights_are_found_as_they_scatter() -> None:
     choice = choose_over_relief(problem, ModelChoice(fit, "", 1.0), ["similarity"])
     weighted = weighted_by_relief(problem, choice.fit)
     relief = weighted.observations.relief
-    assert relief is not None
     noise = choice.fit.adjusted.sigma
     o = problem.observations
     moved = np.linalg.norm(relief, axis=1) * noise
@@ -88,10 +87,8 @@ def test_a_common_displacement_adds_its_square_to_the_covariance() -> None:
 def test_the_displacements_go_with_their_observations() -> None:
     problem, fit = _fitted(_scene(0.08))
     o = weighted_by_relief(problem, fit).observations
-    assert o.relief is not None
     few, thin = o.subset(np.array([2, 0])), o.thinned(20)
     for own in (few, thin):
-        assert own.relief is not None
         assert own.relief.shape == own.points1.shape
         rows = [int(np.flatnonzero((o.points1 == point).all(axis=1))[0]) for point in own.points1]
         np.testing.assert_array_equal(own.relief, o.relief[rows])

@@ -35,7 +35,6 @@ def _sheared(row: Scene, amount: float) -> Scene:
 
 def test_a_plain_row_is_not_doubted() -> None:
     found = _aligned(_row()).shape
-    assert found is not None
     assert not found.doubtful
     assert not found.shown
     assert np.hypot(found.shift, found.shift_std) < 2.0
@@ -43,7 +42,6 @@ def test_a_plain_row_is_not_doubted() -> None:
 
 def test_a_rolling_shutter_is_shown_and_named() -> None:
     found = _aligned(_sheared(_row(), 0.1), lens="division").shape
-    assert found is not None
     assert found.doubtful
     assert found.shown
 
@@ -59,7 +57,6 @@ def test_images_cropped_each_elsewhere_are_doubted(seed: int) -> None:
         for link in row.links
     ]
     found = _aligned(replace(row, links=links)).shape
-    assert found is not None
     assert found.doubtful
     assert found.shown
 
@@ -70,10 +67,8 @@ def test_an_off_center_lens_is_found_in_three_images_or_shown() -> None:
     row = _row(4, lens=lens)
     freed = _aligned(row)
     assert np.abs(np.array(freed.cameras[0].center) - lens.center).max() < 8.0
-    assert freed.shape is not None
     assert not freed.shape.doubtful
     held = _aligned(row, lens="division").shape
-    assert held is not None
     assert held.shown
     assert "axis is off the middle" in held.cause
 
@@ -85,7 +80,6 @@ def test_what_the_images_cannot_exclude_is_said() -> None:
     row = scene(poses, rng=rng, reach=1, overlap=0.05, outliers=0.0, noise=0.6, per_link=30)
     assert poses[:, X].std() > 1.0
     found = _aligned(row).shape
-    assert found is not None
     assert found.doubtful
     assert not found.shown
     assert found.image in (0, 13)

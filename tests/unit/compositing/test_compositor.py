@@ -32,7 +32,6 @@ def _seams(scene: Scene, options: CompositeOptions) -> NDArray[np.bool_]:
     """Px within two of a seam."""
     with prepare_composite(scene.images, scene.canvas, options) as ready:
         seams = ready.renderer.seams
-    assert seams is not None
     box = (0, 0, *scene.canvas.size)
     shares = np.stack([seams.share(k, box) for k in range(len(scene.frames))])
     owner = np.where(shares.max(axis=0) > 0, shares.argmax(axis=0), -1)

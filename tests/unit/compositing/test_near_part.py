@@ -36,7 +36,6 @@ def test_an_image_from_above_is_drawn_whole() -> None:
 @pytest.mark.parametrize("tilt", [0.9, 1.2])
 def test_nothing_is_drawn_beyond_the_stretch(tilt: float) -> None:
     near = _near(tilt)
-    assert near is not None
     outline = near.outline()
     plane = to_plane(LENS, _image_to_plane(tilt), outline)
     assert np.isfinite(plane).all()
@@ -52,15 +51,12 @@ def test_nothing_is_drawn_beyond_the_stretch(tilt: float) -> None:
 
 def test_the_mask_is_what_the_outline_encloses() -> None:
     near = _near(1.2)
-    assert near is not None
     whole = DecodedImage(np.full((300, 400), 200, np.uint8), None, Metadata((400, 300)))
     drawn = near.masked(whole).alpha
-    assert drawn is not None
     x, y = near.outline().T
     area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
     assert (drawn > 0).sum() == pytest.approx(area, rel=0.01)
     half = near.masked(DecodedImage(np.full((150, 200), 200, np.uint8), None, Metadata((400, 300)))).alpha
-    assert half is not None
     assert (half > 0).sum() * 4 == pytest.approx(area, rel=0.02)
 
 

@@ -27,7 +27,6 @@ LENS = Camera((160, 120), -0.2, focal=110.0, focal_source="option")
 
 def _directions(rotations: np.ndarray) -> np.ndarray:
     """What the alignment gives: from undistorted coordinates, in half diagonals, to directions."""
-    assert LENS.focal is not None
     return np.swapaxes(rotations, 1, 2) @ np.diag([1.0, 1.0, LENS.focal / LENS.scale])
 
 

@@ -57,7 +57,6 @@ def test_a_rectangle_seen_squarely_says_nothing_of_the_focal_length() -> None:
 def test_edges_of_a_wall_among_others(focal: Focal) -> None:
     edges = Edges.between(_joints(np.random.default_rng(0), 250), 0.3 * PIXEL)
     found = of_scene(edges, np.eye(3), focal, depth=False)
-    assert found is not None
     upright, across, down = found
     assert 150 < across + down < 280
     assert upright.focal.value == pytest.approx(FOCAL, rel=0.02)
@@ -73,7 +72,6 @@ def test_edges_all_around_a_camera() -> None:
     ends = np.stack([start, start + np.eye(3)[rng.integers(0, 3, 300)] * 0.4], axis=1) @ turn.T
     edges = Edges.between(ends + rng.normal(0.0, 1e-4, ends.shape), 1e-4, on_sphere=True)
     found = of_scene(edges, np.eye(3), Focal(1.0), depth=True)
-    assert found is not None
     upright = found[0]
     np.testing.assert_allclose(upright.axes, turn[:, :2].T, atol=1e-3)
     assert upright.focal.value == 1.0
@@ -99,10 +97,8 @@ def test_few_lines_turn_as_little_as_will_do() -> None:
 def test_a_view_is_turned_right_up_and_clockwise() -> None:
     for name, seen in (("yaw", (0.5, 0.0)), ("pitch", (0.0, -0.5))):
         view = CompositeOptions(**{name: np.degrees(np.arctan(0.5))}).view
-        assert view is not None
         ahead = view @ (*seen, 1.0)
         np.testing.assert_allclose(ahead[:2], 0.0, atol=1e-12)
     rolled = CompositeOptions(roll=10.0).view
-    assert rolled is not None
     assert rolled @ (1.0, 0.0, 0.0) == pytest.approx((np.cos(np.radians(10)), -np.sin(np.radians(10)), 0.0))
     assert CompositeOptions().view is None

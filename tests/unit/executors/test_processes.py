@@ -95,7 +95,6 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
         time.sleep(60)
     """
     parent = subprocess.Popen([sys.executable, "-c", textwrap.dedent(program)], stdout=subprocess.PIPE)
-    assert parent.stdout is not None
     worker = int(parent.stdout.readline())
     assert _alive(worker)
     parent.kill()

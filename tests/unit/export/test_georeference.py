@@ -105,7 +105,6 @@ def test_a_tiff_lies_in_the_right_place_and_north_is_up(
     )
     assert record["gsd_m"] == pytest.approx(transform.a)
     assert record["rms_m"] < 4 * METRES_PER_TEXEL
-    assert result.georeference is not None
     assert result.georeference.summary in [message.text for message in result.messages]
 
 
@@ -118,8 +117,6 @@ def test_the_frame_of_the_reference_is_kept_on_request(
         for given in ({"north_up": False}, {"rotate": 30.0})
     ]
     places = [result.georeference for result in turned]
-    assert places[0] is not None
-    assert places[1] is not None
     assert places[1].clockwise_deg == pytest.approx(places[0].clockwise_deg - 30.0, abs=1e-6)
 
 
@@ -226,8 +223,6 @@ def test_one_bad_position_of_eight_is_named_and_left_out(wrong: GpsPosition, off
     straight, lens, to_output, names = _row(8)
     whole, _ = georeference([*straight[:4], None, *straight[5:]], lens, to_output, names)
     place, _ = georeference([*straight[:4], wrong, *straight[5:]], lens, to_output, names)
-    assert whole is not None
-    assert place is not None
     assert (place.used, len(place.residuals)) == (7, 8)
     ((name, away),) = place.rejected
     assert name == "4.jpg"
@@ -250,7 +245,6 @@ def test_control_points_place_the_output_instead_of_positions() -> None:
             u, v = from_plane(lens[image], to_output[image], np.array([(x, y)]))[0]
             control[image].append(GroundControl(f"P{number}", GpsPosition(latitude, longitude), 32632, (u, v)))
     place, _ = georeference(straight, lens, to_output, names, control=control)
-    assert place is not None
     assert (place.crs, place.source, place.used) == (Crs(32632), "ground control points", 5)
     assert [name for name, _ in place.rejected] == ["P4"]
     assert place.rejected[0][1] == pytest.approx(2.0 * 2**0.5, rel=0.01)
@@ -306,8 +300,6 @@ def test_positions_and_control_points_from_files(
     (tmp_path / "gcp.txt").write_text("\n".join(["EPSG:32734", *lines]), encoding="utf-8")
     options = replace(cached, gcp=tmp_path / "gcp.txt", composite=replace(small, epsg=None))
     result = mosaic(plain, tmp_path / "a.tif", options)
-    assert by_positions is not None
-    assert result.georeference is not None
     assert by_positions.used == 6
     np.testing.assert_allclose(result.georeference.pixel_to_map, by_positions.pixel_to_map, atol=0.1)
     record = json.loads((tmp_path / "a.tif.json").read_text(encoding="utf-8"))["output"]["georeference"]

@@ -53,7 +53,6 @@ def _chance(features1: Features, features2: Features, count: int) -> Corresponde
 def test_what_overlaps_is_kept_and_most_of_the_rest_is_not(images: tuple[Features, Features]) -> None:
     everything = match(*images)
     parts = overlapping(*images, _some(everything, 80))
-    assert parts is not None
     for side, (part, features) in enumerate(zip(parts, images, strict=True)):
         assert np.isin(everything.indices[:, side], part).all()
         assert len(part) < 0.6 * len(features)
@@ -71,8 +70,6 @@ def test_matches_in_the_overlap_are_those_of_the_whole(images: tuple[Features, F
 def test_a_few_matches_by_chance_do_not_widen_it(images: tuple[Features, Features]) -> None:
     some = _some(match(*images), 80)
     alone, beside = overlapping(*images, some), overlapping(*images, _joined(some, _chance(*images, 6)))
-    assert alone is not None
-    assert beside is not None
     for clean, disturbed in zip(alone, beside, strict=True):
         assert len(np.setdiff1d(disturbed, clean)) < 0.1 * len(clean)
 
@@ -102,7 +99,5 @@ def test_where_matches_are_sparse_it_reaches_farther(images: tuple[Features, Fea
         overlapping(*images, Correspondences.of(*images, everything.indices[kept], everything.ratio[kept]))
         for kept in (thinned, dense)
     )
-    assert told is not None
-    assert untold is not None
     assert np.isin(everything.indices[:, 0], told[0]).all()
     assert not np.isin(everything.indices[:, 0], untold[0]).all()

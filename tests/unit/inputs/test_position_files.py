@@ -50,8 +50,6 @@ def _read(folder: Path, text: str, epsg: int | None = None, offset: float = 0.0)
 def test_tables(tmp_path: Path, text: str) -> None:
     one, two, three = _read(tmp_path, text)
     assert three is None
-    assert one is not None
-    assert two is not None
     assert (one.latitude, one.longitude, one.altitude) == pytest.approx((48.8582222222, -2.2945, 35.5), abs=1e-9)
     np.testing.assert_allclose((two.latitude, two.longitude), (-48.8582222222, 2.2945), atol=1e-9)
     assert two.altitude is None
@@ -69,8 +67,6 @@ def test_projected_coordinates(tmp_path: Path, head: str) -> None:
     if head.startswith("EPSG"):
         rows = [row.replace(",", " ") for row in rows]
     one, two, _ = _read(tmp_path, "\n".join([head, *rows]), None if head.startswith("EPSG") else 32734)
-    assert one is not None
-    assert two is not None
     assert (one.latitude, one.longitude, one.altitude) == pytest.approx((-33.9, 18.5, 12.0), abs=1e-7)
     np.testing.assert_allclose(Crs(32734).project([two.latitude], [two.longitude])[0, 0], 268932.2996, atol=1e-3)
 
@@ -83,10 +79,8 @@ GPX = """<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1"><tr
 
 def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> None:
     one, two, three = _read(tmp_path, GPX)
-    assert one is not None
     assert (one.latitude, one.altitude) == pytest.approx((10.001, 110.0))
     assert abs(abs(one.longitude) - 180.0) < 1e-9
-    assert two is not None
     assert (two.latitude, two.longitude, two.altitude) == pytest.approx((10.002, -179.999, 120.0))
     assert three is None
     shifted = _read(tmp_path, GPX, offset=-20.0)

@@ -24,7 +24,6 @@ def test_the_tilt_of_a_known_camera(source: str, element: bool) -> None:
     for rotation, tilt in zip(poses.from_plane()[:, :, :2], poses.tilt, strict=True):
         yaw, pitch, roll = euler_angles(source, rotation, north=rng.uniform(-np.pi, np.pi))
         found = read_attitude(xmp_of(source, yaw, pitch, roll, element=element))
-        assert found is not None
         assert found.source == source
         np.testing.assert_allclose(tilt_from_normal(found.nadir), tilt, atol=1e-6)
 

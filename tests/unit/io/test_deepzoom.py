@@ -34,7 +34,6 @@ def test_levels_and_tiles_are_those_of_the_standard(tmp_path: Path, width: int, 
     write_image(tmp_path / "a.dzi", pixels)
     image = ElementTree.parse(tmp_path / "a.dzi").getroot()
     size = image.find(f"{NAMESPACE}Size")
-    assert size is not None
     assert image.tag == f"{NAMESPACE}Image"
     assert image.attrib == {"Format": "jpg", "Overlap": "1", "TileSize": "254"}
     assert size.attrib == {"Width": str(width), "Height": str(height)}

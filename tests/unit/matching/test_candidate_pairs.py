@@ -9,12 +9,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features
 from rdstitch.features.keypoints import Descriptors
-from rdstitch.matching.candidate_pairs import (
-    CANDIDATES,
-    EXHAUSTIVE_UP_TO,
-    neighbours,
-    pairs_that_matter,
-)
+from rdstitch.matching.candidate_pairs import CANDIDATES, EXHAUSTIVE_UP_TO, neighbours, pairs_that_matter
 from rdstitch.matching.candidate_pairs import first_pairs as _first_pairs
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 

@@ -52,7 +52,6 @@ def _divided(
 )
 def test_two_lenses_are_separated(pairs: list[tuple[int, int]], lenses: list[float]) -> None:
     found = _divided(pairs, lenses)
-    assert found is not None
     assert found.certain
     np.testing.assert_allclose(np.where(found.second, found.distortion[1], found.distortion[0]), lenses, atol=0.02)
     fewer = {value for value in lenses if lenses.count(value) <= len(lenses) / 2}
@@ -62,7 +61,6 @@ def test_two_lenses_are_separated(pairs: list[tuple[int, int]], lenses: list[flo
 @pytest.mark.parametrize(("pairs", "lenses"), [(_CHAIN[:1], [-0.2, -0.15]), (_CHAIN[:2], [-0.2, -0.1, -0.2])])
 def test_where_no_pair_is_of_one_lens_nothing_can_be_kept(pairs: list[tuple[int, int]], lenses: list[float]) -> None:
     found = _divided(pairs, lenses)
-    assert found is not None
     assert not found.certain
 
 
@@ -72,7 +70,6 @@ def test_an_image_that_may_belong_to_either_makes_the_division_uncertain() -> No
     std = np.array([0.001, 0.001, 0.001, 0.05])
     covariance = std[:, None, None] ** 2 * np.eye(2)
     found = two_lenses([Camera((640, 480))] * 5, Votes(i, j, votes, covariance))
-    assert found is not None
     assert not found.certain
 
 

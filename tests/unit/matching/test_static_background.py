@@ -7,12 +7,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
-from rdstitch.matching.static_background import (
-    has_static_background,
-    is_static_pair,
-    moving_features,
-    show_motion,
-)
+from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features, show_motion
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import RadialHomography
 

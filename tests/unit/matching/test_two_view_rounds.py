@@ -66,7 +66,6 @@ def test_a_moving_board_is_found_before_a_static_background() -> None:
     alone = pairing.estimate(ALL)
     assert all(is_static_pair(pair, 3.0) for pair in alone)
     moving = pairing.without_static_background(alone)
-    assert moving is not None
     assert all(pair.relation and not is_static_pair(pair, 3.0) for pair in moving[1])
     distortion = np.median([pair.relation.distortion for pair in moving[1]])
     assert abs(distortion - LENS.distortion) < 0.02
@@ -84,7 +83,6 @@ def test_an_overlay_is_removed_though_every_pair_moves() -> None:
     alone = pairing.estimate(ALL)
     assert not any(is_static_pair(pair, 3.0) for pair in alone)
     moving = pairing.without_static_background(alone)
-    assert moving is not None
     for before, after in zip(alone, moving[1], strict=True):
         assert len(after.correspondences) <= len(before.correspondences) - 35
         assert after.relation.inliers.sum() >= 0.95 * before.relation.inliers.sum()
@@ -141,5 +139,4 @@ def test_with_a_static_background_every_candidate_pair_is_compared() -> None:
     # What is static has chosen these.
     few = [pair for pair in ALL if 0 in pair]
     moving = pairing.without_static_background(pairing.estimate(few), ALL)
-    assert moving is not None
     assert [(pair.image1, pair.image2) for pair in moving[1]] == ALL

@@ -86,7 +86,6 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
         messages=(left_out(frames[0], "contradicts"),),
     )
     rest = _without(spoiled, {(2,): Message("shows something else")}, Aligner.of(sources, OPTIONS, NO_CACHE))
-    assert rest is not None
     assert rest.alignment.used.tolist() == [True, True, False]
     assert [str(message) for message in rest.left_out] == [f"left out {frames[2]}: shows something else [left-out]"]
 

@@ -89,7 +89,6 @@ def test_control_points_meet(taken: Callable[[Path], list[Path]], tmp_path: Path
         for c in control
     ]
     focal = result.registration.camera.with_focal().focal
-    assert focal is not None
     assert np.median(off) * focal < 1.0
     lens = read_camera_file(tmp_path / "a.pto").camera
     assert lens.nearest_distortion == pytest.approx(result.distortion, abs=0.01)

@@ -39,7 +39,6 @@ def test_metric_poses_near_the_truth_and_reasons_for_the_first_frames(drive: Seq
     for number, pose in poses.items():
         x, y = truth.position[number] - start
         expected = turn * complex(x, y) * HEIGHT  # the axes of the first frame
-        assert pose.position is not None
         found = complex(pose.position[0], -pose.position[1])
         assert abs(found - expected) < 0.02 * HEIGHT + 0.02 * abs(expected)
         assert pose.position[2] == pytest.approx(HEIGHT * truth.height[number], rel=0.02)

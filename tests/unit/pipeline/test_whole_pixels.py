@@ -27,7 +27,6 @@ def _crops(name: str, noise: float = 0.0) -> list[NDArray[Any]]:
 @pytest.mark.parametrize("noise", [0.0, 2.0])
 def test_crops_become_the_image_that_they_are_of(name: str, noise: float) -> None:
     result = rdstitch.mosaic(_crops(name, noise))
-    assert result.composite is not None
     pixels, alpha = result.composite.pixels[..., ::-1], result.composite.alpha
     assert pixels.shape == WHOLE.shape
     covered = np.zeros(alpha.shape, dtype=np.bool_)

@@ -101,10 +101,8 @@ def test_rotation(kind: str) -> None:
     found = solvers.rotation_three_point(free.x1, free.x2)
     check(free, found, 0.999)
     true = np.abs(found.distortion - free.distortion[found.sample]) < 1e-9
-    assert found.focal is not None
     assert np.median(np.abs(found.focal / free.focal[found.sample] - 1.0)[true]) < 1e-10
     lens = solvers.rotation_two_point_focal(free.x1[:, :2], free.x2[:, :2], free.distortion)
-    assert lens.focal is not None
     best = np.full(COUNT, np.inf)
     np.minimum.at(best, lens.sample, np.abs(lens.focal / free.focal[lens.sample] - 1.0))
     assert np.mean(best < 1e-3) >= 0.999

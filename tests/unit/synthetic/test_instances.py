@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from rdstitch.errors import ArgumentError
 from rdstitch.radial_homography import transfer
 from rdstitch.solvers.solutions import Solutions
 from tests.correspondences import correspondences
-from tests.instances import HALF_SIZE, general_instances, planar_instances
-from tests.planar_constraints import constraint_residuals
+from tests.instances import HALF_SIZE, planar_instances
 
 
 def test_points_of_planar_instances_obey_homography_and_motion() -> None:
@@ -22,26 +20,6 @@ def test_points_of_planar_instances_obey_homography_and_motion() -> None:
     assert (np.abs(instances.tilt) <= 0.3).all()
     assert np.ptp(instances.yaw) > 5.0
     assert (instances.distortion.min() < -0.65) & (instances.distortion.max() > -0.05)
-
-
-def test_rigid_motion_satisfies_the_constraints_and_free_motion_does_not() -> None:
-    rigid, free = planar_instances(500, 4, seed=2), general_instances(500, 5, seed=2)
-    assert max(np.abs(r).max() for r in constraint_residuals(rigid.homography)) < 1e-12
-    assert min(np.median(np.abs(r)) for r in constraint_residuals(free.homography)) > 1e-4
-    k = 3
-    np.testing.assert_allclose(transfer(free.homography[k], free.distortion[k], free.x1[k]), free.x2[k], atol=1e-12)
-
-
-def test_separate_tilts_are_in_the_homography() -> None:
-    instances = planar_instances(300, 2, seed=3, separate_tilts=True)
-    assert np.abs(instances.tilt - instances.tilt2).max() > 0.3
-    normal2 = np.linalg.solve(instances.homography.transpose(0, 2, 1), _normals(instances.tilt)[:, :, None])[:, :, 0]
-    np.testing.assert_allclose(normal2, _normals(instances.tilt2), atol=1e-12)
-
-
-def _normals(tilt: np.ndarray) -> np.ndarray:
-    psi, theta = tilt.T
-    return np.column_stack([np.sin(theta), -np.sin(psi) * np.cos(theta), np.cos(psi) * np.cos(theta)])
 
 
 def test_seed_decides_and_noise_has_the_requested_size() -> None:
@@ -65,13 +43,6 @@ def test_best_errors_picks_the_nearest_solution_of_each_sample() -> None:
     np.testing.assert_allclose(distortion, [0.1, np.inf, 1e-9], atol=1e-15)
     np.testing.assert_allclose(homography, [0.0, np.inf, 0.0], atol=1e-14)
     assert np.isinf(instances.best_errors(Solutions.empty())[0]).all()
-
-
-def test_impossible_ranges_are_refused() -> None:
-    with pytest.raises(ArgumentError, match="folds"):
-        planar_instances(10, 2, seed=1, distortion=(-1.2, -1.1))
-    with pytest.raises(ArgumentError, match="in common"):
-        planar_instances(10, 2, seed=1, translation=(50.0, 60.0))
 
 
 @pytest.mark.parametrize("motion", ["rigid", "similarity", "homography"])

@@ -6,18 +6,7 @@ import pytest
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
-from rdstitch.synthetic import (
-    RELIEFS,
-    Poses,
-    Relief,
-    Sequence,
-    blank,
-    ground,
-    hills,
-    pair_poses,
-    sequence_over,
-)
-from tests.lined_texture import LinedTexture
+from rdstitch.synthetic import RELIEFS, Poses, Relief, Sequence, blank, ground, hills, pair_poses, sequence_over
 
 LENS = Camera((320, 240), -0.2, focal=260.0)
 
@@ -48,7 +37,6 @@ def met_by_walking(relief: Relief, position: FloatArray, height: float, foot: Fl
 @pytest.mark.parametrize("kind", sorted(RELIEFS))
 def test_a_ray_ends_where_it_first_meets_the_ground(kind: str) -> None:
     sequence = over(kind, 0.1)
-    assert sequence.relief is not None
     points = np.random.default_rng(2).uniform((5, 5), (314, 234), (60, 2))
     feet, found = sequence.to_plane(1, points), sequence.to_ground(1, points)
     position, height = sequence.poses.position[1], float(sequence.poses.height[1])
@@ -116,15 +104,3 @@ def test_ground_as_high_as_the_camera_is_refused() -> None:
     relief = hills((100, 100), 1, height=50.0)
     with pytest.raises(ArgumentError, match="the camera only 40"):
         relief.seen_from(np.array([50.0, 50.0]), 40.0, np.zeros((3, 2)))
-
-
-def test_lines_are_straight_and_the_same_in_every_region() -> None:
-    lines = np.array([[(20.0, 30.0), (180.0, 90.0)]])
-    texture = LinedTexture(blank((200, 120), 0.2), lines, width=5.0)
-    whole = texture.region(0, 0, 200, 120)
-    np.testing.assert_array_equal(texture.region(50, 20, 150, 100), whole[20:100, 50:150])
-    # The centre of gravity of each column lies on the line.
-    light = whole[:, 40:160, 0] - np.float32(0.2)
-    middle = (light * np.arange(120)[:, None]).sum(axis=0) / light.sum(axis=0)
-    np.testing.assert_allclose(middle, 30.0 + (np.arange(40, 160) - 20.0) * 60.0 / 160.0, atol=0.05)
-    assert whole.max() == 1.0

@@ -56,7 +56,6 @@ def centroid(image: FloatArray, around: FloatArray, radius: int = 9) -> FloatArr
 @pytest.mark.parametrize("lens", LENSES, ids=IDS)
 @pytest.mark.parametrize("texels_per_pixel", [0.8, 1.0, 2.6])
 def test_a_blob_is_seen_where_projection_puts_it(lens: Lens, texels_per_pixel: float) -> None:
-    assert lens.focal is not None
     poses, size = fit_to_plane(lens, Poses.of([(0.0, 0.0)], texels_per_pixel * lens.focal, 0.4, (0.06, -0.05)))
     wanted = np.stack(np.meshgrid(np.linspace(25, 295, 7), np.linspace(25, 215, 5)), axis=-1).reshape(-1, 2)
     wanted += np.random.default_rng(1).uniform(-0.5, 0.5, wanted.shape)

@@ -22,7 +22,6 @@ def _placed(x: float, y: float, yaw: float, height: float, tilt: tuple[float, fl
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0, 1.0), (1.5, -2.0, 2.5, 0.8), (-3.0, 0.2, -3.0, 1.4)])
 def test_the_pose_of_a_homography_is_the_one_it_was_made_of(pose: tuple[float, float, float, float]) -> None:
     found = _placed(*pose).pose
-    assert found is not None
     np.testing.assert_allclose([found.x, found.y, found.yaw, found.height], pose, atol=1e-9)
 
 
@@ -34,11 +33,8 @@ def test_without_focal_length_or_homography_there_is_no_pose() -> None:
 
 def test_a_similarity_moves_a_placement_and_its_pose_alike() -> None:
     first, second = _placed(1.0, 2.0, 0.3, 0.9), _placed(2.0, 1.0, 1.1, 1.2)
-    assert first.pose is not None
     move = PlaneSimilarity.to_origin(first.pose)
     origin, other = move.applied(first).pose, move.applied(second).pose
-    assert origin is not None
-    assert other is not None
     np.testing.assert_allclose([origin.x, origin.y, origin.yaw, origin.height], [0.0, 0.0, 0.0, 1.0], atol=1e-9)
     turned = np.array([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]]) @ [1.0, -1.0] / 0.9
     np.testing.assert_allclose([other.x, other.y, other.yaw, other.height], [*turned, 0.8, 1.2 / 0.9], atol=1e-9)

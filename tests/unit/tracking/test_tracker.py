@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 
 from examples.judging.trajectories import compare_trajectories
-from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, Features, detect, match
@@ -18,7 +17,7 @@ from rdstitch.matching.options import PairOptions
 from rdstitch.synthetic import Sequence, blank, line_poses, sequence_over, turn_poses
 from rdstitch.tracking import Tracked, Tracker, TrackingOptions
 from rdstitch.tracking import tracker as module
-from tests.floor_drives import floor_drive
+from tests.floor_drives import floor_drive, true_path
 
 SIZE = (320, 240)
 DISTORTION = -0.25
@@ -60,11 +59,6 @@ def _path(results: list[Tracked]) -> Trajectory:
     return Trajectory(np.array(numbers), places, yaw, height)
 
 
-def _truth(sequence: Sequence) -> Trajectory:
-    p, unit = sequence.poses, sequence.poses.height[0]
-    return Trajectory.from_poses(PlanarPoses(p.yaw, p.position / unit, p.height / unit, p.tilt))
-
-
 @pytest.fixture(scope="module")
 def drive() -> Sequence:
     return _drive(30)
@@ -79,13 +73,13 @@ def tracked(drive: Sequence) -> list[Tracked]:
 
 def _check(results: list[Tracked], sequence: Sequence) -> None:
     """Near the truth; every frame but those before the first alignment has a place when it comes."""
-    error = compare_trajectories(_path(results), _truth(sequence))
+    error = compare_trajectories(_path(results), true_path(sequence))
     assert error.drift < 0.004
     assert error.rotation < math.radians(0.1)
     assert all(result.placement is not None for result in results if result.number >= 12)
 
 
-def test_the_path_and_lambda_come_near_the_truth(tracked: list[Tracked], drive: Sequence) -> None:
+def test_the_path_and_lambda_come_near_thetrue_path(tracked: list[Tracked], drive: Sequence) -> None:
     _check(tracked, drive)
     assert abs(tracked[-1].distortion - DISTORTION) < 0.003
 
@@ -113,7 +107,6 @@ def test_keyframes_that_came_before_the_map_are_given_their_place_later(tracked:
     assert revised
     assert revised[0].number == 0
     pose = revised[0].pose
-    assert pose is not None
     np.testing.assert_allclose([pose.x, pose.y, pose.yaw, pose.height], [0.0, 0.0, 0.0, 1.0], atol=1e-9)
     assert all(result.placement is not None for result in revised)
 
@@ -204,7 +197,7 @@ def test_between_keyframes_corners_are_followed(video: tuple[Sequence, list[NDAr
     assert len(asked) < len(keyframes) + 5 < 35
     placed = [result for result in results if result.placement is not None]
     assert {result.number for result in placed} >= set(range(keyframes[4], len(images)))
-    error = compare_trajectories(_path(placed), _truth(drive))
+    error = compare_trajectories(_path(placed), true_path(drive))
     assert error.drift < 0.002
     assert error.rotation < math.radians(0.1)
 

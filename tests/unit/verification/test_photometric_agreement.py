@@ -9,12 +9,7 @@ from numpy.typing import NDArray
 from rdstitch.camera import Camera
 from rdstitch.io import DecodedImage, Metadata
 from rdstitch.synthetic.textures import ground
-from rdstitch.verification.photometric_agreement import (
-    COMPARED_SIDE,
-    Agreement,
-    ComparedImage,
-    overlap_agreement,
-)
+from rdstitch.verification.photometric_agreement import COMPARED_SIDE, Agreement, ComparedImage, overlap_agreement
 
 PLANE = ground((900, 700), seed=3, channels=1).region(0, 0, 900, 700)[:, :, 0]
 SIZE = (400, 300)

@@ -141,7 +141,6 @@ def test_every_pair_is_moved_as_its_plane_does(monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_pair_with_nothing_but_what_drives_ahead_is_no_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     found = planes_of_pairs(_registration(monkeypatch, _images(0.35), [0, 0], (_pair(0, 1, 0, 60),)), 3.0)
-    assert found is not None
     assert not found[0].relation
     assert "less than half" in found[0].relation.reason
 

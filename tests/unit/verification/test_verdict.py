@@ -203,7 +203,6 @@ def test_of_doubtful_pairs_on_which_nothing_depends_the_images_are_named() -> No
 
 def test_a_doubtful_shape_names_the_image_and_the_size(good: Registration) -> None:
     alignment = good.alignment
-    assert alignment.shape is not None
     doubtful = replace(alignment.shape, doubtful=True, shown=True, image=2, shift=6.0, shift_std=8.0)
     bent = replace(good, alignment=replace(alignment, shape=doubtful))
     (message,) = judge(bent, THRESHOLD)
