@@ -14,9 +14,9 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
-from rdstitch.alignment.lens_selection import WORTH_SAYING
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PlanarModel
+from rdstitch.alignment.noise import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_field import ReliefField
@@ -163,7 +163,7 @@ def weigh_lens(problem: Problem, fit: Fit) -> Fit:
     std = math.sqrt(float(considered_covariance(problem, fit, rough=True)[0, 0]))
     near = value + std * np.linspace(-_REACH, _REACH, _STEPS)
     weighed = float(near[np.argmin([prior.cost(x) + ((x - value) / std) ** 2 for x in near.tolist()])])
-    if abs(weighed - value) * float(np.median(problem.observations.scale1)) < WORTH_SAYING:
+    if abs(weighed - value) * float(np.median(problem.observations.scale1)) < EXACTNESS:
         return fit
     held = replace(problem, free_lens=np.zeros_like(problem.free_lens))
     lens = np.where(problem.free_lens, weighed, parameters.lens)
