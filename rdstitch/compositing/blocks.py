@@ -19,18 +19,10 @@ from rdstitch.stored import Stored
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A part of an output as a task.
+    """A part of an output as a task."""
 
-    Attributes
-    ----------
-    tiles : TiledOutput
-        With the images that reach it alone.
-    images : tuple of int
-        Which of the composite's images these are.
-    """
-
-    tiles: TiledOutput
-    images: tuple[int, ...]
+    tiles: TiledOutput  # with the images that reach it alone
+    images: tuple[int, ...]  # which of the composite's images these are
 
     def compute(self, store: Cache) -> list[Stored[OutputStrip]]:
         """Its strips from top to bottom, in the store, which must be this run's own."""

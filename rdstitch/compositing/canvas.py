@@ -147,13 +147,6 @@ def plan_canvas(
     max_stretch : float
         What an image shows so many times coarser than the reference image has no place on the canvas; see
         :mod:`rdstitch.compositing.near_part`. Without a limit, an image that shows the horizon is refused.
-
-    Raises
-    ------
-    ArgumentError
-        When shapes differ, a homography is not finite or singular, or ``scale`` is not positive.
-    LimitError
-        When the canvas would be absurd; the text names the image that makes it so.
     """
     matrices = np.asarray(homographies, dtype=np.float64)
     called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)

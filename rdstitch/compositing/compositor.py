@@ -56,26 +56,15 @@ class Composite:
 
 @dataclass(frozen=True, repr=False)
 class FileComposite:
-    """A stitched image that went to a file; attributes as of :class:`Composite`.
-
-    Attributes
-    ----------
-    path : Path
-    fingerprint : Fingerprint
-        Size and digest of the file.
-    seams : SeamMap or None
-        Which image owns what of the canvas before cropping; None without seams.
-    origin : (int, int)
-        Where the output begins in that canvas, pixels.
-    """
+    """A stitched image that went to a file; attributes as of :class:`Composite`."""
 
     path: Path
     canvas: Canvas
     exposure: Exposure
-    fingerprint: Fingerprint
+    fingerprint: Fingerprint  # size and digest of the file
     messages: tuple[Message, ...] = ()
-    seams: SeamMap | None = None
-    origin: tuple[int, int] = (0, 0)
+    seams: SeamMap | None = None  # which image owns what of the canvas before cropping; None without seams
+    origin: tuple[int, int] = (0, 0)  # where the output begins in that canvas, pixels
 
     def __repr__(self) -> str:
         return f"<FileComposite {self.path}: {self.canvas.size[0]} x {self.canvas.size[1]} pixels>"
@@ -83,24 +72,15 @@ class FileComposite:
 
 @dataclass(frozen=True)
 class OutputFile:
-    """A file to compose into.
+    """A file to compose into."""
 
-    Attributes
-    ----------
-    path : path
-        ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
-        (held in memory whole).
-    metadata : Metadata, optional
-        Colour profile, EXIF and resolution to keep.
-    extra_tags : callable, optional
-        Gives further tags of a TIFF file for the canvas after cropping.
-    outputs : Outputs, optional
-        Where the file is staged, to be published with what belongs to it; without, it replaces what is there.
-    """
-
+    # ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
+    # (held in memory whole)
     path: str | Path
-    metadata: Metadata | None = None
+    metadata: Metadata | None = None  # colour profile, EXIF and resolution to keep
+    # gives further tags of a TIFF file for the canvas after cropping
     extra_tags: Callable[[Canvas], Iterable[ExtraTag]] | None = None
+    # where the file is staged, to be published with what belongs to it; without, it replaces what is there
     outputs: Outputs | None = None
 
 
@@ -121,15 +101,6 @@ def compose(
         Called with the share of the work done, 0 to 1.
     elsewhere : callable, optional
         Computes the pixels, in blocks, in other processes; see :mod:`rdstitch.compositing.blocks`.
-
-    Raises
-    ------
-    ArgumentError
-        When the arguments do not fit together.
-    InputError
-        When an image cannot be read.
-    LimitError
-        When the memory limit is too low.
     """
     with prepare_composite(images, canvas, options, progress, elsewhere) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
@@ -158,13 +129,6 @@ def compose_to_file(
     ----------
     images, canvas, options, progress, elsewhere
         As for :func:`compose`.
-
-    Raises
-    ------
-    ArgumentError, InputError, LimitError
-        As for :func:`compose`; also LimitError when the image is too large for the format.
-    OutputError
-        When the file cannot be written; nothing is left behind.
     """
     with prepare_composite(images, canvas, options, progress, elsewhere) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size

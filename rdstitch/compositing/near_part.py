@@ -23,16 +23,10 @@ _ROWS = 64  # rows of a mask that are computed at a time, so that they stay in t
 
 @dataclass(frozen=True)
 class NearPart:
-    """The part of an image that is drawn.
-
-    Attributes
-    ----------
-    camera : Camera
-    depth : ndarray of shape (3,)
-        What is drawn has ``depth · (x, y, 1) > 0``; x, y undistorted, in half diagonals from the distortion centre.
-    """
+    """The part of an image that is drawn."""
 
     camera: Camera
+    # (3,): what is drawn has ``depth · (x, y, 1) > 0``; x, y undistorted, in half diagonals from the distortion centre
     depth: FloatArray
 
     def outline(self) -> FloatArray:

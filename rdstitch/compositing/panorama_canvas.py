@@ -35,20 +35,13 @@ _PROPERTIES = (
 
 @dataclass(frozen=True)
 class SeenDirections:
-    """What images show of the directions around their centre.
+    """What images show of the directions around their centre."""
 
-    Attributes
-    ----------
-    outlines : tuple of ndarray of shape (K, 2)
-        Longitude and latitude of each image's border, radians; longitudes without a jump, around that of the image.
-    around : bool
-        Whether they go all the way round.
-    start : float
-        Longitude at the left border of a full turn: that of the reference image's back, or where a gap is open.
-    """
-
+    # (K, 2): longitude and latitude of each image's border, radians; longitudes without a jump, around that of the
+    # image
     outlines: tuple[FloatArray, ...]
-    around: bool
+    around: bool  # whether they go all the way round
+    # longitude at the left border of a full turn: that of the reference image's back, or where a gap is open
     start: float = -np.pi
 
     @property
@@ -124,13 +117,6 @@ def plan_panorama(
     max_stretch : float
         What the projection would stretch more than so many times has no place on the canvas: the ends of a plane, the
         top and the bottom of a cylinder.
-
-    Raises
-    ------
-    ArgumentError
-        When a panorama that goes all the way round should be turned.
-    LimitError
-        When an image looks farther than the projection shows, or the canvas would be absurd.
     """
     seen = seen_directions(cameras, directions)
     chosen = choose_projection(seen) if projection == "auto" else PROJECTIONS[projection]

@@ -31,30 +31,19 @@ DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
 
 @dataclass(frozen=True)
 class Exposure:
-    """What every image's samples are multiplied by: ``v' = q (v + b) - b``.
+    """What every image's samples are multiplied by: ``v' = q (v + b) - b``."""
 
-    Attributes
-    ----------
-    offset : float
-        ``b``, share of the full range.
-    log_gain : ndarray of shape (N, C)
-        log of what image i is brighter by than the average.
-    vignetting : ndarray of shape (3,)
-        Coefficients of r², r⁴, r⁶ in log(v + b); r in half diagonals from the distortion centre.
-    fields : ndarray of shape (N, B, B, C), or (N, 0, 0, C)
-        Smooth remainder on a grid over each image (rows, columns), log of what the image is brighter by there.
-    knee : float
-        Share of the full range from which brightened samples are compressed, so that full scale stays full scale and
-        nothing else gets there; 1: they are clipped.
-    rms_before, rms_after : float
-        Robust difference between overlapping images, share of the full range.
-    """
-
-    offset: float
-    log_gain: FloatArray
+    offset: float  # ``b``, share of the full range
+    log_gain: FloatArray  # (N, C): log of what image i is brighter by than the average
+    # (3,): coefficients of r², r⁴, r⁶ in log(v + b); r in half diagonals from the distortion centre
     vignetting: FloatArray = field(default_factory=lambda: np.zeros(3))
+    # (N, B, B, C), or: smooth remainder on a grid over each image (rows, columns), log of what the image is brighter by
+    # there
     fields: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
+    # share of the full range from which brightened samples are compressed, so that full scale stays full scale and
+    # nothing else gets there; 1: they are clipped
     knee: float = 1.0
+    # rms_before, rms_after: robust difference between overlapping images, share of the full range
     rms_before: float = 0.0
     rms_after: float = 0.0
 

@@ -20,32 +20,18 @@ Displacement = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class PlacedImage:
-    """An image and its place.
+    """An image and its place."""
 
-    Attributes
-    ----------
-    read : callable
-        Reads it (:func:`rdstitch.io.read_image`); called in other threads, before its tiles come, and perhaps again.
-    camera : Camera
-    homography : ndarray of shape (3, 3)
-        Normalized undistorted coordinates to plane coordinates, or to directions.
-    preview : callable, optional
-        Reads it reduced by a factor, which is quicker; see :func:`rdstitch.io.read_image`.
-    exposure : float, optional
-        As the camera wrote it down (time x sensitivity / f-number²), up to a factor common to all images.
-    displacement : callable, optional
-        What local alignment adds to its measured pixels; see :class:`rdstitch.compositing.warp.Warp`.
-    path : str
-        What messages call it; its number if empty.
-    """
-
+    # reads it (:func:`rdstitch.io.read_image`); called in other threads, before its tiles come, and perhaps again
     read: ImageLoader
     camera: Camera
-    homography: FloatArray
-    preview: Preview | None = None
+    homography: FloatArray  # (3, 3): normalized undistorted coordinates to plane coordinates, or to directions
+    preview: Preview | None = None  # reads it reduced by a factor, which is quicker; see :func:`rdstitch.io.read_image`
+    # as the camera wrote it down (time x sensitivity / f-number²), up to a factor common to all images
     exposure: float | None = None
+    # what local alignment adds to its measured pixels; see :class:`rdstitch.compositing.warp.Warp`
     displacement: Displacement | None = None
-    path: str = ""
+    path: str = ""  # what messages call it; its number if empty
 
 
 def place_images(
@@ -58,13 +44,7 @@ def place_images(
     displacement: Sequence[Displacement | None] | None = None,
     paths: Sequence[str] | None = None,
 ) -> list[PlacedImage]:
-    """Images from lists of what is known of each; see :class:`PlacedImage`.
-
-    Raises
-    ------
-    ArgumentError
-        When the lists are not of one length.
-    """
+    """Images from lists of what is known of each; see :class:`PlacedImage`."""
     count, matrices = len(loaders), np.asarray(homographies, dtype=np.float64)
     given = (cameras, matrices, preview, exposure, displacement, paths)
     if any(values is not None and len(values) != count for values in given):

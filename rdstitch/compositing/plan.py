@@ -76,11 +76,6 @@ def plan_composite(
         Channels and bytes per sample of the images.
     masked : bool
         Whether some have transparent parts, or else only those of which the canvas has the near part.
-
-    Raises
-    ------
-    LimitError
-        When the limit is too low for the smallest tiles.
     """
     bands = options.bands or usual_bands(cameras)
     limit = options.max_memory or default_memory()

@@ -33,25 +33,13 @@ _READERS = 2
 
 @dataclass(frozen=True)
 class Prepared:
-    """A composite that is decided on, and not yet computed.
-
-    Attributes
-    ----------
-    renderer : Renderer
-    canvas : Canvas
-        After cropping.
-    tiles : TiledOutput
-        Its pixels; their box is on the canvas of the renderer, before cropping.
-    messages : tuple of Message
-    elsewhere : callable, optional
-        Computes the pixels in blocks, see :mod:`rdstitch.compositing.blocks`.
-    """
+    """A composite that is decided on, and not yet computed."""
 
     renderer: Renderer
-    canvas: Canvas
-    tiles: TiledOutput
+    canvas: Canvas  # after cropping
+    tiles: TiledOutput  # its pixels; their box is on the canvas of the renderer, before cropping
     messages: tuple[Message, ...]
-    elsewhere: BlockRunner | None = None
+    elsewhere: BlockRunner | None = None  # computes the pixels in blocks, see :mod:`rdstitch.compositing.blocks`
 
     def strips(self, progress: ShareProgress | None = None) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""

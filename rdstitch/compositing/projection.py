@@ -23,17 +23,10 @@ Directions = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class Projection(ABC):
-    """What all projections have.
+    """What all projections have."""
 
-    Attributes
-    ----------
-    name : str
-        As the command line has it.
-    periodic : bool
-        Whether its first coordinate is the longitude, so that places a full turn apart are the same.
-    """
-
-    name: ClassVar[ProjectionName]
+    name: ClassVar[ProjectionName]  # as the command line has it
+    # whether its first coordinate is the longitude, so that places a full turn apart are the same
     periodic: ClassVar[bool] = False
 
     @abstractmethod

@@ -21,24 +21,12 @@ from rdstitch.compositing.warp import Geometry, Warp, locate
 
 @dataclass(frozen=True)
 class Layer:
-    """One image's weight on a part of the canvas.
+    """One image's weight on a part of the canvas."""
 
-    Attributes
-    ----------
-    index : int
-        Of the image.
-    box : (int, int, int, int)
-        Part of the canvas: x0, y0, x1, y1, pixels, end exclusive.
-    weight : ndarray of shape (h, w), float32
-        0 where the image contributes nothing.
-    geometry : Geometry
-        Of the same part.
-    """
-
-    index: int
-    box: Box
-    weight: Float32Array
-    geometry: Geometry
+    index: int  # of the image
+    box: Box  # part of the canvas: x0, y0, x1, y1, pixels, end exclusive
+    weight: Float32Array  # (h, w), float32: 0 where the image contributes nothing
+    geometry: Geometry  # of the same part
 
     def part(self, box: Box) -> "Layer":
         """The same for a box within this one."""
@@ -55,30 +43,16 @@ class Layer:
 
 @dataclass(frozen=True)
 class Renderer:
-    """Everything that is needed to compute any tile of the output, in any order.
-
-    Attributes
-    ----------
-    warps : sequence of Warp
-    images : ImageCache
-    exposure : Exposure
-    seams : SeamMap or None
-    options : CompositeOptions
-    bands : int
-        Of the multi-band blending.
-    channels : int
-    dtype : dtype
-        Of the images' samples and of the output.
-    """
+    """Everything that is needed to compute any tile of the output, in any order."""
 
     warps: Sequence[Warp]
     images: ImageCache
     exposure: Exposure
     seams: SeamMap | None
     options: CompositeOptions
-    bands: int
+    bands: int  # of the multi-band blending
     channels: int
-    dtype: np.dtype[Any]
+    dtype: np.dtype[Any]  # of the images' samples and of the output
 
     def tile(self, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Samples (h, w, C) and coverage (h, w) of one box of the canvas.

@@ -35,24 +35,13 @@ _MOVED = 3
 
 @dataclass(frozen=True)
 class SeamMap:
-    """Owner of each pixel of the reduced canvas.
+    """Owner of each pixel of the reduced canvas."""
 
-    Attributes
-    ----------
-    labels : ndarray of shape (h, w), int32
-        Index of the image, or -1 where there is none.
-    factor : int
-        Canvas pixels per reduced pixel, even or 1.
-    softness : int
-        Shares pass from one owner to the next over so many reduced pixels on either side of a seam, for feathering.
-    origin : (int, int)
-        Where ``labels`` begin on the reduced canvas: x, y.
-    """
-
-    labels: NDArray[np.int32]
-    factor: int
+    labels: NDArray[np.int32]  # (h, w), int32: index of the image, or -1 where there is none
+    factor: int  # canvas pixels per reduced pixel, even or 1
+    # shares pass from one owner to the next over so many reduced pixels on either side of a seam, for feathering
     softness: int = 0
-    origin: tuple[int, int] = (0, 0)
+    origin: tuple[int, int] = (0, 0)  # where ``labels`` begin on the reduced canvas: x, y
 
     def owners(self, box: Box) -> list[int]:
         """Images that own anything on a box (canvas pixels), ascending; -1 first where a part has no owner."""

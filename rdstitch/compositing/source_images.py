@@ -28,24 +28,14 @@ _MAX_PREVIEW = 8
 
 @dataclass(frozen=True)
 class LoadedImage:
-    """An image ready to be resampled.
+    """An image ready to be resampled."""
 
-    Attributes
-    ----------
-    pixels : ndarray of shape (h, w) or (h, w, C)
-        uint8, uint16 or float32; transparent pixels are filled from their nearest neighbours.
-    opacity : ndarray of shape (h, w), uint16, or None
-        0 where the image is masked out, else rising to OPAQUE with the distance from the mask.
-    opacity_step : float
-        Opacity of the last opaque pixel beside a transparent one, as a share of OPAQUE.
-    reduction : int
-        The image is smaller than the original by this factor.
-    """
-
+    # (h, w) or (h, w, C): uint8, uint16 or float32; transparent pixels are filled from their nearest neighbours
     pixels: NDArray[Any]
+    # (h, w), uint16: 0 where the image is masked out, else rising to OPAQUE with the distance from the mask
     opacity: NDArray[np.uint16] | None = None
-    opacity_step: float = 1.0
-    reduction: int = 1
+    opacity_step: float = 1.0  # opacity of the last opaque pixel beside a transparent one, as a share of OPAQUE
+    reduction: int = 1  # the image is smaller than the original by this factor
 
     @property
     def nbytes(self) -> int:
@@ -55,31 +45,15 @@ class LoadedImage:
 
 @dataclass(frozen=True)
 class ImageOnDisk:
-    """An image ready to be resampled, in a file.
+    """An image ready to be resampled, in a file."""
 
-    Attributes
-    ----------
-    file : Path
-        Its pixels, then its opacity, as they are in memory.
-    arrays : sequence of (dtype, shape)
-        Of these.
-    outline : LoadedImage
-        What else is known of it.
-    """
-
-    file: Path
-    arrays: Sequence[tuple[np.dtype[Any], tuple[int, ...]]]
-    outline: LoadedImage
+    file: Path  # its pixels, then its opacity, as they are in memory
+    arrays: Sequence[tuple[np.dtype[Any], tuple[int, ...]]]  # of these
+    outline: LoadedImage  # what else is known of it
 
     @classmethod
     def write(cls, image: LoadedImage, file: Path) -> Self:
-        """Keep an image in a file.
-
-        Raises
-        ------
-        OSError
-            When it cannot be written.
-        """
+        """Keep an image in a file."""
         arrays = [image.pixels] if image.opacity is None else [image.pixels, image.opacity]
         try:
             with file.open("wb") as stream:
@@ -182,13 +156,7 @@ class ImageReader:
         return 1 if self._images[index].preview is None else fitting_reduction(shrink / _PIXELS_PER_OUTPUT_PIXEL)
 
     def __call__(self, index: int, reduction: int = 1) -> DecodedImage:
-        """Read image ``index``; a grey image among coloured ones becomes coloured.
-
-        Raises
-        ------
-        InputError
-            When it cannot be read, has another size than its camera, or samples unlike the first image's.
-        """
+        """Read image ``index``; a grey image among coloured ones becomes coloured."""
         placed = self._images[index]
         image = placed.preview(reduction) if reduction > 1 and placed.preview is not None else placed.read()
         height, width = image.pixels.shape[:2]

@@ -22,23 +22,12 @@ _MAX_TOTAL = 16_000_000
 
 @dataclass(frozen=True)
 class SurveyTile:
-    """One image on the reduced canvas.
+    """One image on the reduced canvas."""
 
-    Attributes
-    ----------
-    box : (int, int, int, int)
-        On the reduced canvas.
-    pixels : ndarray of shape (h, w, C)
-        In the image's sample type.
-    inside : ndarray of shape (h, w), bool
-    opacity : ndarray of shape (h, w), float32, or None
-        Of an image with a mask.
-    """
-
-    box: Box
-    pixels: NDArray[Any]
-    inside: NDArray[np.bool_]
-    opacity: Float32Array | None = None
+    box: Box  # on the reduced canvas
+    pixels: NDArray[Any]  # (h, w, C): in the image's sample type
+    inside: NDArray[np.bool_]  # (h, w), bool
+    opacity: Float32Array | None = None  # (h, w), float32: of an image with a mask
 
     def weight(self, geometry: Geometry) -> Float32Array:
         """Falls from 1 at the image's centre to 0 at its border, (h, w); not kept, since all would be half a survey.
@@ -51,24 +40,12 @@ class SurveyTile:
 
 @dataclass(frozen=True)
 class Survey:
-    """All images, small.
+    """All images, small."""
 
-    Attributes
-    ----------
-    factor : int
-        Canvas pixels per reduced pixel, a power of two.
-    canvas : Canvas
-        The reduced canvas.
-    warps : tuple of Warp
-        Onto the reduced canvas.
-    tiles : tuple of SurveyTile or None
-        None for an image that is nowhere opaque.
-    """
-
-    factor: int
-    canvas: Canvas
-    warps: tuple[Warp, ...]
-    tiles: tuple[SurveyTile | None, ...]
+    factor: int  # canvas pixels per reduced pixel, a power of two
+    canvas: Canvas  # the reduced canvas
+    warps: tuple[Warp, ...]  # onto the reduced canvas
+    tiles: tuple[SurveyTile | None, ...]  # None for an image that is nowhere opaque
 
     def pairs(self) -> NDArray[np.intp]:
         """Pairs (P, 2) of images that lie over each other; see :func:`overlapping_pairs`."""

@@ -37,17 +37,10 @@ class _Share:
 
 @dataclass(frozen=True, eq=False)
 class CompositeTables:
-    """Everything about a composite but the samples of its images.
-
-    Attributes
-    ----------
-    canvas : Canvas
-    alpha : ndarray of shape (H, W), uint8
-        255 where an image lies, else 0.
-    """
+    """Everything about a composite but the samples of its images."""
 
     canvas: Canvas
-    alpha: NDArray[np.uint8]
+    alpha: NDArray[np.uint8]  # (H, W), uint8: 255 where an image lies, else 0
     _sizes: tuple[tuple[int, int], ...]
     _shrinks: tuple[float, ...]
     _shares: tuple[_Share, ...]
@@ -89,11 +82,6 @@ class CompositeTables:
         images : sequence of ndarray of shape (H, W) or (H, W, C)
             In the order of those that the tables were made for, each of the size of its camera; uint8, uint16 or
             floating point. Of other bands than these, exposure is left as it is.
-
-        Raises
-        ------
-        ArgumentError
-            When number, size or kind of the images is another.
         """
         self._check(images)
         first = images[0]

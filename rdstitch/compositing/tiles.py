@@ -25,23 +25,12 @@ ShareProgress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class TiledOutput:
-    """A part of a canvas that is not yet computed.
-
-    Attributes
-    ----------
-    renderer : Renderer
-    box : (int, int, int, int)
-        The part: x0, y0, x1, y1 on the canvas of the renderer, pixels, end exclusive.
-    tile_size : int
-        Side of the square tiles, pixels.
-    workers : int
-        Tiles at one time.
-    """
+    """A part of a canvas that is not yet computed."""
 
     renderer: Renderer
-    box: Box
-    tile_size: int
-    workers: int
+    box: Box  # the part: x0, y0, x1, y1 on the canvas of the renderer, pixels, end exclusive
+    tile_size: int  # side of the square tiles, pixels
+    workers: int  # tiles at one time
 
     @property
     def size(self) -> tuple[int, int]:

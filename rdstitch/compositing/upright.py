@@ -35,34 +35,20 @@ _FOCAL_STEPS = np.linspace(-2.0, 2.0, 5)  # standard deviations
 
 @dataclass(frozen=True)
 class UprightOptions:
-    """How the output is turned.
+    """How the output is turned."""
 
-    Attributes
-    ----------
-    yaw, pitch, roll : float
-        Degrees by which the view of a panorama is turned to the right, then up, then clockwise, before it is
-        projected: what is ``yaw`` degrees to the right and ``pitch`` degrees up comes straight ahead.
-    rectangle : tuple of 8 float, optional
-        x and y of four corners, pixels of the reference image as it is read, clockwise, that become an upright
-        rectangle with its aspect ratio; the first becomes the top left.
-    straighten : "off", "auto", or tuple of tuples of 4 float
-        Make edges horizontal and vertical that are so in the scene: those found in the images, or lines by x and y
-        of both ends, pixels of the reference image as it is read.
-    level : bool
-        Make vertical what gravity says, if the images have it, else what is so in most images.
-
-    Raises
-    ------
-    ArgumentError
-        When a value is out of range.
-    """
-
+    # yaw, pitch, roll: degrees by which the view of a panorama is turned to the right, then up, then clockwise, before
+    # it is projected: what is ``yaw`` degrees to the right and ``pitch`` degrees up comes straight ahead
     yaw: float = 0.0
     pitch: float = 0.0
     roll: float = 0.0
+    # x and y of four corners, pixels of the reference image as it is read, clockwise, that become an upright rectangle
+    # with its aspect ratio; the first becomes the top left
     rectangle: Corners | None = None
+    # make edges horizontal and vertical that are so in the scene: those found in the images, or lines by x and y of
+    # both ends, pixels of the reference image as it is read
     straighten: Literal["off", "auto"] | tuple[Segment, ...] = "off"
-    level: bool = False
+    level: bool = False  # make vertical what gravity says, if the images have it, else what is so in most images
 
     def __post_init__(self) -> None:
         for name in ("yaw", "pitch", "roll"):
@@ -164,11 +150,6 @@ def of_rectangle(corners: FloatArray, focal: Focal, pixel: float) -> tuple[Uprig
     Upright, float, float
         With the focal length by which the sides are also orthogonal; the aspect ratio, width by height, and its
         relative standard deviation, where corners are a pixel off.
-
-    Raises
-    ------
-    ArgumentError
-        When the corners are not those of a convex quadrilateral, clockwise.
     """
     sides = _sides(corners)
     if sides is None or np.cross(sides[0], sides[1])[2] <= 0.0:
@@ -211,23 +192,13 @@ def _aspect(sides: tuple[FloatArray, FloatArray], focal: float) -> float:
 
 @dataclass(frozen=True)
 class Edges:
-    """Straight edges, to which directions in the axes of the reference image's camera are parallel or not.
+    """Straight edges, to which directions in the axes of the reference image's camera are parallel or not."""
 
-    Attributes
-    ----------
-    lines : ndarray of shape (N, 3)
-        ``l``, of which the first two are of length 1; on the sphere, the normals of planes through the camera.
-    middles : ndarray of shape (N, 3)
-        ``x`` with 1 as third coordinate; on the sphere, directions of length 1.
-    error : ndarray of shape (N,)
-        Standard deviation of the angle of each, radians.
-    on_sphere : bool
-        Whether lines are those of directions, for which the focal length is 1, and angles those between planes.
-    """
-
+    # (N, 3): ``l``, of which the first two are of length 1; on the sphere, the normals of planes through the camera
     lines: FloatArray
-    middles: FloatArray
-    error: FloatArray
+    middles: FloatArray  # (N, 3): ``x`` with 1 as third coordinate; on the sphere, directions of length 1
+    error: FloatArray  # (N,): standard deviation of the angle of each, radians
+    # whether lines are those of directions, for which the focal length is 1, and angles those between planes
     on_sphere: bool = False
 
     @classmethod

@@ -36,19 +36,12 @@ class Lattice:
     """Pixels of an image at the nodes of a lattice around a box of the canvas.
 
     It is anchored to the canvas: every node, and every pixel between them, is the same bit for bit in every box.
-
-    Attributes
-    ----------
-    box : (int, int, int, int)
-        x0, y0, x1, y1, canvas pixels, end exclusive.
-    step : int
-        Spacing, one of ``LATTICE_STEPS``.
-    points : ndarray of shape (m, n, 2), float32
-        At the nodes, which enclose the box, those of the widest spacing too; far outside where there are no pixels.
     """
 
-    box: Box
-    step: int
+    box: Box  # x0, y0, x1, y1, canvas pixels, end exclusive
+    step: int  # spacing, one of ``LATTICE_STEPS``
+    # (m, n, 2), float32: at the nodes, which enclose the box, those of the widest spacing too; far outside where there
+    # are no pixels
     points: Float32Array
 
     @classmethod
@@ -98,17 +91,10 @@ def _enclosing(box: Box, step: int) -> tuple[tuple[int, int], tuple[int, int]]:
 
 @dataclass(frozen=True)
 class Surface:
-    """A canvas that is no plane.
-
-    Attributes
-    ----------
-    projection : Projection
-    from_canvas : ndarray of shape (3, 3)
-        Canvas pixels to places of the projection, affine.
-    """
+    """A canvas that is no plane."""
 
     projection: Projection
-    from_canvas: FloatArray
+    from_canvas: FloatArray  # (3, 3): canvas pixels to places of the projection, affine
 
     def directions(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Directions at canvas pixels, by coordinate."""
@@ -121,33 +107,17 @@ class Surface:
 
 @dataclass(frozen=True)
 class Warp:
-    """How the canvas is filled from one image.
-
-    Attributes
-    ----------
-    camera : Camera
-    from_canvas : ndarray of shape (3, 3)
-        Canvas pixels, or the directions of a projection, to normalized undistorted coordinates; third coordinate
-        positive in front of the camera.
-    box : (int, int, int, int)
-        Where the image can lie on the canvas: x0, y0, x1, y1, pixels, end exclusive.
-    step : int
-        Spacing of the coordinate lattice, canvas pixels.
-    shrink : float
-        Image pixels per canvas pixel (median over the image); above 1 the image gets smaller.
-    surface : Surface or None
-        What gives directions to canvas pixels; None where the canvas is a plane.
-    displacement : callable, optional
-        Added to the measured pixels.
-    """
+    """How the canvas is filled from one image."""
 
     camera: Camera
+    # (3, 3): canvas pixels, or the directions of a projection, to normalized undistorted coordinates; third coordinate
+    # positive in front of the camera
     from_canvas: FloatArray
-    box: Box
-    step: int
-    shrink: float
-    surface: "Surface | None" = None
-    displacement: Displacement | None = None
+    box: Box  # where the image can lie on the canvas: x0, y0, x1, y1, pixels, end exclusive
+    step: int  # spacing of the coordinate lattice, canvas pixels
+    shrink: float  # image pixels per canvas pixel (median over the image); above 1 the image gets smaller
+    surface: "Surface | None" = None  # what gives directions to canvas pixels; None where the canvas is a plane
+    displacement: Displacement | None = None  # added to the measured pixels
 
     def source_points(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Measured pixels (..., 2) of the image at canvas pixels ``x``, ``y``; NaN where there are none."""
@@ -177,20 +147,11 @@ class Warp:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Where the pixels of one box of the canvas come from in one image; computed on demand.
-
-    Attributes
-    ----------
-    warp : Warp
-    box : (int, int, int, int)
-        x0, y0, x1, y1 on the canvas, pixels, end exclusive; it may reach beyond the canvas.
-    lattice : Lattice
-        Of this box or of a larger one.
-    """
+    """Where the pixels of one box of the canvas come from in one image; computed on demand."""
 
     warp: Warp
-    box: Box
-    lattice: Lattice
+    box: Box  # x0, y0, x1, y1 on the canvas, pixels, end exclusive; it may reach beyond the canvas
+    lattice: Lattice  # of this box or of a larger one
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -109,11 +109,6 @@ def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask 
     Features
         Points in pixels of ``image``, strongest first; none for a blank image. The same for the same image,
         whatever the number of threads.
-
-    Raises
-    ------
-    ArgumentError
-        When the image or the mask has the wrong shape or type, or when this OpenCV lacks the detector.
     """
     return _detect(lambda _: View(image, mask), options or FeatureOptions())
 
@@ -125,13 +120,6 @@ def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
     ----------
     source : callable
         See :data:`ViewLoader`.
-
-    Raises
-    ------
-    ArgumentError
-        As :func:`detect`.
-    Exception
-        What the source raises.
     """
     with one_opencv_thread():
         return _detect(source, options)

@@ -19,50 +19,26 @@ _MAX_HALF = 60000.0  # half precision ends a little above
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Keypoints of one image with their descriptors, the strongest first.
+    """Keypoints of one image with their descriptors, the strongest first."""
 
-    Attributes
-    ----------
-    points : ndarray of shape (N, 2), float64
-        Keypoints ``(u, v)``, pixels of the full-size image, whatever size they were detected at.
-    descriptors : ndarray of shape (N, D), float32 or uint8
-        Numbers that are compared by their Euclidean distance (float32), or bits, eight to a byte, that are
-        compared by the Hamming distance (uint8).
-    scale : ndarray of shape (N,), float64
-        Diameter of the keypoint (OpenCV's ``size``), pixels of the full-size image.
-    angle : ndarray of shape (N,), float64
-        Orientation, radians in [0, 2π), from u towards v; 0 where the kind has none.
-    response : ndarray of shape (N,), float64
-        Strength, in units of the detector.
-    laplacian_sign : ndarray of shape (N,), int8, or None
-        +1 for dark blobs on light ground, -1 for light ones on dark; only equal signs match. None where the
-        kind has no such sign.
-    kind : str
-        What detected and described them; features of different kinds cannot be compared.
-    image_size : (int, int), optional
-        Width and height of the image, pixels.
-    shown : int, optional
-        Keypoints that the image shows at its working size, before any were chosen, or a larger image was used for
-        want of them; None where that is not known.
-    faint : bool
-        Whether these are few, and most of them only just strong enough: they are not seen at the contrast divided by
-        what equalizing it locally multiplies it by at most.
-
-    Raises
-    ------
-    ArgumentError
-        When shapes or types do not fit together, or a point is not finite.
-    """
-
+    # (N, 2), float64: keypoints ``(u, v)``, pixels of the full-size image, whatever size they were detected at
     points: FloatArray
+    # (N, D), float32: numbers that are compared by their Euclidean distance (float32), or bits, eight to a byte, that
+    # are compared by the Hamming distance (uint8)
     descriptors: Descriptors
-    scale: FloatArray
-    angle: FloatArray
-    response: FloatArray
+    scale: FloatArray  # (N,), float64: diameter of the keypoint (OpenCV's ``size``), pixels of the full-size image
+    angle: FloatArray  # (N,), float64: orientation, radians in [0, 2π), from u towards v; 0 where the kind has none
+    response: FloatArray  # (N,), float64: strength, in units of the detector
+    # (N,), int8: +1 for dark blobs on light ground, -1 for light ones on dark; only equal signs match. None where the
+    # kind has no such sign
     laplacian_sign: NDArray[np.int8] | None
-    kind: str
-    image_size: tuple[int, int] | None = None
+    kind: str  # what detected and described them; features of different kinds cannot be compared
+    image_size: tuple[int, int] | None = None  # width and height of the image, pixels
+    # keypoints that the image shows at its working size, before any were chosen, or a larger image was used for want of
+    # them; None where that is not known
     shown: int | None = None
+    # whether these are few, and most of them only just strong enough: they are not seen at the contrast divided by what
+    # equalizing it locally multiplies it by at most
     faint: bool = False
 
     def __post_init__(self) -> None:
@@ -101,22 +77,14 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class PackedFeatures:
-    """Features as they are stored: descriptors in a quarter or half of their size, which matching cannot tell apart.
+    """Features as they are stored: descriptors in a quarter or half of their size, which matching cannot tell apart."""
 
-    Attributes
-    ----------
-    features : Features
-        Their descriptors are replaced by none.
-    descriptors : ndarray of shape (N, D), uint8, float16 or float32
-        Bits; integers up to 255 such as SIFT's and, but for rare ones, RootSIFT's, which lose nothing; else half
-        precision, which is finer than the grid of 1/512 of the largest norm on which descriptors are compared.
-    bits : bool
-        Whether descriptors are bits.
-    """
-
-    features: Features
+    features: Features  # their descriptors are replaced by none
+    # (N, D), uint8, float16: bits; integers up to 255 such as SIFT's and, but for rare ones, RootSIFT's, which lose
+    # nothing; else half precision, which is finer than the grid of 1/512 of the largest norm on which descriptors are
+    # compared
     descriptors: NDArray[Any]
-    bits: bool
+    bits: bool  # whether descriptors are bits
 
     @classmethod
     def pack(cls, features: Features) -> Self:
@@ -146,27 +114,13 @@ def _smallest(descriptors: Descriptors) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Points of two images that show the same, the most distinctive match first (PROSAC's order).
+    """Points of two images that show the same, the most distinctive match first (PROSAC's order)."""
 
-    Attributes
-    ----------
-    indices : ndarray of shape (M, 2), intp
-        Indices into the features of image 1 and image 2.
-    points1, points2 : ndarray of shape (M, 2), float64
-        pixels of the full-size images.
-    ratio : ndarray of shape (M,), float64
-        Distance to the match over distance to the second-best, the worse of both directions; in [0, 1],
-        ascending.
-
-    Raises
-    ------
-    ArgumentError
-        When the shapes do not fit together.
-    """
-
-    indices: NDArray[np.intp]
-    points1: FloatArray
+    indices: NDArray[np.intp]  # (M, 2), intp: indices into the features of image 1 and image 2
+    points1: FloatArray  # points1, points2: (M, 2), float64: pixels of the full-size images
     points2: FloatArray
+    # (M,), float64: distance to the match over distance to the second-best, the worse of both directions; in [0, 1],
+    # ascending
     ratio: FloatArray
 
     def __post_init__(self) -> None:

@@ -33,15 +33,7 @@ class AlikedDetection:
 
     @classmethod
     def find(cls, grey: NDArray[np.uint8], options: FeatureOptions) -> Self:
-        """Run the network on an image.
-
-        Raises
-        ------
-        ArgumentError
-            When this OpenCV has no ALIKED.
-        InputError
-            When the file cannot be read, or holds another network.
-        """
+        """Run the network on an image."""
         assert options.aliked_model is not None
         network = _load("ALIKED", options.aliked_model, _aliked_parameters(options.aliked_size))
         try:
@@ -80,13 +72,6 @@ class LightGlue:
         ONNX file, trained for the kind of features to match.
     min_score : float
         Least confidence of a match, in [0, 1).
-
-    Raises
-    ------
-    ArgumentError
-        When this OpenCV has no LightGlue.
-    InputError
-        When the file cannot be read.
     """
 
     def __init__(self, model: str | Path, min_score: float = 0.1) -> None:
@@ -103,13 +88,6 @@ class LightGlue:
         """Match the features of two images, the most certain first.
 
         Where the matcher by distances gives the ratio of distances, this one gives one minus its confidence.
-
-        Raises
-        ------
-        ArgumentError
-            When the features do not know the size of their images.
-        InputError
-            When the network is not LightGlue for these features.
         """
         if features1.image_size is None or features2.image_size is None:
             raise ArgumentError("LightGlue needs to know the sizes of the images")

@@ -47,11 +47,6 @@ def match(
         Limit to the ratio of distances, in (0, 1]; 1 keeps all mutual nearest neighbours.
     block_bytes : int
         Memory for one block of distances, bytes; the result is the same for any, and for any number of threads.
-
-    Raises
-    ------
-    ArgumentError
-        When the kinds differ, or ``ratio`` is out of range.
     """
     limit = check_ratio(ratio)
     if features1.kind != features2.kind:
@@ -110,11 +105,6 @@ def match_near(
         Matches that are right, as indices into features 1 and 2; at least one.
     ratio : float, optional
         As in :func:`rdstitch.features.match`.
-
-    Raises
-    ------
-    ArgumentError
-        When ``ratio`` is out of range.
     """
     limit = check_ratio(ratio)
     candidates = _within(expected, features2.points, radius)

@@ -144,14 +144,10 @@ class Locations:
 
     They compete with each other in the ratio test, which then loses the point, and would give several matches of
     one point. So what is matched is locations, as alike as the most alike of their descriptors.
-
-    Attributes
-    ----------
-    layers : tuple of ndarray, intp
-        Layer k holds the index of the (k+1)-th keypoint of each location that has one; the locations with the most
-        keypoints come first, so that every layer is a beginning of the one before.
     """
 
+    # layer k holds the index of the (k+1)-th keypoint of each location that has one; the locations with the most
+    # keypoints come first, so that every layer is a beginning of the one before
     layers: tuple[NDArray[np.intp], ...]
 
     @classmethod

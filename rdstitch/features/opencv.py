@@ -97,13 +97,7 @@ def _table(keypoints: Sequence[cv2.KeyPoint], *names: str) -> FloatArray:
 
 
 def create_detector(options: FeatureOptions) -> Any:
-    """Make the OpenCV detector of a kind of features.
-
-    Raises
-    ------
-    ArgumentError
-        When this OpenCV lacks it. Builds differ, and a name may be there that only raises: so it is called.
-    """
+    """Make the OpenCV detector of a kind of features."""
     kind = options.kind
     try:
         if kind in ("sift", "rootsift"):

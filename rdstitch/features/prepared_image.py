@@ -28,22 +28,12 @@ Stretch = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """An image as it was loaded, whole or smaller.
+    """An image as it was loaded, whole or smaller."""
 
-    Attributes
-    ----------
-    image : ndarray of shape (height, width) or (height, width, bands)
-    mask : ndarray of shape (height, width), bool or uint8, or None
-        True or not zero where the image counts; None for everywhere.
-    reduction : int
-        Blocks of so many pixels a side of the whole image are one pixel.
-    image_size : (int, int), optional
-        Width and height of the whole image, pixels; where it is not given, this is the whole.
-    """
-
-    image: PixelArray
-    mask: Mask | None = None
-    reduction: int = 1
+    image: PixelArray  # (height, width) or (height, width, bands)
+    mask: Mask | None = None  # (height, width), bool: true or not zero where the image counts; None for everywhere
+    reduction: int = 1  # blocks of so many pixels a side of the whole image are one pixel
+    # width and height of the whole image, pixels; where it is not given, this is the whole
     image_size: tuple[int, int] | None = None
 
     @property
@@ -54,23 +44,14 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class PreparedImage:
-    """A grey image of working size.
+    """A grey image of working size."""
 
-    Attributes
-    ----------
-    grey : ndarray of shape (height, width), uint8
-    clearance : ndarray of shape (height, width), float32, or None
-        Distance to the nearest masked pixel, pixels of ``grey``, zero if masked; None without mask.
-    factor : ndarray of shape (2,)
-        Pixels of the whole image for one of this, horizontally and vertically.
-    full_size : (int, int)
-        Width and height, pixels.
-    """
-
-    grey: NDArray[np.uint8]
+    grey: NDArray[np.uint8]  # (height, width), uint8
+    # (height, width), float32: distance to the nearest masked pixel, pixels of ``grey``, zero if masked; None without
+    # mask
     clearance: NDArray[np.float32] | None
-    factor: FloatArray
-    full_size: tuple[int, int]
+    factor: FloatArray  # (2,): pixels of the whole image for one of this, horizontally and vertically
+    full_size: tuple[int, int]  # width and height, pixels
 
     @property
     def reduced(self) -> bool:

@@ -30,20 +30,11 @@ _UPSAMPLED, _FIRST = 255, 0  # octaves -1 and 0, as OpenCV packs them
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Keypoints of a tile.
-
-    Attributes
-    ----------
-    detection : OpenCVDetection
-    corner : ndarray of shape (2,)
-        Of the tile, pixels of the reduced image that it is cut from.
-    factor : ndarray of shape (2,)
-        Pixels of the image itself for one of the reduced one, horizontally and vertically.
-    """
+    """Keypoints of a tile."""
 
     detection: OpenCVDetection
-    corner: NDArray[np.intp]
-    factor: FloatArray
+    corner: NDArray[np.intp]  # (2,): of the tile, pixels of the reduced image that it is cut from
+    factor: FloatArray  # (2,): pixels of the image itself for one of the reduced one, horizontally and vertically
 
     @property
     def points(self) -> FloatArray:

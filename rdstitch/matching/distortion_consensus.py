@@ -17,36 +17,16 @@ _ROUNDS = 20  # of reweighting; three or four are needed
 
 @dataclass(frozen=True)
 class Consensus:
-    """What the pairs agree on.
+    """What the pairs agree on."""
 
-    Attributes
-    ----------
-    distortion : float
-        λ in the half-diagonal frame; NaN where no pair can see it.
-    std : float
-        Its standard deviation; inf where no pair can see it.
-    scatter : float
-        Standard deviation between pairs that their own uncertainty does not explain.
-    agreeing : int
-        Votes within three standard deviations of the consensus.
-    votes : int
-        Pairs that can see λ.
-    edges : ndarray of shape (B + 1,)
-        Bin edges of the histogram; empty without votes.
-    histogram : ndarray of shape (B,)
-        Weight of the votes in each bin, adding up to one.
-    reason : str
-        One sentence.
-    """
-
-    distortion: float
-    std: float
-    scatter: float
-    agreeing: int
-    votes: int
-    edges: FloatArray
-    histogram: FloatArray
-    reason: str
+    distortion: float  # λ in the half-diagonal frame; NaN where no pair can see it
+    std: float  # its standard deviation; inf where no pair can see it
+    scatter: float  # standard deviation between pairs that their own uncertainty does not explain
+    agreeing: int  # votes within three standard deviations of the consensus
+    votes: int  # pairs that can see λ
+    edges: FloatArray  # (B + 1,): bin edges of the histogram; empty without votes
+    histogram: FloatArray  # (B,): weight of the votes in each bin, adding up to one
+    reason: str  # one sentence
 
 
 def vote(distortion: ArrayLike, std: ArrayLike) -> Consensus:

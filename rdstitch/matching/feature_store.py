@@ -18,30 +18,15 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class StoredFeatures:
-    """Features of one image, read when they are needed.
+    """Features of one image, read when they are needed."""
 
-    Attributes
-    ----------
-    stored : Stored of PackedFeatures
-        In pixels of the size of the image.
-    count : int
-        Number of features that are stored.
-    image_size : (int, int), optional
-        Width and height of the image in whose pixels they are wanted; None: as they are stored.
-    chosen : ndarray of shape (N,), intp, optional
-        Those that are wanted, in their order; None: all.
-    shown : int
-        Keypoints that the image shows at its working size, see :class:`rdstitch.features.Features`.
-    faint : bool
-        Whether these are few and weak.
-    """
-
-    stored: Stored[PackedFeatures]
-    count: int
+    stored: Stored[PackedFeatures]  # in pixels of the size of the image
+    count: int  # number of features that are stored
+    # width and height of the image in whose pixels they are wanted; None: as they are stored
     image_size: Size | None = None
-    chosen: NDArray[np.intp] | None = None
-    shown: int = 0
-    faint: bool = False
+    chosen: NDArray[np.intp] | None = None  # (N,), intp: those that are wanted, in their order; None: all
+    shown: int = 0  # keypoints that the image shows at its working size, see :class:`rdstitch.features.Features`
+    faint: bool = False  # whether these are few and weak
 
     @classmethod
     def of(cls, features: Features) -> Self:
@@ -77,12 +62,7 @@ class StoredFeatures:
 
 @dataclass(frozen=True, eq=False)
 class FeatureStore(Sequence[Features]):
-    """Features of the images of a set; an item is read when it is asked for.
-
-    Attributes
-    ----------
-    items : tuple of StoredFeatures
-    """
+    """Features of the images of a set; an item is read when it is asked for."""
 
     items: tuple[StoredFeatures, ...]
 
@@ -122,19 +102,11 @@ class FeatureStore(Sequence[Features]):
 
 @dataclass(frozen=True, eq=False)
 class StoredMatches:
-    """Putative matches of one pair, read when they are needed.
-
-    Attributes
-    ----------
-    stored : Stored of Correspondences
-    count : int
-        Number of matches.
-    sizes : ((int, int), (int, int), (int, int), (int, int)), optional
-        Width and height of the two images in whose pixels they are stored, and of those in whose they are wanted.
-    """
+    """Putative matches of one pair, read when they are needed."""
 
     stored: Stored[Correspondences]
-    count: int
+    count: int  # number of matches
+    # width and height of the two images in whose pixels they are stored, and of those in whose they are wanted
     sizes: tuple[Size, Size, Size, Size] | None = None
 
     @classmethod

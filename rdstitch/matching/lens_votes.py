@@ -26,21 +26,12 @@ _PAIRS_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Votes:
-    """What pairs see of λ, each on its own.
+    """What pairs see of λ, each on its own."""
 
-    Attributes
-    ----------
-    image1, image2 : ndarray of shape (L,), intp
-        The images of each pair.
-    distortion : ndarray of shape (L, 2)
-        λ of its first and of its second image, half-diagonal frame.
-    covariance : ndarray of shape (L, 2, 2)
-    """
-
-    image1: IntArray
+    image1: IntArray  # image1, image2: (L,), intp: the images of each pair
     image2: IntArray
-    distortion: FloatArray
-    covariance: FloatArray
+    distortion: FloatArray  # (L, 2): λ of its first and of its second image, half-diagonal frame
+    covariance: FloatArray  # (L, 2, 2)
 
     @classmethod
     def of(cls, pairs: Sequence[PairRegistration], threshold: float) -> Self:

@@ -14,26 +14,15 @@ from rdstitch.radial_homography import RadialHomography
 
 @dataclass(frozen=True)
 class Link:
-    """Two images that overlap.
+    """Two images that overlap."""
 
-    Attributes
-    ----------
-    image1, image2 : int
-        Indices of the images.
-    points1, points2 : ndarray of shape (M, 2)
-        Where the inliers of the pair were measured, pixels of the one and of the other image.
-    relation : RadialHomography
-        The pair's own estimate, from ``image1`` to ``image2``.
-    count : int, optional
-        Number of the inliers, where these points are only some of them.
-    """
-
-    image1: int
+    image1: int  # image1, image2: indices of the images
     image2: int
+    # points1, points2: (M, 2): where the inliers of the pair were measured, pixels of the one and of the other image
     points1: FloatArray
     points2: FloatArray
-    relation: RadialHomography
-    count: int | None = None
+    relation: RadialHomography  # the pair's own estimate, from ``image1`` to ``image2``
+    count: int | None = None  # number of the inliers, where these points are only some of them
 
     def __post_init__(self) -> None:
         """Check that the parts fit together."""

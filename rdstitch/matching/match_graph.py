@@ -22,20 +22,11 @@ def connected_components(count: int, image1: ArrayLike, image2: ArrayLike) -> li
 
 @dataclass(frozen=True)
 class SpanningTree:
-    """A tree over a connected graph, as the steps that reach one image after the other from the root.
-
-    Attributes
-    ----------
-    root : int
-    link : ndarray of shape (N - 1,), intp
-        The link of each step.
-    parent, child : ndarray of shape (N - 1,), intp
-        Where the step starts, and the image that it reaches.
-    """
+    """A tree over a connected graph, as the steps that reach one image after the other from the root."""
 
     root: int
-    link: IntArray
-    parent: IntArray
+    link: IntArray  # (N - 1,), intp: the link of each step
+    parent: IntArray  # parent, child: (N - 1,), intp: where the step starts, and the image that it reaches
     child: IntArray
 
     def chained(self, homographies: FloatArray, image1: NDArray[np.intp], root_matrix: FloatArray) -> FloatArray:

@@ -26,21 +26,11 @@ _MIN_MARGIN = 5.0  # standard deviations by which votes must tell of which of th
 
 @dataclass(frozen=True)
 class TwoLenses:
-    """Images of two lenses.
+    """Images of two lenses."""
 
-    Attributes
-    ----------
-    second : ndarray of shape (N,), bool
-        Which images come from the second one: the fewer.
-    distortion : (float, float)
-        λ of both, half-diagonal frame.
-    certain : bool
-        Whether it is clear which images belong together, and a pair of them can be stitched.
-    """
-
-    second: BoolArray
-    distortion: tuple[float, float]
-    certain: bool
+    second: BoolArray  # (N,), bool: which images come from the second one: the fewer
+    distortion: tuple[float, float]  # λ of both, half-diagonal frame
+    certain: bool  # whether it is clear which images belong together, and a pair of them can be stitched
 
 
 def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:

@@ -40,36 +40,19 @@ Descriptors = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Similarity:
-    """How alike N images are, as far as they are.
+    """How alike N images are, as far as they are."""
 
-    Attributes
-    ----------
-    scores : sparse array of shape (N, N)
-        Symmetric; larger is more alike, and what any two images have in common counts nothing.
-    most_alike : ndarray of shape (N, K), intp
-        The K other images that are most alike to each, the most alike first.
-    ordered : bool
-        Whether images that follow one another are alike, so that their order means something.
-    """
-
-    scores: "sparse.csr_array"
-    most_alike: IntArray
-    ordered: bool
+    scores: "sparse.csr_array"  # symmetric; larger is more alike, and what any two images have in common counts nothing
+    most_alike: IntArray  # (N, K), intp: the K other images that are most alike to each, the most alike first
+    ordered: bool  # whether images that follow one another are alike, so that their order means something
 
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Words in a tree of two levels.
+    """Words in a tree of two levels."""
 
-    Attributes
-    ----------
-    branches : ndarray of shape (B, D), float32
-    words : ndarray of shape (B, B, D), float32
-        Of each branch.
-    """
-
-    branches: Array32
-    words: Array32
+    branches: Array32  # (B, D), float32
+    words: Array32  # (B, B, D), float32: of each branch
 
     @classmethod
     def learned(cls, descriptors: Descriptors, branches: int, random: np.random.Generator) -> "Vocabulary":

@@ -41,22 +41,12 @@ _one_estimation = Lock()
 
 @dataclass(frozen=True, repr=False)
 class PairRegistration:
-    """What became of one pair.
+    """What became of one pair."""
 
-    Attributes
-    ----------
-    image1, image2 : int
-        Indices of the images.
-    matches : StoredMatches
-        The putative matches, on disk.
-    relation : RadialHomography
-        The estimate from ``image1`` to ``image2``; falsy with the reason where there is none.
-    """
-
-    image1: int
+    image1: int  # image1, image2: indices of the images
     image2: int
-    matches: StoredMatches
-    relation: RadialHomography
+    matches: StoredMatches  # the putative matches, on disk
+    relation: RadialHomography  # the estimate from ``image1`` to ``image2``; falsy with the reason where there is none
 
     def __repr__(self) -> str:
         """One line: its images and their relation."""
@@ -87,26 +77,14 @@ class PairRegistration:
 
 @dataclass(frozen=True)
 class MatchingTask:
-    """Pairs to be matched together.
+    """Pairs to be matched together."""
 
-    Attributes
-    ----------
-    features : sequence of (StoredFeatures, StoredFeatures)
-        Of the two images of each pair.
-    known : sequence of StoredMatches or None
-        Some matches of each pair, where they are known: they show where the images overlap, and only there the rest
-        is looked for.
-    matcher : callable
-        Matches the features of two images.
-    how : tuple
-        What stands for the matcher in the inputs of results.
-    cache : Cache
-    """
-
-    features: Sequence[tuple[StoredFeatures, StoredFeatures]]
+    features: Sequence[tuple[StoredFeatures, StoredFeatures]]  # of the two images of each pair
+    # some matches of each pair, where they are known: they show where the images overlap, and only there the rest is
+    # looked for
     known: Sequence[StoredMatches | None]
-    matcher: Matcher
-    how: tuple[float | str | None, ...]
+    matcher: Matcher  # matches the features of two images
+    how: tuple[float | str | None, ...]  # what stands for the matcher in the inputs of results
     cache: Cache
 
 
@@ -138,23 +116,13 @@ def _match_pair(
 
 @dataclass(frozen=True)
 class EstimationTask:
-    """Pairs to be estimated together.
+    """Pairs to be estimated together."""
 
-    Attributes
-    ----------
-    cameras : sequence of (Camera, Camera)
-        Of the two images of each pair; of their lens only the centre and the focal length are used, unless
-        ``options.distortion``.
-    matches : sequence of StoredMatches
-        Of each pair.
-    tilts : sequence of ((float, float) or None, (float, float) or None)
-        Known tilts (ψ, θ), radians, of the two images of each pair; None where unknown.
-    options : PairOptions
-    cache : Cache
-    """
-
+    # of the two images of each pair; of their lens only the centre and the focal length are used, unless
+    # ``options.distortion``
     cameras: Sequence[tuple[Camera, Camera]]
-    matches: Sequence[StoredMatches]
+    matches: Sequence[StoredMatches]  # of each pair
+    # known tilts (ψ, θ), radians, of the two images of each pair; None where unknown
     tilts: Sequence[tuple[tuple[float, float] | None, tuple[float, float] | None]]
     options: PairOptions
     cache: Cache

@@ -44,34 +44,17 @@ _SEARCH_RADIUS = 3.0  # thresholds around the place where a match is expected
 
 @dataclass(frozen=True)
 class Pairing:
-    """What it takes to register pairs.
-
-    Attributes
-    ----------
-    features : FeatureStore
-    cameras : sequence of Camera
-    matcher : callable
-    options : MatchingOptions
-    progress : callable
-    executor : concurrent.futures.Executor
-        Where batches of pairs are matched and estimated.
-    cache : Cache
-        Of results of earlier runs.
-    store : Cache
-        Of what need not be in memory all the time.
-    tilts : sequence of (float, float), optional
-        (ψ, θ), radians, of each image, where they are known exactly.
-    """
+    """What it takes to register pairs."""
 
     features: FeatureStore
     cameras: Sequence[Camera]
     matcher: Matcher
     options: MatchingOptions
     progress: Progress
-    executor: Executor
-    cache: Cache = NO_CACHE
-    store: Cache = NO_CACHE
-    tilts: Sequence[tuple[float, float]] | None = None
+    executor: Executor  # where batches of pairs are matched and estimated
+    cache: Cache = NO_CACHE  # of results of earlier runs
+    store: Cache = NO_CACHE  # of what need not be in memory all the time
+    tilts: Sequence[tuple[float, float]] | None = None  # (ψ, θ), radians, of each image, where they are known exactly
 
     def prescreen_pairs(self, pairs: Sequence[Pair]) -> dict[Pair, StoredMatches]:
         """The pairs whose strongest features match and that matter for the place of an image, with those matches.

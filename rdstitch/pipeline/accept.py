@@ -51,13 +51,6 @@ def accept(
         Only the lens is wanted, so that doubts about the places of images do not matter.
     prefer_turn : bool
         As for :func:`rdstitch.pipeline.register.register`.
-
-    Raises
-    ------
-    RefusedError
-        When nothing trustworthy remains, unless ``options.force``: then everything is kept.
-    PartialResultError
-        When an image is left out, under ``options.strict``.
     """
     cache = Cache(options.cache)
     layout_matters = not (lens_only or metric)

@@ -41,12 +41,7 @@ was the lens that moved them, not the ground."""
 
 @contextmanager
 def impossible_estimates_fail() -> Iterator[None]:
-    """An estimated camera that cannot be is a failed registration; a block, or a decorator of a stage.
-
-    Raises
-    ------
-    RegistrationError
-    """
+    """An estimated camera that cannot be is a failed registration; a block, or a decorator of a stage."""
     try:
         yield
     except ImpossibleCameraError as error:
@@ -58,49 +53,25 @@ def impossible_estimates_fail() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class AlignedPairs:
-    """Pairs, and the alignment that was made from them.
+    """Pairs, and the alignment that was made from them."""
 
-    Attributes
-    ----------
-    pairs : tuple of PairRegistration
-        Every pair that was compared, in the order of the images.
-    alignment : Alignment
-    rough : bool
-        Whether the inliers that it was made from are those over rough ground.
-    """
-
-    pairs: tuple[PairRegistration, ...]
+    pairs: tuple[PairRegistration, ...]  # every pair that was compared, in the order of the images
     alignment: Alignment
-    rough: bool = False
+    rough: bool = False  # whether the inliers that it was made from are those over rough ground
 
 
 @dataclass(frozen=True)
 class Aligner:
-    """What the alignment of a set of images needs besides their pairs.
+    """What the alignment of a set of images needs besides their pairs."""
 
-    Attributes
-    ----------
-    paths : tuple of str
-        Of the images, for messages.
-    cameras : tuple of Camera
-        Of the size that features are detected at.
-    options : AlignmentOptions
-    cache : Cache
-    threshold : float
-        Largest transfer error of an inlier, pixels.
-    needs_poses : bool
-        Whether every alignment must have metric poses, see :meth:`metric`.
-    orientations : tuple of int
-        By which quarter turns of EXIF (1, 3, 6, 8) the images became upright; ``options`` are of the stored ones.
-        All upright as they are if empty.
-    """
-
-    paths: tuple[str, ...]
-    cameras: tuple[Camera, ...]
+    paths: tuple[str, ...]  # of the images, for messages
+    cameras: tuple[Camera, ...]  # of the size that features are detected at
     options: AlignmentOptions
     cache: Cache
-    threshold: float
-    needs_poses: bool = False
+    threshold: float  # largest transfer error of an inlier, pixels
+    needs_poses: bool = False  # whether every alignment must have metric poses, see :meth:`metric`
+    # by which quarter turns of EXIF (1, 3, 6, 8) the images became upright; ``options`` are of the stored ones. All
+    # upright as they are if empty
     orientations: tuple[int, ...] = ()
 
     @classmethod
@@ -113,13 +84,7 @@ class Aligner:
         prefer_turn: bool = False,
         layout_matters: bool = True,
     ) -> Self:
-        """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`.
-
-        Raises
-        ------
-        ArgumentError
-            When the reference image is none of the images.
-        """
+        """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`."""
         paths = tuple(str(source.path) for source in sources)
         megapixels = options.features.for_images(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
@@ -140,13 +105,7 @@ class Aligner:
         return [(psi, theta) for psi, theta in turned_tilts(np.array(tilts), self._turns).tolist()]
 
     def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
-        """Align the images by the pairs that were registered; from an earlier run where the cache has it.
-
-        Raises
-        ------
-        RegistrationError
-            When no pair was registered.
-        """
+        """Align the images by the pairs that were registered; from an earlier run where the cache has it."""
         return_freed_memory()
         aligned = AlignedPairs(tuple(pairs), self._aligned(pairs))
         ground = over_rough_ground(pairs, self.threshold)

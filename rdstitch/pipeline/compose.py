@@ -48,36 +48,16 @@ _PROBE_REDUCTION = 8
 
 @dataclass(frozen=True)
 class Composed:
-    """Images put together, or the plan of doing so.
+    """Images put together, or the plan of doing so."""
 
-    Attributes
-    ----------
-    canvas : Canvas
-        Where the images lie in the output.
-    composite : Composite or None
-        The image; None where it went to a file, or was only planned.
-    plan : CompositePlan or None
-        Of a dry run.
-    messages : tuple of Message
-        What the user should know, such as why nothing was cropped.
-    fingerprint : Fingerprint or None
-        Size and digest of the file.
-    written : FileComposite or None
-        The image in its file.
-    place : Georeference or None
-        Of the canvas.
-    place_reason : str
-        Why there is none.
-    """
-
-    canvas: Canvas
-    composite: Composite | None = None
-    plan: CompositePlan | None = None
-    messages: tuple[Message, ...] = ()
-    fingerprint: Fingerprint | None = None
-    written: FileComposite | None = None
-    place: Georeference | None = None
-    place_reason: str = ""
+    canvas: Canvas  # where the images lie in the output
+    composite: Composite | None = None  # the image; None where it went to a file, or was only planned
+    plan: CompositePlan | None = None  # of a dry run
+    messages: tuple[Message, ...] = ()  # what the user should know, such as why nothing was cropped
+    fingerprint: Fingerprint | None = None  # size and digest of the file
+    written: FileComposite | None = None  # the image in its file
+    place: Georeference | None = None  # of the canvas
+    place_reason: str = ""  # why there is none
 
 
 def compose_images(
@@ -107,11 +87,6 @@ def compose_images(
         See :func:`rdstitch.compositing.compose`.
     dry_run : bool
         Only plan.
-
-    Raises
-    ------
-    OutputError
-        When a file beside the output exists already.
     """
     return_freed_memory()
     world_files = _files_beside(output, placed, overwrite)
@@ -233,20 +208,11 @@ def _profiles_differ(sources: Sequence[Source]) -> list[Message]:
 
 @dataclass(frozen=True, eq=False)
 class BlockTask:
-    """A block, and what its worker must know beside.
-
-    Attributes
-    ----------
-    block : Block
-    sources : tuple of Source
-        Its images.
-    store : Cache
-        Where its strips go.
-    """
+    """A block, and what its worker must know beside."""
 
     block: Block
-    sources: tuple[Source, ...]
-    store: Cache
+    sources: tuple[Source, ...]  # its images
+    store: Cache  # where its strips go
 
 
 def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None) -> BlockRunner | None:

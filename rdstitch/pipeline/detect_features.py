@@ -36,18 +36,10 @@ _LOW_SHARE = 0.5
 
 @dataclass(frozen=True)
 class DetectedFeatures:
-    """Features of N images.
+    """Features of N images."""
 
-    Attributes
-    ----------
-    features : FeatureStore
-        In pixels of the images; a damaged image has none.
-    damaged : mapping of int to str
-        Why the pixels of an image could not be read, by its index.
-    """
-
-    features: FeatureStore
-    damaged: Mapping[int, str]
+    features: FeatureStore  # in pixels of the images; a damaged image has none
+    damaged: Mapping[int, str]  # why the pixels of an image could not be read, by its index
 
 
 @dataclass(frozen=True)
@@ -76,11 +68,6 @@ def detect_features(
         Where the features lie.
     skip_bad : bool
         Go on without damaged images instead of raising.
-
-    Raises
-    ------
-    InputError
-        When the pixels of an image cannot be read, unless ``skip_bad``.
     """
     results: list[StoredFeatures | InputError] = []
     size = min(_IMAGES_AT_ONCE, -(-len(sources) // _MIN_BATCHES))
@@ -139,20 +126,11 @@ def _no_features(options: FeatureOptions, source: Source) -> Features:
 
 @dataclass(frozen=True)
 class DetectionByContrast:
-    """Features, and how the images were rendered for detection.
-
-    Attributes
-    ----------
-    detected : DetectedFeatures
-    stretch : (float, float) or None
-        Grey levels that became 0 and 255 in all images; None where they are those of 8 bits.
-    equalized : tuple of int
-        The images whose local contrast was equalized because they showed too little otherwise.
-    """
+    """Features, and how the images were rendered for detection."""
 
     detected: DetectedFeatures
-    stretch: Stretch | None
-    equalized: tuple[int, ...]
+    stretch: Stretch | None  # grey levels that became 0 and 255 in all images; None where they are those of 8 bits
+    equalized: tuple[int, ...]  # the images whose local contrast was equalized because they showed too little otherwise
 
 
 def detect_by_contrast(

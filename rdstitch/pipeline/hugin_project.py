@@ -21,11 +21,6 @@ def project_of_hugin(result: StitchResult) -> str:
     """The project: images as their files store them, with yaw, pitch and roll, and over a plane with TrX, TrY, TrZ.
 
     Its panorama is equirectangular, or the plane seen from one height of the reference image.
-
-    Raises
-    ------
-    ArgumentError
-        When images have no files, or no poses: the model with one homography for each.
     """
     from rdstitch.camera_files.hugin import HEAD, hugin_lens
 

@@ -21,13 +21,7 @@ from rdstitch.stitch_result import StitchResult
 
 
 def layer_files(names: list[str], folder: str | Path) -> list[Path]:
-    """The files of images of these names, two each: the layer, and its mask.
-
-    Raises
-    ------
-    OutputError
-        When two images would have the same file.
-    """
+    """The files of images of these names, two each: the layer, and its mask."""
     stems = [Path(name).stem for name in names]
     twice = [stem for stem, count in Counter(stems).items() if count > 1]
     if twice:
@@ -36,13 +30,7 @@ def layer_files(names: list[str], folder: str | Path) -> list[Path]:
 
 
 def make_folder(folder: str | Path) -> None:
-    """Make the folder of layers, which is better known before long work than after it.
-
-    Raises
-    ------
-    OutputError
-        When that is impossible.
-    """
+    """Make the folder of layers, which is better known before long work than after it."""
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:

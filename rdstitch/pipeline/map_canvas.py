@@ -15,13 +15,7 @@ from rdstitch.pipeline.placed_images import PlacedImages, plan
 
 
 def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
-    """Find out before long work whether what is requested of the map can be had.
-
-    Raises
-    ------
-    ArgumentError
-        When it cannot.
-    """
+    """Find out before long work whether what is requested of the map can be had."""
     if options.epsg is not None:
         Crs(options.epsg)
     placed = has_place([source.metadata.gps for source in sources]) or any(source.control for source in sources)
@@ -34,13 +28,7 @@ def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
 
 
 def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas, Georeference | None, str]:
-    """The canvas with its place on the Earth, or why it has none.
-
-    Raises
-    ------
-    ArgumentError
-        When ``options.gsd`` is given and there is no place.
-    """
+    """The canvas with its place on the Earth, or why it has none."""
     canvas = plan(placed, options)
     if placed.turned:
         place, reason = None, "the camera turned on the spot"

@@ -57,11 +57,6 @@ def match_crossings(
     AlignedPairs
     dict of int to str
         Why images have no place any more: none, as in :func:`settle_repeated_pattern`, whose place this takes.
-
-    Raises
-    ------
-    InputError
-        When an image can no longer be read.
     """
     if not pairing.shows_repeated_pattern:
         return aligned, {}

@@ -53,11 +53,6 @@ def settle_repeated_pattern(
     AlignedPairs
     dict of int to str
         Why images have no place any more, by their index.
-
-    Raises
-    ------
-    InputError
-        When an image can no longer be read.
     """
     alignment = aligned.alignment
     if alignment.poses is None or len(sources) > _MAX_IMAGES or not pairing.shows_repeated_pattern:

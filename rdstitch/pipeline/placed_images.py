@@ -58,33 +58,19 @@ def align_registration_locally(registration: Registration, choice: LocalAlignmen
 
 @dataclass(frozen=True)
 class PlacedImages:
-    """The images that are used, and where they belong.
-
-    Attributes
-    ----------
-    sources : sequence of Source
-    cameras : sequence of Camera
-    homographies : ndarray of shape (N, 3, 3)
-        Normalized undistorted coordinates of each image to the plane, or to directions.
-    reference : int or None
-        Image whose resolution the output has; None for the median one's.
-    displacements : sequence of callables or None, optional
-        What local alignment adds to the measured pixels of each image.
-    turned : bool
-        Whether the camera turned on the spot, so that the homographies lead to directions, not to a plane.
-    place : Georeference or None
-        Of the plane, where it is known from an earlier run.
-    orientation : ndarray of shape (3, 3), or None
-        What the homographies were turned by; see :mod:`rdstitch.pipeline.upright`.
-    """
+    """The images that are used, and where they belong."""
 
     sources: Sequence[Source]
     cameras: Sequence[Camera]
+    # (N, 3, 3): normalized undistorted coordinates of each image to the plane, or to directions
     homographies: FloatArray
-    reference: int | None
+    reference: int | None  # image whose resolution the output has; None for the median one's
+    # what local alignment adds to the measured pixels of each image
     displacements: Sequence[Displacement | None] | None = None
+    # whether the camera turned on the spot, so that the homographies lead to directions, not to a plane
     turned: bool = False
-    place: Georeference | None = None
+    place: Georeference | None = None  # of the plane, where it is known from an earlier run
+    # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.upright`
     orientation: FloatArray | None = None
 
     @classmethod

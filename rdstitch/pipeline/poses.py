@@ -24,11 +24,6 @@ def poses_table(result: StitchResult, frame: PosesFrame = "enu") -> str:
         "enu" or "camera", see :mod:`rdstitch.export.trajectory_files`, in heights of the first image; "map": easting,
         northing and the height above the ground in metres, with yaw zero where the top of an image is north. The
         covariances are then relative to the reference image; how well that is placed, the georeference says.
-
-    Raises
-    ------
-    ArgumentError
-        When there are no metric poses, or no map.
     """
     registration = result.registration
     path = Trajectory.from_alignment(registration.alignment)

@@ -44,13 +44,7 @@ def read_frames(
 def read_inputs(
     frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool
 ) -> tuple[list[Source], list[Message]]:
-    """The images that options leave, with what was measured of them; and why others cannot be read.
-
-    Raises
-    ------
-    ArgumentError, InputError, LimitError
-        See :func:`rdstitch.inputs.source.read_sources`; also when fewer than two are left.
-    """
+    """The images that options leave, with what was measured of them; and why others cannot be read."""
     # Before the first large image is freed.
     return_freed_memory()
     chosen = selected(frames, options.exclude, options.include_only)

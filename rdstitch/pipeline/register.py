@@ -66,11 +66,6 @@ def register(
         Only the lens is wanted, so that images of a repeated pattern may be off by whole periods of it.
     prefer_turn : bool
         A turn on the spot is taken where a plane explains the images as well.
-
-    Raises
-    ------
-    RegistrationError
-        When no two images overlap.
     """
     options = options.for_images(len(sources))
     cache = Cache.at(options.cache)

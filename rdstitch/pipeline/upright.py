@@ -39,12 +39,6 @@ def turned(placed: PlacedImages, options: UprightOptions) -> tuple[PlacedImages,
     """The images as the options turn them, and what the user should know of it.
 
     :attr:`PlacedImages.orientation` says by what.
-
-    Raises
-    ------
-    ArgumentError
-        When a plane should be turned as only a panorama can be, or places are given where there is no reference
-        image, or that it cannot show.
     """
     matrix, said = _upright(placed, options) if options.upright else (None, [])
     if (view := options.view) is not None:

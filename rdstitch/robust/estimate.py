@@ -29,26 +29,14 @@ _MATCHES_AT_ONCE = 1 << 14
 
 @dataclass(frozen=True)
 class PairMatches:
-    """Matches of one pair of images, and what is known of the cameras.
+    """Matches of one pair of images, and what is known of the cameras."""
 
-    Attributes
-    ----------
-    points1, points2 : ndarray of shape (N, 2)
-        Measured points of image 1 and image 2, pixels.
-    camera1, camera2 : Camera
-        With the focal length and the distortion centre; one lens, so λ is shared.
-    quality : ndarray of shape (N,), optional
-        How much each match can be trusted, the higher the better.
-    tilts : ndarray of shape (2, 2), optional
-        Known (ψ, θ) of both images, radians.
-    """
-
-    points1: FloatArray
+    points1: FloatArray  # points1, points2: (N, 2): measured points of image 1 and image 2, pixels
     points2: FloatArray
-    camera1: Camera
+    camera1: Camera  # camera1, camera2: with the focal length and the distortion centre; one lens, so λ is shared
     camera2: Camera
-    quality: FloatArray | None = None
-    tilts: FloatArray | None = None
+    quality: FloatArray | None = None  # (N,): how much each match can be trusted, the higher the better
+    tilts: FloatArray | None = None  # (2, 2): known (ψ, θ) of both images, radians
 
     def __len__(self) -> int:
         """Number of matches."""
@@ -73,23 +61,13 @@ class PairMatches:
 
 @dataclass(frozen=True)
 class EstimationOptions:
-    """How pairs are estimated.
+    """How pairs are estimated."""
 
-    Attributes
-    ----------
-    solver : str
-        One of :data:`SOLVERS`.
-    distortion : float, optional
-        Known λ in the half-diagonal frame; it is then not estimated.
-    ransac : RansacOptions
-    select_below : int or None
-        Inliers below which the models of planar motion compete with the free homography, which needs more of them;
-        None: always.
-    """
-
-    solver: str = "auto"
-    distortion: float | None = None
+    solver: str = "auto"  # one of :data:`SOLVERS`
+    distortion: float | None = None  # known λ in the half-diagonal frame; it is then not estimated
     ransac: RansacOptions = field(default_factory=RansacOptions)
+    # inliers below which the models of planar motion compete with the free homography, which needs more of them; None:
+    # always
     select_below: int | None = None
 
     def __post_init__(self) -> None:
@@ -188,13 +166,7 @@ def estimate_radial_homography(
 
 
 def estimate_radial_homographies(pairs: Sequence[PairMatches], options: EstimationOptions) -> list[RadialHomography]:
-    """As :func:`estimate_radial_homography`, of many pairs at once: several times faster, the same result for each.
-
-    Raises
-    ------
-    ArgumentError
-        When the two-point solver is requested for a pair without known tilts.
-    """
+    """As :func:`estimate_radial_homography`, of many pairs at once: several times faster, the same result for each."""
     if options.solver == "two_point" and any(pair.tilts is None for pair in pairs):
         raise ArgumentError("the two_point solver needs the tilt")
     result: dict[int, RadialHomography] = {}

@@ -22,23 +22,12 @@ _MIN_DAMPING = 1e-9
 
 @dataclass
 class BatchedNormalEquations:
-    """The loss of B problems at some parameters, and what a step from there takes.
+    """The loss of B problems at some parameters, and what a step from there takes."""
 
-    Attributes
-    ----------
-    cost : ndarray of shape (B,)
-    information : ndarray of shape (B, P, P)
-        Weighted ``J'J``.
-    gradient : ndarray of shape (B, P)
-        Half the gradient of the cost.
-    squared : ndarray of shape (B, N)
-        Squared errors of the measurements; inf where there is none.
-    """
-
-    cost: FloatArray
-    information: FloatArray
-    gradient: FloatArray
-    squared: FloatArray
+    cost: FloatArray  # (B,)
+    information: FloatArray  # (B, P, P): weighted ``J'J``
+    gradient: FloatArray  # (B, P): half the gradient of the cost
+    squared: FloatArray  # (B, N): squared errors of the measurements; inf where there is none
 
     @property
     def errors(self) -> FloatArray:

@@ -37,31 +37,19 @@ class PairLenses:
 
 @dataclass(frozen=True)
 class TransferDerivatives:
-    """Errors of transfer and their derivatives; pixels of image 2, pairs first and matches last.
+    """Errors of transfer and their derivatives; pixels of image 2, pairs first and matches last."""
 
-    Attributes
-    ----------
-    error : ndarray of shape (B, 2, N)
-        Transferred less measured point.
-    by_image : ndarray of shape (B, 2, 3, N)
-        By ``z = H p``, so that the derivative by ``H[i, j]`` is ``by_image[:, :, i] * lifted[:, j]``.
-    lifted : ndarray of shape (B, 3, N)
-        ``p``.
-    by_lens : ndarray of shape (B, 2, E, N)
-        By λ; or by λ of image 1, λ of image 2, μ and the distortion centre where the lens has all of these.
-    precision : ndarray of shape (B, 3, N)
-        Entries xx, xy, yy of the inverse covariance of the error for unit noise in both images, halved:
-        ``((I + J J') / 2)⁻¹``, J the derivative by the point of image 1 (Sampson's weighting).
-    lost : ndarray of shape (B, N), bool
-        No transfer: behind the camera, or beyond the lens model. Errors and derivatives are then finite but mean
-        nothing.
-    """
-
-    error: FloatArray
+    error: FloatArray  # (B, 2, N): transferred less measured point
+    # (B, 2, 3, N): by ``z = H p``, so that the derivative by ``H[i, j]`` is ``by_image[:, :, i] * lifted[:, j]``
     by_image: FloatArray
-    lifted: FloatArray
+    lifted: FloatArray  # (B, 3, N): ``p``
+    # (B, 2, E, N): by λ; or by λ of image 1, λ of image 2, μ and the distortion centre where the lens has all of these
     by_lens: FloatArray
+    # (B, 3, N): entries xx, xy, yy of the inverse covariance of the error for unit noise in both images, halved: ``((I
+    # + J J') / 2)⁻¹``, J the derivative by the point of image 1 (Sampson's weighting)
     precision: FloatArray
+    # (B, N), bool: no transfer: behind the camera, or beyond the lens model. Errors and derivatives are then finite but
+    # mean nothing
     lost: BoolArray
 
     @property
@@ -147,21 +135,12 @@ def _precision(by_point: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class EntryEquations:
-    """Loss and normal equations by the entries of H, row by row, and then by the lens: 9 + E of them.
+    """Loss and normal equations by the entries of H, row by row, and then by the lens: 9 + E of them."""
 
-    Attributes
-    ----------
-    cost : ndarray of shape (B,)
-    information : ndarray of shape (B, 9 + E, 9 + E)
-    gradient : ndarray of shape (B, 9 + E)
-    squared : ndarray of shape (B, N)
-        Squared whitened errors, px²; inf where there is no transfer, or no match.
-    """
-
-    cost: FloatArray
-    information: FloatArray
-    gradient: FloatArray
-    squared: FloatArray
+    cost: FloatArray  # (B,)
+    information: FloatArray  # (B, 9 + E, 9 + E)
+    gradient: FloatArray  # (B, 9 + E)
+    squared: FloatArray  # (B, N): squared whitened errors, px²; inf where there is no transfer, or no match
 
 
 def entry_equations(

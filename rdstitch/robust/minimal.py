@@ -20,27 +20,15 @@ Solve = Callable[[FloatArray, FloatArray, FloatArray | None], Solutions]
 
 @dataclass(frozen=True)
 class MinimalSolver:
-    """A minimal solver.
+    """A minimal solver."""
 
-    Attributes
-    ----------
-    name : str
-        As the user names it.
-    sample_size : int
-    solve : callable
-        Maps points (B, sample_size, 2) of both images, in the half-diagonal frame, and the known tilts (B, 2, 2) of
-        both images of each sample, radians, or None, to solutions in that frame.
-    model : PairModel
-        The model that the solver assumes; its solutions are refined with it first.
-    fixed_distortion : bool
-        Whether λ is known.
-    """
-
-    name: str
+    name: str  # as the user names it
     sample_size: int
+    # maps points (B, sample_size, 2) of both images, in the half-diagonal frame, and the known tilts (B, 2, 2) of both
+    # images of each sample, radians, or None, to solutions in that frame
     solve: Solve
-    model: PairModel
-    fixed_distortion: bool = False
+    model: PairModel  # the model that the solver assumes; its solutions are refined with it first
+    fixed_distortion: bool = False  # whether λ is known
 
 
 def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortion: float | None) -> list[MinimalSolver]:

@@ -22,30 +22,15 @@ _FREE_STEPS, _STEPS = 8, 15
 
 @dataclass(frozen=True)
 class PairFit:
-    """The chosen model of one pair, fitted.
-
-    Attributes
-    ----------
-    model : PairModel
-    state : ndarray of shape (S,)
-    homography : ndarray of shape (3, 3)
-    distortion : float
-    errors : ndarray of shape (N,)
-        Whitened transfer errors, pixels; inf where there is no transfer.
-    covariance : ndarray of shape (P, P)
-        Of λ (first, where it was estimated) and the model's parameters.
-    distortion_std : float
-        Standard deviation of λ; 0 where it was given, inf where it is not observable (λ is then 0).
-    reason : str
-    """
+    """The chosen model of one pair, fitted."""
 
     model: PairModel
-    state: FloatArray
-    homography: FloatArray
+    state: FloatArray  # (S,)
+    homography: FloatArray  # (3, 3)
     distortion: float
-    errors: FloatArray
-    covariance: FloatArray
-    distortion_std: float
+    errors: FloatArray  # (N,): whitened transfer errors, pixels; inf where there is no transfer
+    covariance: FloatArray  # (P, P): of λ (first, where it was estimated) and the model's parameters
+    distortion_std: float  # standard deviation of λ; 0 where it was given, inf where it is not observable (λ is then 0)
     reason: str
 
 
@@ -62,32 +47,15 @@ class _Fitted:
 
 @dataclass(frozen=True)
 class PairSelection:
-    """B pairs for which a model is to be chosen.
+    """B pairs for which a model is to be chosen."""
 
-    Attributes
-    ----------
-    homography : ndarray of shape (B, 3, 3)
-        Where to start.
-    distortion : ndarray of shape (B,)
-        Where to start, or what λ is known to be.
-    data : Measurements
-    tilts : ndarray of shape (B, 2, 2) or None
-        Known tilts (ψ, θ) of both images, radians.
-    noise : ndarray of shape (B,)
-        Standard deviation of the errors per axis, pixels.
-    threshold : float
-        Largest transfer error of an inlier, pixels.
-    fixed_distortion : bool
-        Whether λ is known.
-    """
-
-    homography: FloatArray
-    distortion: FloatArray
+    homography: FloatArray  # (B, 3, 3): where to start
+    distortion: FloatArray  # (B,): where to start, or what λ is known to be
     data: Measurements
-    tilts: FloatArray | None
-    noise: FloatArray
-    threshold: float
-    fixed_distortion: bool
+    tilts: FloatArray | None  # (B, 2, 2): known tilts (ψ, θ) of both images, radians
+    noise: FloatArray  # (B,): standard deviation of the errors per axis, pixels
+    threshold: float  # largest transfer error of an inlier, pixels
+    fixed_distortion: bool  # whether λ is known
 
     def take(self, rows: IntArray) -> Self:
         """Some of the pairs."""

@@ -32,18 +32,11 @@ _ROUNDS = 2  # what one λ leaves is no measure of the noise
 
 @dataclass(frozen=True)
 class OwnLenses:
-    """λ of both images of a pair, half-diagonal frame.
+    """λ of both images of a pair, half-diagonal frame."""
 
-    Attributes
-    ----------
-    distortion : ndarray of shape (2,)
-    covariance : ndarray of shape (2, 2)
-    coherence : float
-        Correlation of the errors of neighbours that are left: 0 for noise, up to 1 where depth moves them together.
-    """
-
-    distortion: FloatArray
-    covariance: FloatArray
+    distortion: FloatArray  # (2,)
+    covariance: FloatArray  # (2, 2)
+    # correlation of the errors of neighbours that are left: 0 for noise, up to 1 where depth moves them together
     coherence: float
 
 

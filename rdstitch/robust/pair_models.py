@@ -97,24 +97,12 @@ class HomographyPairModel:
 
 @dataclass(frozen=True)
 class PlanarPairModel:
-    """Planar motion ``H ~ K R2 Rz(φ) diag(1, 1, height) T R1' K⁻¹``, ``K = diag(focal, focal, 1)``.
+    """Planar motion ``H ~ K R2 Rz(φ) diag(1, 1, height) T R1' K⁻¹``, ``K = diag(focal, focal, 1)``."""
 
-    Attributes
-    ----------
-    focal : float
-        Focal length in half diagonals.
-    focal_std : float
-        Standard deviation of its logarithm; 0 fixes it.
-    tilts_known : bool
-        Whether the tilts of both images are known; otherwise they share an unknown one.
-    height_free : bool
-        Whether the height may change.
-    """
-
-    focal: float
-    focal_std: float = 0.0
-    tilts_known: bool = False
-    height_free: bool = False
+    focal: float  # focal length in half diagonals
+    focal_std: float = 0.0  # standard deviation of its logarithm; 0 fixes it
+    tilts_known: bool = False  # whether the tilts of both images are known; otherwise they share an unknown one
+    height_free: bool = False  # whether the height may change
     _directions: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

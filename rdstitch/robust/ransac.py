@@ -41,25 +41,14 @@ class RansacOptions:
 
 @dataclass
 class Hypotheses:
-    """For each of B pairs a homography with λ, and how well it explains the matches.
+    """For each of B pairs a homography with λ, and how well it explains the matches."""
 
-    Attributes
-    ----------
-    homography : ndarray of shape (B, 3, 3)
-        In the half-diagonal frame.
-    distortion : ndarray of shape (B,)
-    cost : ndarray of shape (B,)
-        Mean truncated loss: 1 where nothing fits, 0 where all fits exactly; inf where there is no hypothesis.
-    inliers : ndarray of shape (B, N), bool
-    solver : ndarray of shape (B,), intp
-        Which minimal solver found it.
-    """
-
-    homography: FloatArray
-    distortion: FloatArray
+    homography: FloatArray  # (B, 3, 3): in the half-diagonal frame
+    distortion: FloatArray  # (B,)
+    # (B,): mean truncated loss: 1 where nothing fits, 0 where all fits exactly; inf where there is no hypothesis
     cost: FloatArray
-    inliers: BoolArray
-    solver: IntArray
+    inliers: BoolArray  # (B, N), bool
+    solver: IntArray  # (B,), intp: which minimal solver found it
 
     @classmethod
     def none(cls, data: Measurements) -> "Hypotheses":
@@ -101,20 +90,11 @@ class Hypotheses:
 
 @dataclass(frozen=True)
 class Search:
-    """What RANSAC found.
+    """What RANSAC found."""
 
-    Attributes
-    ----------
-    best : Hypotheses
-        With infinite cost where no sample gave a plausible model.
-    iterations : ndarray of shape (B,), intp
-        Samples drawn.
-    confident : ndarray of shape (B,), bool
-        Whether the search stopped because it was confident, not because ``max_iterations`` was reached.
-    """
-
-    best: Hypotheses
-    iterations: IntArray
+    best: Hypotheses  # with infinite cost where no sample gave a plausible model
+    iterations: IntArray  # (B,), intp: samples drawn
+    # (B,), bool: whether the search stopped because it was confident, not because ``max_iterations`` was reached
     confident: BoolArray
 
 

@@ -15,20 +15,11 @@ from rdstitch.robust.pair_models import PairModel
 
 @dataclass(frozen=True)
 class Fits:
-    """One model fitted to the matches of B pairs.
+    """One model fitted to the matches of B pairs."""
 
-    Attributes
-    ----------
-    state : ndarray of shape (B, S)
-        The model's states.
-    homography : ndarray of shape (B, 3, 3)
-    distortion : ndarray of shape (B,)
-        λ in the half-diagonal frame.
-    """
-
-    state: FloatArray
-    homography: FloatArray
-    distortion: FloatArray
+    state: FloatArray  # (B, S): the model's states
+    homography: FloatArray  # (B, 3, 3)
+    distortion: FloatArray  # (B,): λ in the half-diagonal frame
 
     def take(self, rows: BoolArray | IntArray | slice) -> "Fits":
         """Those of some pairs."""
@@ -37,25 +28,13 @@ class Fits:
 
 @dataclass(frozen=True)
 class PairProblems:
-    """Refinement of B pairs as problems of least squares; parameters are ``(λ, state)``.
-
-    Attributes
-    ----------
-    model : PairModel
-    data : Measurements
-    scale : ndarray of shape (B,)
-        Of the loss, pixels.
-    noise : ndarray of shape (B,)
-        Standard deviation of the errors per axis, pixels.
-    fixed_distortion : bool
-        Whether λ is known.
-    """
+    """Refinement of B pairs as problems of least squares; parameters are ``(λ, state)``."""
 
     model: PairModel
     data: Measurements
-    scale: FloatArray
-    noise: FloatArray
-    fixed_distortion: bool
+    scale: FloatArray  # (B,): of the loss, pixels
+    noise: FloatArray  # (B,): standard deviation of the errors per axis, pixels
+    fixed_distortion: bool  # whether λ is known
 
     def take(self, rows: BoolArray | IntArray) -> Self:
         """Some of them."""

@@ -18,23 +18,13 @@ Points = NDArray[np.complex128]
 
 @dataclass(frozen=True, eq=False)
 class SimilarityFit:
-    """``target = scale * source + origin``, in complex numbers.
-
-    Attributes
-    ----------
-    scale, origin : complex
-    residuals : ndarray of shape (N,)
-        Distances from the targets, in their unit.
-    weights : ndarray of shape (N,)
-        1 of what agrees exactly, towards 0 of outliers.
-    inliers : ndarray of shape (N,), bool
-    """
+    """``target = scale * source + origin``, in complex numbers."""
 
     scale: complex
     origin: complex
-    residuals: FloatArray
-    weights: FloatArray
-    inliers: NDArray[np.bool_]
+    residuals: FloatArray  # (N,): distances from the targets, in their unit
+    weights: FloatArray  # (N,): 1 of what agrees exactly, towards 0 of outliers
+    inliers: NDArray[np.bool_]  # (N,), bool
 
 
 def fit_similarity(source: Points, target: Points, std: float) -> SimilarityFit:

@@ -23,26 +23,14 @@ from rdstitch.verification.second_motion import (
 
 @dataclass(frozen=True)
 class Evidence:
-    """Everything that rules look at; what takes long is computed when the first of them asks for it.
-
-    Attributes
-    ----------
-    registration : Registration
-    threshold : float
-        Largest transfer error of an inlier of a pair, pixels.
-    threads : int
-        Pairs of images that are compared at the same time.
-    cache : Cache
-        Of results of earlier runs.
-    lens_only : bool
-        Only the lens is wanted, so that doubts about the places of images do not make the result fail, and are not
-        reported where a repeated pattern explains them.
-    """
+    """Everything that rules look at; what takes long is computed when the first of them asks for it."""
 
     registration: Registration
-    threshold: float
-    threads: int = 1
-    cache: Cache = NO_CACHE
+    threshold: float  # largest transfer error of an inlier of a pair, pixels
+    threads: int = 1  # pairs of images that are compared at the same time
+    cache: Cache = NO_CACHE  # of results of earlier runs
+    # only the lens is wanted, so that doubts about the places of images do not make the result fail, and are not
+    # reported where a repeated pattern explains them
     lens_only: bool = False
 
     @property

@@ -8,25 +8,14 @@ from rdstitch.messages import Severity
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a rule found.
+    """One thing that a rule found."""
 
-    Attributes
-    ----------
-    kind : str
-        A key of :data:`rdstitch.verification.messages.TEXTS`.
-    images : tuple of int
-        Indices of the images that it concerns; empty where it concerns the whole.
-    severity : str
-        As of :class:`rdstitch.messages.Message`. A failure of one image or of a pair may be mended without these; one
-        of the whole, or of more images, may not.
-    values : mapping
-        What was measured: sizes, shares and counts, by name.
-    """
-
-    kind: str
-    images: tuple[int, ...] = ()
+    kind: str  # a key of :data:`rdstitch.verification.messages.TEXTS`
+    images: tuple[int, ...] = ()  # indices of the images that it concerns; empty where it concerns the whole
+    # as of :class:`rdstitch.messages.Message`. A failure of one image or of a pair may be mended without these; one of
+    # the whole, or of more images, may not
     severity: Severity = "failure"
-    values: Mapping[str, object] = field(default_factory=dict)
+    values: Mapping[str, object] = field(default_factory=dict)  # what was measured: sizes, shares and counts, by name
 
     @property
     def fails(self) -> bool:

@@ -34,23 +34,12 @@ _IMAGES_AT_ONCE = 128
 
 @dataclass(frozen=True)
 class CheckedLink:
-    """A link and what the pixels say of it.
-
-    Attributes
-    ----------
-    fit : LinkFit
-    agreement : Agreement
-        Whether the two look alike where they are put together.
-    ambiguity : Ambiguity
-        Whether they would look as much alike elsewhere.
-    unique : bool
-        Whether they would, but for something unique that both show, which shows that they lie here.
-    """
+    """A link and what the pixels say of it."""
 
     fit: LinkFit
-    agreement: Agreement
-    ambiguity: Ambiguity
-    unique: bool = False
+    agreement: Agreement  # whether the two look alike where they are put together
+    ambiguity: Ambiguity  # whether they would look as much alike elsewhere
+    unique: bool = False  # whether they would, but for something unique that both show, which shows that they lie here
 
     @property
     def pair(self) -> tuple[int, int]:
@@ -68,11 +57,6 @@ class ComparedImages:
         Grey levels of black and white.
     threads : int
         Images that are read and pairs that are compared at the same time.
-
-    Raises
-    ------
-    InputError
-        When an image can no longer be read; by the methods.
     """
 
     def __init__(self, sources: Sequence[Source], stretch: tuple[float, float] | None, threads: int = 1) -> None:
@@ -99,13 +83,7 @@ class ComparedImages:
 
 
 def check_overlaps(registration: Registration, images: ComparedImages, cache: Cache = NO_CACHE) -> list[CheckedLink]:
-    """Compare the images of every used link, or of those that the fewest others confirm.
-
-    Raises
-    ------
-    InputError
-        When an image can no longer be read.
-    """
+    """Compare the images of every used link, or of those that the fewest others confirm."""
     alignment = registration.alignment
     chosen = _least_confirmed([fit for fit in alignment.links if fit.used])
     every = sorted(set(chain.from_iterable((fit.image1, fit.image2) for fit in chosen)))

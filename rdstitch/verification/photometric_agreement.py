@@ -34,21 +34,11 @@ _LATTICE = 8  # pixels between the places that are computed; those between are i
 
 @dataclass(frozen=True)
 class Agreement:
-    """What the cells of an overlap say.
+    """What the cells of an overlap say."""
 
-    Attributes
-    ----------
-    cells : int
-        Cells with texture in both images.
-    confirming : int
-        Cells that correlate best, and well, where the registration says.
-    in_all : int
-        Cells with texture in the whole of the second image.
-    """
-
-    cells: int
-    confirming: int
-    in_all: int = 0
+    cells: int  # cells with texture in both images
+    confirming: int  # cells that correlate best, and well, where the registration says
+    in_all: int = 0  # cells with texture in the whole of the second image
 
     @property
     def share(self) -> float:
@@ -58,21 +48,11 @@ class Agreement:
 
 @dataclass(frozen=True)
 class ComparedImage:
-    """A registered image as it is compared.
+    """A registered image as it is compared."""
 
-    Attributes
-    ----------
-    grey : ndarray of shape (h, w), float32
-        In [0, 1], small; NaN where transparent.
-    camera : Camera
-        Of the size of ``grey``.
-    homography : ndarray of shape (3, 3)
-        From undistorted normalized coordinates to the plane.
-    """
-
-    grey: Grey
-    camera: Camera
-    homography: FloatArray
+    grey: Grey  # (h, w), float32: in [0, 1], small; NaN where transparent
+    camera: Camera  # of the size of ``grey``
+    homography: FloatArray  # (3, 3): from undistorted normalized coordinates to the plane
 
     @classmethod
     def of(

@@ -33,29 +33,15 @@ _AREA_CELLS = 16
 
 @dataclass(frozen=True)
 class SecondMotion:
-    """What moves differently in one pair of images.
-
-    Attributes
-    ----------
-    images : (int, int)
-    area : int
-        Cells of the first image in which it has inliers and the plane has none; 0 where nothing moves differently.
-    plane_area : int
-        Cells in which the plane has inliers.
-    center : (float, float)
-        Median place of its inliers in the first image, pixels.
-    disagreement : float
-        Median distance of its inliers from where the alignment expects them, pixels.
-    relation : RadialHomography, optional
-        How it moves, of all matches of the pair; None where there is none.
-    """
+    """What moves differently in one pair of images."""
 
     images: Pair
+    # cells of the first image in which it has inliers and the plane has none; 0 where nothing moves differently
     area: int
-    plane_area: int
-    center: tuple[float, float] = (0.0, 0.0)
-    disagreement: float = 0.0
-    relation: RadialHomography | None = None
+    plane_area: int  # cells in which the plane has inliers
+    center: tuple[float, float] = (0.0, 0.0)  # median place of its inliers in the first image, pixels
+    disagreement: float = 0.0  # median distance of its inliers from where the alignment expects them, pixels
+    relation: RadialHomography | None = None  # how it moves, of all matches of the pair; None where there is none
 
     @property
     def is_far(self) -> bool:
@@ -166,14 +152,10 @@ def _may_be_a_plane(agreement: Agreement) -> bool:
 
 @dataclass(frozen=True)
 class MotionComparison:
-    """What was aligned and what moves differently, compared with the pixels.
+    """What was aligned and what moves differently, compared with the pixels."""
 
-    Attributes
-    ----------
-    fills_at_most, second_fills_at_most : float
-        Share of the images that is not seen to contradict the alignment, and what moves differently, in [0, 1].
-    """
-
+    # fills_at_most, second_fills_at_most: share of the images that is not seen to contradict the alignment, and what
+    # moves differently, in [0, 1]
     fills_at_most: float
     second_fills_at_most: float
 
@@ -195,11 +177,6 @@ def compare_motions(
 
     Only where the latter is a motion of its own and covers a good part; or where what was aligned fills less than half
     of the images, and something else moves in any of them. None otherwise.
-
-    Raises
-    ------
-    InputError
-        When an image can no longer be read.
     """
     second = {own.images: own.relation for own in motions if own.relation is not None}
     separate, far = is_separate(motions), any(own.relation is not None and own.is_far for own in motions)
@@ -254,11 +231,6 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
     -------
     list of PairRegistration or None
         None where no pair has a motion that fills less.
-
-    Raises
-    ------
-    InputError
-        When an image can no longer be read.
     """
     alignment, pairs = registration.alignment, [pair for pair in registration.pairs if pair.relation]
     images = ComparedImages(registration.sources, registration.stretch)

@@ -25,20 +25,13 @@ _MIN_NORM = 1e-4  # of the largest: where fewer pixels overlap, rounding decides
 
 @dataclass(frozen=True)
 class Ambiguity:
-    """How well two images fit where they were put, and elsewhere.
+    """How well two images fit where they were put, and elsewhere."""
 
-    Attributes
-    ----------
-    here, elsewhere : float
-        Correlation where the registration says, and the best at any other shift that keeps half of the overlap or
-        more; 0 where nothing can be compared.
-    shift : float
-        Length of that shift, as a share of the longer side of an image.
-    """
-
+    # here, elsewhere: correlation where the registration says, and the best at any other shift that keeps half of the
+    # overlap or more; 0 where nothing can be compared
     here: float
     elsewhere: float
-    shift: float
+    shift: float  # length of that shift, as a share of the longer side of an image
 
     @property
     def ambiguous(self) -> bool:
@@ -48,18 +41,10 @@ class Ambiguity:
 
 @dataclass(frozen=True)
 class Drawing:
-    """An image drawn on the plane, without its brightness.
+    """An image drawn on the plane, without its brightness."""
 
-    Attributes
-    ----------
-    pixels : ndarray of shape (h, w), float32
-        NaN where the image is not.
-    origin : ndarray of shape (2,)
-        Where their first pixel lies, pixels of the plane.
-    """
-
-    pixels: Grey
-    origin: FloatArray
+    pixels: Grey  # (h, w), float32: NaN where the image is not
+    origin: FloatArray  # (2,): where their first pixel lies, pixels of the plane
 
 
 def drawing_scale(camera: Camera, homography: FloatArray, longest_side: int = MAX_SIDE) -> float:
@@ -129,20 +114,12 @@ def _without_brightness(image: Grey) -> Grey:
 
 @dataclass(frozen=True)
 class Overlaps:
-    """Sums over the overlap of two images, the first at every position in the second, shape (h, w) each.
+    """Sums over the overlap of two images, the first at every position in the second, shape (h, w) each."""
 
-    Attributes
-    ----------
-    products, squares1, squares2 : ndarray
-        Of the values of both images, and of either.
-    area : ndarray
-        Number of pixels.
-    """
-
-    products: Grey
+    products: Grey  # products, squares1, squares2: of the values of both images, and of either
     squares1: Grey
     squares2: Grey
-    area: Grey
+    area: Grey  # number of pixels
 
     @classmethod
     def of(cls, first: Grey, second: Grey) -> "Overlaps":

@@ -28,24 +28,14 @@ _MOST = 25.0  # spreads of the copies: a larger departure counts as this
 
 @dataclass(frozen=True)
 class UniqueShift:
-    """The shift of one image's drawing within another's at which what is unique in both agrees best.
+    """The shift of one image's drawing within another's at which what is unique in both agrees best."""
 
-    Attributes
-    ----------
-    shift : ndarray of shape (2,)
-        (x, y) by which the first image must be moved on the plane, pixels of the drawings or units of the plane.
-    matched : float
-        What is unique in both and the same, in squared spreads of the pattern times pixels, times ``share``.
-    share : float
-        Of what is unique in either, in the overlap: their correlation, in [-1, 1].
-    rival : float
-        The most that is matched so at any other shift.
-    """
-
+    # (2,): (x, y) by which the first image must be moved on the plane, pixels of the drawings or units of the plane
     shift: FloatArray
+    # what is unique in both and the same, in squared spreads of the pattern times pixels, times ``share``
     matched: float
-    share: float
-    rival: float
+    share: float  # of what is unique in either, in the overlap: their correlation, in [-1, 1]
+    rival: float  # the most that is matched so at any other shift
 
     @property
     def decides(self) -> bool:

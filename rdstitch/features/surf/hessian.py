@@ -84,23 +84,12 @@ def vertex(values: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.bool_]]
 
 @dataclass(frozen=True, eq=False)
 class Blobs:
-    """Blobs of one image.
+    """Blobs of one image."""
 
-    Attributes
-    ----------
-    points : ndarray of shape (N, 2)
-        Centres, pixels.
-    size : ndarray of shape (N,)
-        Side of the box filter that answers most, pixels.
-    response : ndarray of shape (N,)
-        Determinant of the Hessian, grey levels².
-    laplacian_sign : ndarray of shape (N,), int8
-        Sign of the trace of the Hessian: +1 for dark blobs, -1 for light ones.
-    """
-
-    points: FloatArray
-    size: FloatArray
-    response: FloatArray
+    points: FloatArray  # (N, 2): centres, pixels
+    size: FloatArray  # (N,): side of the box filter that answers most, pixels
+    response: FloatArray  # (N,): determinant of the Hessian, grey levels²
+    # (N,), int8: sign of the trace of the Hessian: +1 for dark blobs, -1 for light ones
     laplacian_sign: NDArray[np.int8]
 
     def __len__(self) -> int:
