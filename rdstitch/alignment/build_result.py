@@ -289,7 +289,9 @@ def _warnings(found: AdjustedImages, camera: Camera, considered: FloatArray) -> 
     if (overruled := _overruled_focal(found, camera)) is not None:
         result.append(Message(overruled))
     if not found.choice.fit.adjusted.converged:
-        result.append(Message("the adjustment did not converge; judge the result with care", code="not-converged"))
+        text = "the adjustment did not converge; judge the result with care"
+        # Of seven on adverse sets two results were off (python -m examples.benchmarks.trust --kind adverse).
+        result.append(Message(text, severity="detail", code="not-converged"))
     if found.positions_disagree:
         result.append(Message(found.positions_disagree))
     return tuple(result)
