@@ -157,6 +157,11 @@ class Problem:
         return Fit(model, adjusted, self.free_lens, spread if model.free_tilts else 0.0, overdispersion)
 
     @cached_property
+    def free_fit(self) -> Fit:
+        """The freest motion: one homography an image."""
+        return self.fit(HOMOGRAPHY)
+
+    @cached_property
     def _link_sigma(self) -> float:
         """Standard deviation of a coordinate of the errors of links on their own, pixels."""
         squared = squared_lengths(whitened_errors(self.observations, self.homographies, self.lens))
