@@ -225,5 +225,6 @@ def _around(features: Features, size: tuple[int, int], points: FloatArray, reach
 
 def _distances(points: FloatArray, others: FloatArray, size: tuple[int, int]) -> FloatArray:
     """Between all points (N, 2) and all others (M, 2), diagonals of the image, (N, M)."""
+    points, others = (each / np.hypot(*size) for each in (points, others))
     across, down = (np.subtract.outer(points[:, k], others[:, k]) for k in (0, 1))
-    return np.asarray(np.sqrt(across**2 + down**2) / np.hypot(*size), dtype=np.float64)
+    return np.asarray(np.sqrt(across**2 + down**2), dtype=np.float64)
