@@ -39,7 +39,7 @@ _RADII = np.linspace(0.05, 1.0, 20)
 _OVERRULED = 1.5
 """Ratio from which on EXIF was wrong, not rounded or of another focus."""
 
-_WORTH_SAYING = 0.5
+_WORTH_SAYING = 1.0
 """Pixels that the corners of too few images may lie elsewhere, from which on that is said."""
 
 _CONFIDENT = 2.0
