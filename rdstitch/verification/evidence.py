@@ -96,6 +96,7 @@ class Evidence:
 
     @property
     def depth(self) -> bool:
-        """Whether the scene has depth; of a turn, whether the camera moved, or something before it."""
-        turn_with_parallax = self.alignment.on_sphere and any(own.area for own in self.motions)
-        return self.alignment.relief.found or turn_with_parallax
+        """Whether the scene has depth: relief, a second motion as small as tree tops have, or any of a turn."""
+        moved = [own for own in self.motions if own.area]
+        near = bool(moved) and (self.alignment.on_sphere or not any(own.is_far for own in moved))
+        return self.alignment.relief.found or near

@@ -10,6 +10,7 @@ import pytest
 from rdstitch.alignment.result import LinkFit
 from rdstitch.camera import Camera
 from rdstitch.messages import Message
+from rdstitch.radial_homography import RadialHomography
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
@@ -249,3 +250,22 @@ def test_images_without_a_mask_among_others_are_named() -> None:
     assert _texts(*masked) == []
     assert _texts(*masked, _source("x.png")) == ["1 of 4 images have no mask: x.png"]
     assert _texts(masked[0], _source("x.png"), _source("y.png")) == ["2 of 3 images have no mask: x.png, y.png"]
+
+
+@pytest.mark.parametrize(
+    ("off", "area", "relief", "on_sphere", "depth"),
+    [
+        (20.0, 40, False, False, True),  # less than a twentieth of the diagonal of 500 pixels: nearer things
+        (30.0, 40, False, False, False),  # a vehicle
+        (30.0, 40, False, True, True),
+        (30.0, 40, True, False, True),
+        (0.0, 0, False, True, False),
+    ],
+)
+def test_depth_is_relief_or_a_motion_as_small_as_that_of_tree_tops(
+    off: float, area: int, relief: bool, on_sphere: bool, depth: bool
+) -> None:
+    relation = RadialHomography(np.eye(3), CAMERA, CAMERA, np.ones(20, dtype=np.bool_))
+    alignment = SimpleNamespace(relief=SimpleNamespace(found=relief), on_sphere=on_sphere)
+    found = SimpleNamespace(alignment=alignment, motions=[SecondMotion((0, 1), area, 60, (0.0, 0.0), off, relation)])
+    assert Evidence.depth.__get__(found) is depth
