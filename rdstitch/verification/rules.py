@@ -101,7 +101,9 @@ def _shape(found: Evidence) -> Iterator[Finding]:
         return
     if alignment.focal is None:
         # Chains of free homographies bend with whatever is not modelled, a curved wall for one.
-        yield Finding("shape unknown", (shape.image,), "warning", {"size": _size_of_shape(found)})
+        yield Finding(
+            "shape unknown", (shape.image,), "warning" if shape.doubtful else "detail", {"size": _size_of_shape(found)}
+        )
     elif shape.doubtful:
         remedy = "more rows of images" if alignment.distortion_std == 0.0 else "the lens, or more rows of images"
         values = {"size": _size_of_shape(found), "cause": shape.cause, "remedy": remedy}
@@ -177,9 +179,9 @@ def _second_motion(found: Evidence) -> Iterator[Finding]:
     values = {"share": share, "place": worst.center, "shown": worst.images, "off": off}
     if found.alignment.on_sphere:
         yield Finding("parallax", worst.images, "warning", {"size": off, "share": share})
-    elif found.lens_only or clear:
+    elif found.lens_only or (clear and worst.is_far):
         yield Finding("second motion", worst.images, "warning", values)
-    else:
+    elif worst.is_far:  # nearer, it is depth
         yield Finding("undecided motion", tuple(sorted({k for own in motions for k in own.images})), "failure", values)
 
 

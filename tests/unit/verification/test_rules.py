@@ -269,3 +269,18 @@ def test_depth_is_relief_or_a_motion_as_small_as_that_of_tree_tops(
     alignment = SimpleNamespace(relief=SimpleNamespace(found=relief), on_sphere=on_sphere)
     found = SimpleNamespace(alignment=alignment, motions=[SecondMotion((0, 1), area, 60, (0.0, 0.0), off, relation)])
     assert Evidence.depth.__get__(found) is depth
+
+
+def test_what_moves_by_no_more_than_tree_tops_rivals_no_plane() -> None:
+    relation = RadialHomography(np.eye(3), CAMERA, CAMERA, np.ones(20, dtype=np.bool_))
+    near, far = (SecondMotion((0, 1), 46, 54, (30.0, 40.0), off, relation) for off in (20.0, 30.0))
+    assert [how for how, _ in _of_motions(far, 0.3)] == ["failure"]
+    assert _of_motions(near, 0.3) == _of_motions(near, 0.9) == []
+    assert [how for how, _ in _of_motions(near, 0.3, lens_only=True)] == ["warning"]  # depth looks like a lens
+
+
+@pytest.mark.parametrize(("doubtful", "severity"), [(True, "warning"), (False, "detail")])
+def test_free_homographies_are_doubted_where_their_errors_have_a_pattern(doubtful: bool, severity: str) -> None:
+    shape = SimpleNamespace(image=1, shift=6.0, shift_std=8.0, doubtful=doubtful)
+    found: Any = SimpleNamespace(alignment=SimpleNamespace(focal=None, shape=shape), lens_only=False)
+    assert [(own.kind, own.severity) for own in rules._shape(found)] == [("shape unknown", severity)]
