@@ -14,11 +14,9 @@ from rdstitch.alignment.attitude_check import check_attitudes
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
-from rdstitch.alignment.evidence import Evidence
 from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
 from rdstitch.alignment.lens_uncertainty import weigh_lens
-from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, noise_of_links
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.options import AlignmentOptions
@@ -49,11 +47,11 @@ _ROUNDS = 3
 
 _FEW_VIEWS, _LENS_OVER_DEPTH = 3, 6.0
 """Images from more than which depth does not look like a lens; times by which a lens must make errors of depth smaller
-to be no depth itself: in published pairs with depth λ has taken the blame for up to 5.3 times what is left."""
+to be no depth itself: in published pairs with depth λ takes the blame for up to 3 times what is left, a lens for 14."""
 
 _LITTLE_DEPTH, _LITTLE_DEPTH_PX = 0.0003, 0.3
 """Diagonals of an image, and pixels: errors that neighbours share beside a lens, up to which there is no depth to speak
-of. Less than the noise of keypoints says nothing: published pairs with depth leave 0.6 to 1 pixel."""
+of. Less than the noise of keypoints says nothing: published pairs with depth leave 0.6 to 2 pixels."""
 
 
 def align(
@@ -214,11 +212,9 @@ def _is_depth(observations: Observations, bent: BundleAdjustmentResult, flat: Bu
     left = left_coherence(flat, observations)
     if left.correlation <= COHERENT_CORRELATION or left.relative_size <= LARGE_RELIEF:
         return False
-    errors = [whitened_errors(observations, fit.homographies, fit.parameters.lens) for fit in (bent, flat)]
-    evidence = Evidence.of(observations, errors[0])
-    with_lens, without = (evidence.cost(each).field for each in errors)
+    with_lens = left_coherence(bent, observations).size
     largest = max(_LITTLE_DEPTH * 2.0 * float(np.median(observations.scale2)), _LITTLE_DEPTH_PX)
-    return with_lens > largest and without < _LENS_OVER_DEPTH * with_lens
+    return with_lens > largest and left.size < _LENS_OVER_DEPTH * with_lens
 
 
 def _observable(apart: BundleAdjustmentResult) -> bool:
