@@ -211,7 +211,7 @@ class Tracker:
     def __init__(self, options: StitchOptions | None = None, poses: FollowedPoses | None = None) -> None:
         self._options, self._poses = options or StitchOptions(), poses or FollowedPoses()
         self._detection = _live_features(self._options.features)
-        how = TrackingOptions(self._options.matching.pair, alignment_options([], self._options))
+        how = TrackingOptions(self._options.estimation, alignment_options([], self._options))
         self._frames = FrameTracker(how, partial(match, ratio=self._options.ratio))
         self._labels: dict[int, Pose] = {}  # of the frames that may still find their place
         self._numbers = count()

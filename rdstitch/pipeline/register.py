@@ -74,8 +74,7 @@ def register(
         sources = with_image_circle(sources, executor, cache, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, prefer_turn=prefer_turn, layout_matters=layout_matters)
     store = cache if options.cache is not None else Cache.for_this_run()
-    rendered = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)
-    detected = rendered.detected
+    detected = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))
@@ -84,11 +83,13 @@ def register(
         features,
         cameras,
         _matcher(options),
-        options.matching,
+        options.estimation,
         progress,
         executor,
         cache,
         store,
+        options.ratio,
+        options.lightglue_model,
         aligner.exact_tilts,
     )
     found = pairing.estimate_candidates(candidates)
@@ -101,7 +102,7 @@ def register(
     aligned = close_loops(aligner, pairing, aligned, candidates)
     aligned = select_by_whole_lens(aligner, aligned)
     settle = match_crossings if lens_only else settle_repeated_pattern
-    aligned, undecided = settle(aligner, pairing, aligned, sources, rendered.stretch, options.threads)
+    aligned, undecided = settle(aligner, pairing, aligned, sources, detected.stretch, options.threads)
     if metric:
         aligned = aligner.metric(aligned)
     return Registration(
@@ -112,11 +113,11 @@ def register(
         (
             *aligned.alignment.messages,
             *([_STATIC_BACKGROUND] if moving else []),
-            *_low_contrast(rendered.equalized, aligned.alignment, aligner.paths),
+            *_low_contrast(detected.equalized, aligned.alignment, aligner.paths),
             *_left_out(aligned.alignment, aligner.paths, counts, {**other_lens, **detected.damaged, **undecided}),
         ),
         static_background=moving is not None,
-        stretch=rendered.stretch,
+        stretch=detected.stretch,
         mixed=mixed,
     )
 

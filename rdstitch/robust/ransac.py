@@ -10,10 +10,12 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
+from rdstitch.robust.options import EstimationOptions
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel
 from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
+from rdstitch.robust.verification import MIN_PLACES
 from rdstitch.solvers.solutions import Solutions
 
 # Halved or doubled, none of these changes what is found, only the time.
@@ -26,17 +28,6 @@ _SOLVER_SUCCESS = 0.8  # share of all-inlier samples that lead to the model, in 
 _NOVELTY = 0.1  # share of a hypothesis's inliers that must be new for it to be worth optimising
 _FREE_REFINEMENT = 12  # inliers from which on refinement may leave the model that the minimal solver assumes
 _LOCAL_STEPS = 4
-
-
-@dataclass(frozen=True)
-class RansacOptions:
-    """When to stop, and what counts as agreement."""
-
-    threshold: float = 3.0  # pixels, largest transfer error of an inlier
-    confidence: float = 0.999  # probability that a better model was not missed
-    max_iterations: int = 10000  # samples a pair, over all solvers
-    seed: int = 0
-    least_inliers: int = 8  # a model with fewer would not be accepted, so none such is searched for
 
 
 @dataclass
@@ -103,7 +94,7 @@ def ransac(
     data: Measurements,
     ordered: BoolArray,
     tilts: FloatArray | None,
-    options: RansacOptions,
+    options: EstimationOptions,
 ) -> Search:
     """Search the model that explains most matches of each pair, with all solvers taking turns.
 
@@ -120,7 +111,7 @@ def ransac(
         Whether the best matches of a pair come first.
     tilts : ndarray of shape (B, 2, 2) or None
         Known tilts (ψ, θ) of both images, radians.
-    options : RansacOptions
+    options : EstimationOptions
     """
     quick = _subset(data, options.seed)
     lanes = [_Lane(solver, data, quick, ordered, tilts, options, index) for index, solver in enumerate(solvers)]
@@ -154,7 +145,7 @@ class _Lane:
         quick: Measurements,
         ordered: BoolArray,
         tilts: FloatArray | None,
-        options: RansacOptions,
+        options: EstimationOptions,
         index: int,
     ) -> None:
         self.drawn = np.zeros(len(data), dtype=np.intp)
@@ -170,7 +161,7 @@ class _Lane:
         With ``explore`` at least as many as every solver draws.
         """
         counts = self._data.count[rows]
-        agreeing = np.maximum(best.inliers[rows].sum(axis=1), self._options.least_inliers)
+        agreeing = np.maximum(best.inliers[rows].sum(axis=1), MIN_PLACES)
         good = _SOLVER_SUCCESS * np.minimum(agreeing / counts, 1.0) ** self._solver.sample_size
         needed = np.log1p(-self._options.confidence) / np.log1p(-np.minimum(good, 1.0 - 1e-12))
         return np.asarray(np.maximum(needed, _MIN_EXPLORATION) if explore else needed)

@@ -11,10 +11,10 @@ from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, match
 from rdstitch.matching.candidate_pairs import neighbours
 from rdstitch.matching.feature_store import FeatureStore
-from rdstitch.matching.options import MatchingOptions
 from rdstitch.matching.static_background import is_static_pair, moving_features
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.progress import silent
+from rdstitch.robust import EstimationOptions
 
 LENS = Camera((640, 480), distortion=-0.2, focal=520.0)
 IMAGES = 4
@@ -55,7 +55,9 @@ def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pai
         found.append(_features(points[inside], seen_as[inside]))
     matcher = partial(match, ratio=None)
     cameras = [LENS.with_focal()] * IMAGES
-    return Pairing(FeatureStore.of(found), cameras, matcher, MatchingOptions(), silent, ThreadPoolExecutor(1))
+    return Pairing(
+        FeatureStore.of(found), cameras, matcher, EstimationOptions(select_below=50), silent, ThreadPoolExecutor(1)
+    )
 
 
 ALL = [(i, j) for i in range(IMAGES) for j in range(i + 1, IMAGES)]
