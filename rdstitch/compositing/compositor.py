@@ -70,20 +70,6 @@ class FileComposite:
         return f"<FileComposite {self.path}: {self.canvas.size[0]} x {self.canvas.size[1]} pixels>"
 
 
-@dataclass(frozen=True)
-class OutputFile:
-    """A file to compose into."""
-
-    # ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
-    # (held in memory whole)
-    path: str | Path
-    metadata: Metadata | None = None  # colour profile, EXIF and resolution to keep
-    # gives further tags of a TIFF file for the canvas after cropping
-    extra_tags: Callable[[Canvas], Iterable[ExtraTag]] | None = None
-    # where the file is staged, to be published with what belongs to it; without, it replaces what is there
-    outputs: Outputs | None = None
-
-
 def compose(
     images: Sequence[PlacedImage],
     canvas: Canvas,
@@ -116,19 +102,32 @@ def compose(
 
 
 def compose_to_file(
-    file: OutputFile,
+    path: str | Path,
     images: Sequence[PlacedImage],
     canvas: Canvas,
     options: CompositeOptions | None = None,
     progress: ShareProgress | None = None,
     elsewhere: BlockRunner | None = None,
+    *,
+    metadata: Metadata | None = None,
+    extra_tags: Callable[[Canvas], Iterable[ExtraTag]] = lambda canvas: (),
+    outputs: Outputs | None = None,
 ) -> FileComposite:
     """Put images together straight into a file, whatever its size: memory is that of a strip of tiles.
 
     Parameters
     ----------
+    path : path
+        ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
+        (held in memory whole).
     images, canvas, options, progress, elsewhere
         As for :func:`compose`.
+    metadata : Metadata, optional
+        Colour profile, EXIF and resolution to keep.
+    extra_tags : callable
+        Gives further tags of a TIFF file for the canvas after cropping.
+    outputs : Outputs, optional
+        Where the file is staged, to be published with what belongs to it; without, it replaces what is there.
     """
     with prepare_composite(images, canvas, options, progress, elsewhere) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
@@ -137,18 +136,17 @@ def compose_to_file(
             renderer.channels,
             renderer.dtype,
             transparent=True,
-            metadata=replace(file.metadata or Metadata(size), xmp=photo_sphere_xmp(prepared.canvas)),
+            metadata=replace(metadata or Metadata(size), xmp=photo_sphere_xmp(prepared.canvas)),
             quality=renderer.options.quality,
             background=renderer.options.background,
         )
-        check_format(file.path, layout)
-        check_memory(file.path, size, renderer.options.max_memory)
-        tags = () if file.extra_tags is None else file.extra_tags(prepared.canvas)
+        check_format(path, layout)
+        check_memory(path, size, renderer.options.max_memory)
         # Nothing goes on behind a writer that fails.
         with closing(prepared.strips(progress)) as strips:
-            written = write_strips(file.path, layout, strips, tags, outputs=file.outputs)
+            written = write_strips(path, layout, strips, extra_tags(prepared.canvas), outputs=outputs)
     return FileComposite(
-        Path(file.path),
+        Path(path),
         prepared.canvas,
         renderer.exposure,
         written,

@@ -16,7 +16,6 @@ from rdstitch.compositing import (
     CompositeOptions,
     CompositePlan,
     FileComposite,
-    OutputFile,
     compose,
     compose_to_file,
     plan_composite,
@@ -123,8 +122,9 @@ def compose_images(
     if metadata.pixel_size is not None:
         scaled = None if options.max_size is not None else metadata.pixel_size / options.scale
         metadata = replace(metadata, pixel_size=scaled)
-    file = OutputFile(output, metadata, tags, outputs)
-    written = compose_to_file(file, images, canvas, options, report, elsewhere)
+    written = compose_to_file(
+        output, images, canvas, options, report, elsewhere, metadata=metadata, extra_tags=tags, outputs=outputs
+    )
     place = moved(place, canvas, written.canvas)
     beside = []
     if place is not None and world_files:

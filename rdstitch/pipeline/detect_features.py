@@ -39,12 +39,8 @@ class DetectedFeatures:
 
     features: FeatureStore  # in pixels of the images; a damaged image has none
     damaged: Mapping[int, str]  # why the pixels of an image could not be read, by its index
-    stretch: Stretch | None = (
-        None  # grey levels that became 0 and 255 in all images; None where they are those of 8 bits
-    )
-    equalized: tuple[
-        int, ...
-    ] = ()  # the images whose local contrast was equalized, as they showed too little otherwise
+    stretch: Stretch | None = None  # grey levels that became 0 and 255 in all images; None: those of 8 bits
+    equalized: tuple[int, ...] = ()  # images whose local contrast was equalized, as they showed too little otherwise
 
 
 def detect_features(
