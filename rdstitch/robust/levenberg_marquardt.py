@@ -1,6 +1,5 @@
 """Levenberg-Marquardt for many small problems in lockstep."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, Self
 
@@ -63,14 +62,13 @@ class Problems(Protocol):
         """At parameters (B, K)."""
         ...
 
-
-Retract = Callable[[FloatArray, FloatArray], tuple[FloatArray, BoolArray]]
-"""Parameters (B, K) and steps (B, P) to the parameters after the step, and whether these are possible (B,)."""
+    def retract(self, parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Parameters after steps (B, P), and whether they are possible."""
+        ...
 
 
 def descend(
     problems: Problems,
-    retract: Retract,
     start: FloatArray,
     iterations: int,
     *,
@@ -94,7 +92,7 @@ def descend(
         if not going.all():
             rows, step, parameters, damping = rows[going], step[going], parameters[going], damping[going]
             problems, current = problems.take(going), current.take(going)
-        moved, possible = retract(parameters, step)
+        moved, possible = problems.retract(parameters, step)
         there = problems.normal_equations(moved)
         better = possible & (there.cost < current.cost)
         damping = next_damping(damping, better)
