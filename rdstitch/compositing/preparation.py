@@ -9,7 +9,7 @@ from rdstitch.compositing.blender import margin
 from rdstitch.compositing.blocks import BlockRunner, strips_of_blocks
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.crop import coverage_map, crop_box, crop_rows
+from rdstitch.compositing.crop import covered_pixels, crop_box, crop_rows
 from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.options import CompositeOptions
@@ -93,25 +93,25 @@ def _decided(
     """Decide for a renderer that has neither exposure nor seams yet."""
     options, warps, exposure = renderer.options, renderer.warps, renderer.exposure
     seams = survey = None
-    if len(images) > 1 and (options.exposure != "none" or options.seam != "none"):
+    joined = len(images) > 1 and (options.exposure != "none" or options.seam != "none")
+    if joined or options.crop == "auto":
         surveyed = _part_of(progress, 0.0, 0.7)
         survey = survey_images(reader, images, canvas, min(plan.workers, _READERS), surveyed)
         # The first tiles need most of them, however the seams run.
         topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
         renderer.images.prefetch(sorted(topmost, key=lambda index: warps[index].box))
-        if options.exposure != "none":
+        if joined and options.exposure != "none":
             exposure = estimate_exposure(survey, images, options.exposure)
-        if options.seam != "none":
+        if joined and options.seam != "none":
             seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
             if canvas.period is not None:
                 seams = seams.repeated(round(canvas.period))
             if options.blend == "feather":
                 seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
     box, note = _unwidened(canvas), ""
-    if options.crop == "auto":
-        covered, factor = coverage_map(images, canvas, survey)
+    if survey is not None and options.crop == "auto":
         find = crop_box if box is None else partial(crop_rows, whole=box)
-        found, note = find(covered, factor, canvas.size)
+        found, note = find(covered_pixels(survey), survey.factor, canvas.size)
         box = found or box
     cropped = canvas if box is None else canvas.cropped(box)
     renderer = replace(renderer, exposure=exposure, seams=seams)

@@ -149,35 +149,20 @@ def mutual_nearest(
     one, two = Locations.group(features1.points), Locations.group(features2.points)
     similarity = Similarity(features1.descriptors[one.order], features2.descriptors[two.order])
 
-    candidates = _two_best(similarity, one, two, block_bytes)
-    ratio = candidates.ratio(similarity)
-    chosen = np.flatnonzero(ratio < limit)
-    return _nearest_keypoints(similarity, one, two, chosen, candidates.nearest[chosen]), ratio[chosen]
+    nearest, best, second = _two_best(similarity, one, two, block_bytes)
+    distinct = np.flatnonzero(best > second)
+    ratio = np.divide(*(similarity.distance(each[distinct]) for each in (best, second)))
+    chosen, ratio = distinct[ratio < limit], ratio[ratio < limit]
+    return _nearest_keypoints(similarity, one, two, chosen, nearest[chosen]), ratio
 
 
-@dataclass(frozen=True)
-class _TwoBest:
-    """The nearest location in image 2 to each in image 1, and how alike they are; shapes (L,).
+def _two_best(
+    similarity: Similarity, one: Locations, two: Locations, block_bytes: int
+) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
+    """The nearest location in image 2 to each in image 1, how alike they are, and the best other pair of either.
 
-    ``second`` is how alike the best other pair is that either of the two is in: where that is less than ``best``, the
-    two are each other's nearest.
+    Where that is less alike, the two are each other's nearest. The descriptors are in the orders of the locations.
     """
-
-    nearest: NDArray[np.intp]
-    best: NDArray[np.float32]
-    second: NDArray[np.float32]
-
-    def ratio(self, similarity: Similarity) -> FloatArray:
-        """Distance of the nearest over that of the best other pair; infinite where that is as near, or nearer."""
-        ratio = np.full(len(self.best), np.inf)
-        distinct = np.flatnonzero(self.best > self.second)
-        nearest, second = (similarity.distance(each[distinct]) for each in (self.best, self.second))
-        ratio[distinct] = nearest / second
-        return ratio
-
-
-def _two_best(similarity: Similarity, one: Locations, two: Locations, block_bytes: int) -> _TwoBest:
-    """Both directions from one pass over the similarities; the descriptors are in the orders of the locations."""
     nearest = np.empty(len(one), dtype=np.intp)
     best, second = np.empty((2, len(one)), np.float32)
     # Of each location of image 2, the most alike of those whose nearest it is not.
@@ -192,7 +177,7 @@ def _two_best(similarity: Similarity, one: Locations, two: Locations, block_byte
         second[here] = block.max(axis=1)
         np.maximum(others, block.max(axis=0), out=others)
     rivals = _rivals(nearest, best)
-    return _TwoBest(nearest, best, np.maximum.reduce([second, others[nearest], rivals]))
+    return nearest, best, np.maximum.reduce([second, others[nearest], rivals])
 
 
 def _rivals(nearest: NDArray[np.intp], best: NDArray[np.float32]) -> NDArray[np.float32]:
