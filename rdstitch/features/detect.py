@@ -110,11 +110,9 @@ def _detect(source: ViewLoader, options: FeatureOptions) -> Features:
     most, megapixels = options.limits
     image, detection, usable = _look(source, options, megapixels)
     shown, few = len(usable), len(usable) < _MIN_KEYPOINT_SHARE * most
-    # As if differences of grey levels were divided by the most that equalization multiplies them by.
-    faint = (
-        few
-        and len(_usable(image, find(np.rint(image.grey / CLIP_LIMIT).astype(np.uint8), options))) <= _LASTING * shown
-    )
+    # Differences of grey levels are divided by the most that equalization multiplies them by.
+    weaker = np.rint(image.grey / CLIP_LIMIT).astype(np.uint8)
+    faint = few and len(_usable(image, find(weaker, options))) <= _LASTING * shown
     if megapixels is not None and image.reduced and few:
         image, detection, usable = _look(source, options, CLOSER * megapixels)
     points, response = detection.points[usable], detection.response[usable]

@@ -12,7 +12,6 @@ import numpy as np
 from rdstitch.cache import Cache
 from rdstitch.compositing import (
     Canvas,
-    Composite,
     CompositeOptions,
     CompositePlan,
     FileComposite,
@@ -32,12 +31,12 @@ from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.messages import Message, names_of, shortened
-from rdstitch.outputs import Fingerprint, Outputs, check_output, text_bytes
+from rdstitch.outputs import Outputs, check_output, text_bytes
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.process_memory import return_freed_memory
 from rdstitch.progress import Progress
-from rdstitch.stitch_result import StitchResult
+from rdstitch.stitch_result import OutputImage, StitchResult
 from rdstitch.stored import Stored
 from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
 
@@ -45,18 +44,12 @@ from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
 _PROBE_REDUCTION = 8
 
 
-@dataclass(frozen=True)
-class Composed:
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Composed(OutputImage):
     """Images put together, or the plan of doing so."""
 
-    canvas: Canvas  # where the images lie in the output
-    composite: Composite | None = None  # the image; None where it went to a file, or was only planned
-    plan: CompositePlan | None = None  # of a dry run
-    messages: tuple[Message, ...] = ()  # what the user should know, such as why nothing was cropped
-    fingerprint: Fingerprint | None = None  # size and digest of the file
+    messages: tuple[Message, ...]  # what the user should know, such as why nothing was cropped
     written: FileComposite | None = None  # the image in its file
-    place: Georeference | None = None  # of the canvas
-    place_reason: str = ""  # why there is none
 
 
 def compose_images(
@@ -97,22 +90,23 @@ def compose_images(
         check_memory(output, canvas.size, options.max_memory)
     options = replace(options, workers=threads)
     images = placed.images(canvas.near)
+    composed = Composed(
+        canvas=canvas,
+        output=None if output is None else Path(output),
+        georeference=place,
+        not_georeferenced=reason,
+        messages=tuple(notes),
+    )
     if dry_run:
-        planned = _planned(placed, canvas, options)
-        return Composed(canvas, plan=planned, messages=tuple(notes), place=place, place_reason=reason)
+        return replace(composed, plan=_planned(placed, canvas, options))
 
     def report(share: float) -> None:
         progress("compositing", round(100 * share), 100)
 
     if output is None:
         composite = compose(images, canvas, options, report, elsewhere)
-        return Composed(
-            composite.canvas,
-            composite,
-            messages=(*notes, *composite.messages),
-            place=moved(place, canvas, composite.canvas),
-            place_reason=reason,
-        )
+        place, messages = moved(place, canvas, composite.canvas), (*notes, *composite.messages)
+        return replace(composed, canvas=composite.canvas, composite=composite, georeference=place, messages=messages)
 
     def tags(final: Canvas) -> list[ExtraTag]:
         there = moved(place, canvas, final)
@@ -136,13 +130,13 @@ def compose_images(
         *_profiles_differ(placed.sources),
         *beside,
     )
-    return Composed(
-        written.canvas,
+    return replace(
+        composed,
+        canvas=written.canvas,
         messages=messages,
         fingerprint=written.fingerprint,
         written=written,
-        place=place,
-        place_reason=reason,
+        georeference=place,
     )
 
 
@@ -256,7 +250,7 @@ def write_page(
     if page is None or written is None:
         return []
 
-    gsd = None if composed.place is None else composed.place.gsd
+    gsd = None if composed.georeference is None else composed.georeference.gsd
 
     def stage() -> None:
         text = viewer_page(output, composed.canvas.size, images(), written.seams, written.origin, gsd)

@@ -406,16 +406,10 @@ def compose_registration(
         dry_run=options.dry_run,
     )
     result = StitchResult(
-        _finished(registration).with_messages((*said, *composed.messages)),
-        composed.canvas,
-        options.for_images(len(registration.sources)),
-        None if output is None else Path(output),
-        composed.composite,
-        composed.plan,
-        composed.fingerprint,
-        local,
-        composed.place,
-        composed.place_reason,
+        registration=_finished(registration).with_messages((*said, *composed.messages)),
+        options=options.for_images(len(registration.sources)),
+        local_alignment=local,
+        **composed.output_fields,
     )
     if options.dry_run:
         return result
