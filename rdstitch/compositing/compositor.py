@@ -58,16 +58,11 @@ class Composite:
 class FileComposite:
     """A stitched image that went to a file; attributes as of :class:`Composite`."""
 
-    path: Path
     canvas: Canvas
-    exposure: Exposure
     fingerprint: Fingerprint  # size and digest of the file
-    messages: tuple[Message, ...] = ()
-    seams: SeamMap | None = None  # which image owns what of the canvas before cropping; None without seams
-    origin: tuple[int, int] = (0, 0)  # where the output begins in that canvas, pixels
-
-    def __repr__(self) -> str:
-        return f"<FileComposite {self.path}: {self.canvas.size[0]} x {self.canvas.size[1]} pixels>"
+    messages: tuple[Message, ...]
+    seams: SeamMap | None  # which image owns what of the canvas before cropping; None without seams
+    origin: tuple[int, int]  # where the output begins in that canvas, pixels
 
 
 def compose(
@@ -145,12 +140,4 @@ def compose_to_file(
         # Nothing goes on behind a writer that fails.
         with closing(prepared.strips(progress)) as strips:
             written = write_strips(path, layout, strips, extra_tags(prepared.canvas), outputs=outputs)
-    return FileComposite(
-        Path(path),
-        prepared.canvas,
-        renderer.exposure,
-        written,
-        prepared.messages,
-        renderer.seams,
-        prepared.tiles.box[:2],
-    )
+    return FileComposite(prepared.canvas, written, prepared.messages, renderer.seams, prepared.tiles.box[:2])

@@ -127,14 +127,7 @@ def _margins(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) ->
     """By how much more the votes were missed if an image came from the other lens, for each image (N,)."""
     which = votes.which(second)
     missed = votes.mahalanobis_residuals(lenses[which])
-    return _per_image(
-        count, votes, *(votes.mahalanobis_residuals(lenses[which ^ other]) - missed for other in np.eye(2, dtype=int))
-    )
-
-
-def _per_image(count: int, votes: Votes, of_first: FloatArray, of_last: FloatArray) -> FloatArray:
-    """What the votes say of their first and second images, added up, shape (N,)."""
     total: FloatArray = np.zeros(count)
-    np.add.at(total, votes.image1, of_first)
-    np.add.at(total, votes.image2, of_last)
+    for image, other in zip((votes.image1, votes.image2), np.eye(2, dtype=int), strict=True):
+        np.add.at(total, image, votes.mahalanobis_residuals(lenses[which ^ other]) - missed)
     return total

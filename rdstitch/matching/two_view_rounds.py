@@ -11,7 +11,7 @@ import numpy as np
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.camera import Camera
 from rdstitch.executors import batches, in_order
-from rdstitch.features import Correspondences, Matcher, match_near
+from rdstitch.features import Matcher, match_near
 from rdstitch.matching.candidate_pairs import pairs_that_matter
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
@@ -111,7 +111,7 @@ class Pairing:
         threshold = self.estimation.threshold
         if not has_static_background(pairs, threshold):
             return None
-        compared = [(pair.image1, pair.image2) for pair in pairs]
+        compared = [pair.images for pair in pairs]
         others = sorted(set(candidates).difference(compared))
         everything = [*pairs, *self.estimate(others)]
         chosen = sorted([*compared, *others])
@@ -147,20 +147,14 @@ class Pairing:
 
     def rematch_elsewhere(self, pairs: Sequence[PairRegistration], transfer: Transfer) -> list[PairRegistration]:
         """Match registered pairs again, only near where ``transfer`` puts them."""
-        matched = [StoredMatches.of(self._near(pair, transfer)) for pair in pairs]
-        return self._relate([(pair.image1, pair.image2) for pair in pairs], matched, self.estimation.distortion)
-
-    def _near(self, pair: PairRegistration, transfer: Transfer) -> Correspondences:
-        """Matches of a pair near the places where the alignment expects them."""
-        features1, features2 = self.features[pair.image1], self.features[pair.image2]
-        return match_near(
-            features1,
-            features2,
-            transfer(pair.image1, pair.image2, features1.points),
-            _SEARCH_RADIUS * self.estimation.threshold,
-            pair.correspondences.indices[pair.relation.inliers],
-            self.ratio,
-        )
+        matched = []
+        for pair in pairs:
+            features1, features2 = self.features[pair.image1], self.features[pair.image2]
+            expected = transfer(pair.image1, pair.image2, features1.points)
+            known = pair.correspondences.indices[pair.relation.inliers]
+            radius = _SEARCH_RADIUS * self.estimation.threshold
+            matched.append(StoredMatches.of(match_near(features1, features2, expected, radius, known, self.ratio)))
+        return self._relate([pair.images for pair in pairs], matched, self.estimation.distortion)
 
     def _match(
         self, pairs: Sequence[Pair], stage: str, shared: Mapping[Pair, StoredMatches] | None = None

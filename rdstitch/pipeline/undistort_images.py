@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal, get_args, overload
+from typing import Any, Literal, TypedDict, Unpack, get_args, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,40 +30,22 @@ ImageFormat = Literal["jpg", "png", "tif", "webp"]
 _POINTS_PER_SIDE = 256
 
 
-@overload
-def undistort(
-    inputs: Images,
-    folder: str | Path,
-    *,
-    camera: Camera | None = None,
-    distortion: float | None = None,
-    view: Framing = "same",
-    image_format: ImageFormat | None = None,
-    overwrite: bool = False,
-    topic: str | None = None,
-    channel_order: ChannelOrder = "bgr",
-    warn: Callable[[Message], None] = ignored,
-    progress: Progress = silent,
-) -> list[Path]: ...
+class _Choices(TypedDict, total=False):
+    camera: Camera | None
+    distortion: float | None
+    view: Framing
+    image_format: ImageFormat | None
+    overwrite: bool
+    topic: str | None
+    channel_order: ChannelOrder
+    warn: Callable[[Message], None]
+    progress: Progress
 
 
 @overload
-def undistort(
-    inputs: Images,
-    folder: None = None,
-    *,
-    camera: Camera | None = None,
-    distortion: float | None = None,
-    view: Framing = "same",
-    image_format: ImageFormat | None = None,
-    overwrite: bool = False,
-    topic: str | None = None,
-    channel_order: ChannelOrder = "bgr",
-    warn: Callable[[Message], None] = ignored,
-    progress: Progress = silent,
-) -> list[NDArray[Any]]: ...
-
-
+def undistort(inputs: Images, folder: str | Path, **choices: Unpack[_Choices]) -> list[Path]: ...
+@overload
+def undistort(inputs: Images, folder: None = None, **choices: Unpack[_Choices]) -> list[NDArray[Any]]: ...
 def undistort(
     inputs: Images,
     folder: str | Path | None = None,
