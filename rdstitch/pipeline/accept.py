@@ -11,7 +11,7 @@ from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
 from rdstitch.errors import PartialResultError, RegistrationError
-from rdstitch.messages import Message, left_out, names_of, told_once
+from rdstitch.messages import Message, names_of, told_once
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
@@ -221,13 +221,10 @@ def _aligned_anew(
     registration: Registration, aligned: AlignedPairs, paths: Sequence[str], reasons: Mapping[int, Message]
 ) -> Registration:
     """The registration with another alignment, and why images are not in it."""
-    known = {message.images: message for message in registration.left_out}
-    unaligned = np.flatnonzero(~aligned.alignment.used).tolist()
-    explained = zip(unaligned, explain_unaligned(aligned.alignment, paths, registration.keypoints), strict=True)
-    unused = [
-        known.get(message.images, left_out(paths[k], reasons[k].text) if k in reasons else message)
-        for k, message in explained
-    ]
+    known = {k: message.text for k, message in reasons.items()}
+    number = {path: k for k, path in enumerate(paths)}
+    known |= {number[m.images[0]]: m.text for m in registration.left_out if m.images[0] in number}
+    unused = explain_unaligned(aligned.alignment, paths, registration.keypoints, known)
     dropped = (*registration.alignment.messages, *registration.left_out)
     whole = [message for message in registration.messages if message not in dropped]
     messages = (*aligned.alignment.messages, *whole, *unused)

@@ -1,11 +1,9 @@
 """The registration that pano, mosaic, calibrate and trajectory share: features, pairs, one alignment."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
-
-import numpy as np
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames import frontal_reference, in_frame_of
@@ -18,7 +16,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.messages import Message, left_out, names_of, shortened
+from rdstitch.messages import Message, names_of, shortened
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail, select_by_whole_lens
 from rdstitch.pipeline.detect_features import detect_by_contrast
@@ -105,6 +103,7 @@ def register(
     aligned, undecided = settle(aligner, pairing, aligned, sources, detected.stretch, options.threads)
     if metric:
         aligned = aligner.metric(aligned)
+    unplaced = {**other_lens, **detected.damaged, **undecided}
     return Registration(
         tuple(sources),
         counts := tuple(features.counts.tolist()),
@@ -114,7 +113,7 @@ def register(
             *aligned.alignment.messages,
             *([_STATIC_BACKGROUND] if moving else []),
             *_low_contrast(detected.equalized, aligned.alignment, aligner.paths),
-            *_left_out(aligned.alignment, aligner.paths, counts, {**other_lens, **detected.damaged, **undecided}),
+            *explain_unaligned(aligned.alignment, aligner.paths, counts, unplaced),
         ),
         static_background=moving is not None,
         stretch=detected.stretch,
@@ -159,15 +158,3 @@ def _low_contrast(equalized: Sequence[int], alignment: Alignment, paths: Sequenc
     who = "shows" if len(images) == 1 else f"{several} show"
     text = f"{who} little contrast: features were found after equalizing it locally"
     return [Message(text, images, "detail", code="low-contrast")]
-
-
-def _left_out(
-    alignment: Alignment, paths: Sequence[str], keypoints: Sequence[int], reasons: Mapping[int, str]
-) -> list[Message]:
-    """Why images are not in the alignment, which is known beforehand of those that never reached it."""
-    return [
-        message if index not in reasons else left_out(paths[index], reasons[index])
-        for index, message in zip(
-            np.flatnonzero(~alignment.used).tolist(), explain_unaligned(alignment, paths, keypoints), strict=True
-        )
-    ]
