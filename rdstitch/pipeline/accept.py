@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -59,7 +58,10 @@ def accept(
     undamaged = None if options.force else _without_damage(registration, aligner)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None
-    checked = partial(_judged, options=options, cache=cache, lens_only=lens_only)
+
+    def checked(candidate: Registration) -> tuple[Finding, ...]:
+        return judge(Evidence(candidate, options.threshold, options.threads, cache, lens_only))
+
     current, found = registration, checked(registration)
     first, found_first = registration, found
     if _fails(found) and undamaged is not None and not _fails(judged := checked(undamaged)):
@@ -89,12 +91,6 @@ def accept(
     if options.strict and accepted.left_out:
         raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
     return accepted
-
-
-def _judged(
-    registration: Registration, options: StitchOptions, cache: Cache, *, lens_only: bool
-) -> tuple[Finding, ...]:
-    return judge(Evidence(registration, options.threshold, options.threads, cache, lens_only))
 
 
 def _without_damage(registration: Registration, aligner: Aligner) -> Registration | None:

@@ -135,42 +135,40 @@ def ransac(
     return Search(best, np.sum([lane.drawn for lane in lanes], axis=0), confident)
 
 
+@dataclass(eq=False)
 class _Lane:
     """One minimal solver's share of the search."""
 
-    def __init__(
-        self,
-        solver: MinimalSolver,
-        data: Measurements,
-        quick: Measurements,
-        ordered: BoolArray,
-        tilts: FloatArray | None,
-        options: EstimationOptions,
-        index: int,
-    ) -> None:
-        self.drawn = np.zeros(len(data), dtype=np.intp)
-        self._solver, self._index = solver, index
-        self._data, self._quick, self._ordered, self._tilts = data, quick, ordered, tilts
-        self._options = options
-        self._least_raw_cost = np.ones(len(data))
-        self._sampler = Sampler(solver.sample_size, options.max_iterations, [options.seed, index])
+    solver: MinimalSolver
+    data: Measurements
+    quick: Measurements  # a part of the matches
+    ordered: BoolArray
+    tilts: FloatArray | None
+    options: EstimationOptions
+    index: int  # of the solver
+
+    def __post_init__(self) -> None:
+        self.drawn = np.zeros(len(self.data), dtype=np.intp)
+        self._least_raw_cost = np.ones(len(self.data))
+        seed = [self.options.seed, self.index]
+        self._sampler = Sampler(self.solver.sample_size, self.options.max_iterations, seed)
 
     def needed(self, best: Hypotheses, rows: IntArray, *, explore: bool = False) -> FloatArray:
         """Samples after which a better model than the best of each of some pairs is unlikely to have been missed.
 
         With ``explore`` at least as many as every solver draws.
         """
-        counts = self._data.count[rows]
+        counts = self.data.count[rows]
         agreeing = np.maximum(best.inliers[rows].sum(axis=1), MIN_PLACES)
-        good = _SOLVER_SUCCESS * np.minimum(agreeing / counts, 1.0) ** self._solver.sample_size
-        needed = np.log1p(-self._options.confidence) / np.log1p(-np.minimum(good, 1.0 - 1e-12))
+        good = _SOLVER_SUCCESS * np.minimum(agreeing / counts, 1.0) ** self.solver.sample_size
+        needed = np.log1p(-self.options.confidence) / np.log1p(-np.minimum(good, 1.0 - 1e-12))
         return np.asarray(np.maximum(needed, _MIN_EXPLORATION) if explore else needed)
 
     def advance(self, best: Hypotheses, rows: IntArray, batch: int) -> None:
         """Draw a batch of samples of some pairs, and put the best hypotheses where they are better."""
         if not len(rows) or batch < 1:
             return
-        picks = self._sampler.draw(self.drawn[rows], batch, self._data.count[rows], self._ordered[rows])
+        picks = self._sampler.draw(self.drawn[rows], batch, self.data.count[rows], self.ordered[rows])
         self.drawn[rows] += batch
         step = max(1, _SAMPLES_AT_ONCE // batch)
         found = [self._best_of(rows[i : i + step], picks[i : i + step]) for i in range(0, len(rows), step)]
@@ -180,8 +178,8 @@ class _Lane:
         self._least_raw_cost[rows] = cost[better]
         if not len(rows):
             return
-        data, threshold = self._data.take(rows), self._options.threshold
-        judged = Hypotheses.judged(homography, distortion, data, threshold, self._index)
+        data, threshold = self.data.take(rows), self.options.threshold
+        judged = Hypotheses.judged(homography, distortion, data, threshold, self.index)
         fresh = (judged.inliers & ~best.inliers[rows]).sum(axis=1) > _NOVELTY * judged.inliers.sum(axis=1)
         worthwhile = np.flatnonzero(fresh | ~(judged.cost > best.cost[rows]))
         if len(worthwhile):
@@ -194,17 +192,15 @@ class _Lane:
         places = picks.reshape(len(rows), 1, -1)
         x1, x2 = (
             np.take_along_axis(x[rows], places, axis=2).reshape(len(rows), 2, batch, size).transpose(0, 2, 3, 1)
-            for x in (self._data.x1, self._data.x2)
+            for x in (self.data.x1, self.data.x2)
         )
-        tilts = None if self._tilts is None else np.repeat(self._tilts[rows], batch, axis=0)
-        found = self._solver.solve(x1.reshape(-1, size, 2), x2.reshape(-1, size, 2), tilts)
+        tilts = None if self.tilts is None else np.repeat(self.tilts[rows], batch, axis=0)
+        found = self.solver.solve(x1.reshape(-1, size, 2), x2.reshape(-1, size, 2), tilts)
         # A lens that is known may see beyond the horizon at the corners: what is there is no inlier.
-        keep = plausible(found, corner_radius=0.0 if self._solver.fixed_distortion else 1.0)
+        keep = plausible(found, corner_radius=0.0 if self.solver.fixed_distortion else 1.0)
         found = Solutions(found.sample[keep], found.homography[keep], found.distortion[keep])
         pair = found.sample // batch
-        costs = truncated_costs(
-            found.homography, found.distortion, pair, self._quick.take(rows), self._options.threshold
-        )
+        costs = truncated_costs(found.homography, found.distortion, pair, self.quick.take(rows), self.options.threshold)
         order = np.lexsort((costs, pair))
         first = order[np.flatnonzero(np.diff(pair[order], prepend=-1))]
         homography, distortion = np.zeros((len(rows), 3, 3)), np.zeros(len(rows))
@@ -220,12 +216,12 @@ class _Lane:
         Where the solver assumes none, one refinement is enough to count inliers by; the choice of the model refines the
         last of them again.
         """
-        wide = 3.0 * self._options.threshold
-        if isinstance(self._solver.model, HomographyPairModel):
-            return self._refined(start, data, rows, self._solver.model, wide)
+        wide = 3.0 * self.options.threshold
+        if isinstance(self.solver.model, HomographyPairModel):
+            return self._refined(start, data, rows, self.solver.model, wide)
         best = start
         enough = start.inliers.sum(axis=1) >= _FREE_REFINEMENT
-        for chosen, model in ((enough, HomographyPairModel()), (~enough, self._solver.model)):
+        for chosen, model in ((enough, HomographyPairModel()), (~enough, self.solver.model)):
             part = np.flatnonzero(chosen)
             if len(part):
                 refined = self._refined(best.take(part), data.take(part), rows[part], model, wide)
@@ -237,12 +233,12 @@ class _Lane:
     ) -> Hypotheses:
         """The start or its refinement, whichever is better."""
         problems = PairProblems(
-            model, data, np.full(len(data), scale), np.ones(len(data)), self._solver.fixed_distortion
+            model, data, np.full(len(data), scale), np.ones(len(data)), self.solver.fixed_distortion
         )
-        state = model.initialize(start.homography, None if self._tilts is None else self._tilts[rows])
+        state = model.initialize(start.homography, None if self.tilts is None else self.tilts[rows])
         begin = Fits(state, start.homography, start.distortion)
         fits, _ = refine_pairs(problems, begin, _LOCAL_STEPS, rough=True)
-        judged = Hypotheses.judged(fits.homography, fits.distortion, data, self._options.threshold, self._index)
+        judged = Hypotheses.judged(fits.homography, fits.distortion, data, self.options.threshold, self.index)
         result = start.take(np.arange(len(data)))
         result.put(np.arange(len(data)), judged, judged.cost < start.cost)
         return result
