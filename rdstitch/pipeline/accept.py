@@ -12,7 +12,7 @@ from rdstitch.cache import Cache
 from rdstitch.errors import PartialResultError, RegistrationError
 from rdstitch.messages import Message, names_of, told_once
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
+from rdstitch.pipeline.aligner import AlignedPairs, Aligner, Purpose, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
 from rdstitch.verification.evidence import Evidence
@@ -30,31 +30,19 @@ Offenders = Mapping[tuple[int, ...], Message]
 
 
 @impossible_estimates_fail()
-def accept(
-    registration: Registration,
-    options: StitchOptions,
-    *,
-    metric: bool = False,
-    lens_only: bool = False,
-    prefer_turn: bool = False,
-) -> Registration:
+def accept(registration: Registration, options: StitchOptions, purpose: Purpose = "mosaic") -> Registration:
     """The registration of what passes all checks, with everything that the user should know of it.
 
     Parameters
     ----------
     registration : Registration
         In pixels of the working size; the result is in those of the images.
-    metric : bool
-        Metric poses are needed, also of what remains.
-    lens_only : bool
-        Only the lens is wanted, so that doubts about the places of images do not matter.
-    prefer_turn : bool
+    purpose : str
         As for :func:`rdstitch.pipeline.register.register`.
     """
     cache = Cache(options.cache)
-    layout_matters = not (lens_only or metric)
-    aligner = Aligner.of(registration.sources, options, cache, prefer_turn=prefer_turn, layout_matters=layout_matters)
-    aligner = replace(aligner, needs_poses=metric)
+    aligner = Aligner.of(registration.sources, options, cache, purpose)
+    aligner, lens_only = replace(aligner, needs_poses=purpose == "trajectory"), purpose == "calibrate"
     undamaged = None if options.force else _without_damage(registration, aligner)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None

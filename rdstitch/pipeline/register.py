@@ -18,7 +18,7 @@ from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, names_of, shortened
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail, select_by_whole_lens
+from rdstitch.pipeline.aligner import Aligner, Purpose, close_loops, impossible_estimates_fail, select_by_whole_lens
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.pattern_crossings import match_crossings
 from rdstitch.pipeline.pattern_shifts import settle_repeated_pattern
@@ -40,10 +40,7 @@ def register(
     options: StitchOptions,
     executor: Executor,
     *,
-    skip_bad: bool,
-    metric: bool = False,
-    lens_only: bool = False,
-    prefer_turn: bool = False,
+    purpose: Purpose = "mosaic",
     progress: Progress = silent,
 ) -> Registration:
     """Detect features, register pairs, and align all images as one.
@@ -56,22 +53,16 @@ def register(
     ----------
     executor : concurrent.futures.Executor
         Where features are detected and pairs are registered; see :func:`rdstitch.executors.open_executor`.
-    skip_bad : bool
-        Leave out damaged images instead of raising.
-    metric : bool
-        Metric poses are needed, so that the freest model is that of planar motion with small tilts.
-    lens_only : bool
-        Only the lens is wanted, so that images of a repeated pattern may be off by whole periods of it.
-    prefer_turn : bool
-        A turn on the spot is taken where a plane explains the images as well.
+    purpose : str
+        See :data:`rdstitch.pipeline.aligner.Purpose`.
     """
     options = options.for_images(len(sources))
     cache = Cache.at(options.cache)
-    layout_matters = not (lens_only or metric)
     if options.known_distortion is None:
         sources = with_image_circle(sources, executor, cache, options.features.limits[1])
-    aligner = Aligner.of(sources, options, cache, prefer_turn=prefer_turn, layout_matters=layout_matters)
+    aligner = Aligner.of(sources, options, cache, purpose)
     store = cache if options.cache is not None else Cache.for_this_run()
+    skip_bad = purpose != "pano"
     detected = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
@@ -93,15 +84,15 @@ def register(
     found = pairing.estimate_candidates(candidates)
     moving = pairing.without_static_background(found, candidates)
     pairing, found = moving or (pairing, found)
-    found = pairing.match_repeated_patterns(found) if lens_only else found
+    found = pairing.match_repeated_patterns(found) if purpose == "calibrate" else found
     mixed, other_lens = separate_lenses(aligner.cameras, found, options.threshold, options.known_distortion)
     aligned = aligner.align([pair for pair in found if not {*pair.images} & other_lens.keys()])
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
     aligned = close_loops(aligner, pairing, aligned, candidates)
     aligned = select_by_whole_lens(aligner, aligned)
-    settle = match_crossings if lens_only else settle_repeated_pattern
+    settle = match_crossings if purpose == "calibrate" else settle_repeated_pattern
     aligned, undecided = settle(aligner, pairing, aligned, sources, detected.stretch, options.threads)
-    if metric:
+    if purpose == "trajectory":
         aligned = aligner.metric(aligned)
     unplaced = {**other_lens, **detected.damaged, **undecided}
     return Registration(
