@@ -17,13 +17,13 @@ from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
-from rdstitch.compositing.tiles import ShareProgress
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, check_memory, write_strips
 from rdstitch.messages import Message
 from rdstitch.outputs import Fingerprint, Outputs
+from rdstitch.progress import ShareProgress, unheard
 
 
 @dataclass(frozen=True, repr=False)
@@ -69,7 +69,7 @@ def compose(
     images: Sequence[PlacedImage],
     canvas: Canvas,
     options: CompositeOptions | None = None,
-    progress: ShareProgress | None = None,
+    progress: ShareProgress = unheard,
     elsewhere: BlockRunner | None = None,
 ) -> Composite:
     """Put images together on a canvas, in memory.
@@ -101,7 +101,7 @@ def compose_to_file(
     images: Sequence[PlacedImage],
     canvas: Canvas,
     options: CompositeOptions | None = None,
-    progress: ShareProgress | None = None,
+    progress: ShareProgress = unheard,
     elsewhere: BlockRunner | None = None,
     *,
     metadata: Metadata | None = None,

@@ -20,11 +20,12 @@ from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
 from rdstitch.compositing.source_images import ImageReader
 from rdstitch.compositing.survey import survey_factor, survey_images
-from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
+from rdstitch.compositing.tiles import OutputStrip, TiledOutput
 from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.messages import Message
 from rdstitch.process_memory import return_freed_memory
+from rdstitch.progress import ShareProgress, unheard
 
 _PREPARATION = 0.25
 # Images that the survey reads at one time: what the tiles need is not there yet.
@@ -41,7 +42,7 @@ class Prepared:
     messages: tuple[Message, ...]
     elsewhere: BlockRunner | None = None  # computes the pixels in blocks, see :mod:`rdstitch.compositing.blocks`
 
-    def strips(self, progress: ShareProgress | None = None) -> Generator[OutputStrip]:
+    def strips(self, progress: ShareProgress = unheard) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
         progress = _part_of(progress, _PREPARATION, 1.0)
         if self.elsewhere is None:
@@ -54,7 +55,7 @@ def prepare_composite(
     images: Sequence[PlacedImage],
     canvas: Canvas,
     options: CompositeOptions | None = None,
-    progress: ShareProgress | None = None,
+    progress: ShareProgress = unheard,
     elsewhere: BlockRunner | None = None,
 ) -> Iterator[Prepared]:
     """Decide on exposure, seams and cropping, from a small version of each image; see :func:`compose`.
@@ -88,7 +89,7 @@ def _decided(
     images: Sequence[PlacedImage],
     canvas: Canvas,
     plan: CompositePlan,
-    progress: ShareProgress | None,
+    progress: ShareProgress,
 ) -> Prepared:
     """Decide for a renderer that has neither exposure nor seams yet."""
     options, warps, exposure = renderer.options, renderer.warps, renderer.exposure
@@ -137,8 +138,6 @@ def _unwidened(canvas: Canvas) -> Box | None:
     return left, 0, left + turn, height
 
 
-def _part_of(progress: ShareProgress | None, start: float, stop: float) -> ShareProgress | None:
+def _part_of(progress: ShareProgress, start: float, stop: float) -> ShareProgress:
     """A progress that fills a part of another."""
-    if progress is None:
-        return None
     return lambda share: progress(start + (stop - start) * share)

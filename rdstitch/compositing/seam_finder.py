@@ -6,7 +6,7 @@ cut), so that what moved or stands out of the plane is taken from one of them wh
 other, so that memory is that of one label per pixel of the reduced canvas.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean
+from rdstitch.progress import ShareProgress, unheard
 
 NO_OWNER = -1
 
@@ -96,9 +97,7 @@ class SeamMap:
         return self.labels[np.ix_(rows, columns)]
 
 
-def find_seams(
-    survey: Survey, exposure: Exposure, graphcut: bool, progress: Callable[[float], None] | None = None
-) -> SeamMap:
+def find_seams(survey: Survey, exposure: Exposure, graphcut: bool, progress: ShareProgress = unheard) -> SeamMap:
     """Owner of every pixel.
 
     Parameters
@@ -131,8 +130,7 @@ def find_seams(
                 composite[cut][won] = pixels[won]
             labels[cut][won] = index
             weights[cut][won] = weight[won]
-        if progress is not None:
-            progress((index + 1) / len(survey.tiles))
+        progress((index + 1) / len(survey.tiles))
     return SeamMap(labels, survey.factor)
 
 

@@ -1,6 +1,6 @@
 """All images on a reduced canvas: what exposure and seams are decided on."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -15,6 +15,7 @@ from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
 from rdstitch.compositing.source_images import ImageReader
 from rdstitch.compositing.warp import Geometry, Warp, locate, plan_warps
+from rdstitch.progress import ShareProgress, unheard
 
 _MAX_IMAGE = 600_000
 _MAX_TOTAL = 16_000_000
@@ -75,7 +76,7 @@ def survey_images(
     images: Sequence[PlacedImage],
     canvas: Canvas,
     workers: int = 1,
-    progress: Callable[[float], None] | None = None,
+    progress: ShareProgress = unheard,
 ) -> Survey:
     """Read every image once, ``workers`` at a time, and lay it, small, on the reduced canvas."""
     factor = survey_factor(canvas)
@@ -85,8 +86,7 @@ def survey_images(
     with ThreadPoolExecutor(workers) as pool:
         for tile in pool.map(partial(_survey_tile, reader), range(len(warps)), warps):
             tiles.append(tile)
-            if progress is not None:
-                progress(len(tiles) / len(warps))
+            progress(len(tiles) / len(warps))
     return Survey(factor, small, warps, tuple(tiles))
 
 
