@@ -5,7 +5,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 
 MIN_GAIN = 1e-5
 """Expected relative fall of the loss of all images that is worth another step: a hundredth of the noise."""
@@ -20,7 +20,7 @@ _MIN_DAMPING = 1e-9
 
 
 @dataclass
-class BatchedNormalEquations:
+class BatchedNormalEquations(Rows):
     """The loss of B problems at some parameters, and what a step from there takes."""
 
     cost: FloatArray  # (B,)
@@ -32,15 +32,6 @@ class BatchedNormalEquations:
     def errors(self) -> FloatArray:
         """Errors of the measurements, (B, N); inf where there is none."""
         return np.sqrt(self.squared)
-
-    def take(self, rows: BoolArray | IntArray) -> "BatchedNormalEquations":
-        """Those of some problems."""
-        return BatchedNormalEquations(self.cost[rows], self.information[rows], self.gradient[rows], self.squared[rows])
-
-    def put(self, rows: IntArray, others: "BatchedNormalEquations") -> None:
-        """Replace those of some problems."""
-        self.cost[rows], self.information[rows] = others.cost, others.information
-        self.gradient[rows], self.squared[rows] = others.gradient, others.squared
 
     def where(self, better: BoolArray, others: "BatchedNormalEquations") -> "BatchedNormalEquations":
         """The others where they are better."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 from rdstitch.robust.options import EstimationOptions
@@ -31,7 +31,7 @@ _LOCAL_STEPS = 4
 
 
 @dataclass
-class Hypotheses:
+class Hypotheses(Rows):
     """For each of B pairs a homography with λ, and how well it explains the matches."""
 
     homography: FloatArray  # (B, 3, 3): in the half-diagonal frame
@@ -64,19 +64,6 @@ class Hypotheses:
         inliers = relative < 1.0
         missed = (relative * data.present).sum(axis=1)
         return cls(homography, distortion, missed / data.count, inliers, np.full(len(data), solver))
-
-    def take(self, rows: IntArray) -> "Hypotheses":
-        """Those of some pairs; copies."""
-        return Hypotheses(
-            self.homography[rows], self.distortion[rows], self.cost[rows], self.inliers[rows], self.solver[rows]
-        )
-
-    def put(self, rows: IntArray, others: "Hypotheses", better: BoolArray) -> None:
-        """Replace those of some pairs where others are better."""
-        where = rows[better]
-        self.homography[where], self.distortion[where] = others.homography[better], others.distortion[better]
-        self.cost[where], self.inliers[where] = others.cost[better], others.inliers[better]
-        self.solver[where] = others.solver[better]
 
 
 @dataclass(frozen=True)
@@ -184,7 +171,8 @@ class _Lane:
         worthwhile = np.flatnonzero(fresh | ~(judged.cost > best.cost[rows]))
         if len(worthwhile):
             optimized = self._optimized(judged.take(worthwhile), data.take(worthwhile), rows[worthwhile])
-            best.put(rows[worthwhile], optimized, optimized.cost < best.cost[rows[worthwhile]])
+            better = optimized.cost < best.cost[rows[worthwhile]]
+            best.put(rows[worthwhile][better], optimized.take(better))
 
     def _best_of(self, rows: IntArray, picks: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of each pair the hypothesis that explains a part of its matches best: H, λ and cost; inf where none is."""
@@ -225,7 +213,8 @@ class _Lane:
             part = np.flatnonzero(chosen)
             if len(part):
                 refined = self._refined(best.take(part), data.take(part), rows[part], model, wide)
-                best.put(part, refined, refined.cost < best.cost[part])
+                better = refined.cost < best.cost[part]
+                best.put(part[better], refined.take(better))
         return best
 
     def _refined(
@@ -240,7 +229,8 @@ class _Lane:
         fits, _ = refine_pairs(problems, begin, _LOCAL_STEPS, rough=True)
         judged = Hypotheses.judged(fits.homography, fits.distortion, data, self.options.threshold, self.index)
         result = start.take(np.arange(len(data)))
-        result.put(np.arange(len(data)), judged, judged.cost < start.cost)
+        better = judged.cost < start.cost
+        result.put(better, judged.take(better))
         return result
 
 

@@ -5,7 +5,7 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.division_model import MAX_ABS_DISTORTION
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, descend
 from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
@@ -16,16 +16,12 @@ _STATE = 9  # numbers of a state of any pair model; before these, parameters hav
 
 
 @dataclass(frozen=True)
-class Fits:
+class Fits(Rows):
     """One model fitted to the matches of B pairs."""
 
     state: FloatArray  # (B, S): the model's states
     homography: FloatArray  # (B, 3, 3)
     distortion: FloatArray  # (B,): λ in the half-diagonal frame
-
-    def take(self, rows: BoolArray | IntArray | slice) -> "Fits":
-        """Those of some pairs."""
-        return Fits(self.state[rows], self.homography[rows], self.distortion[rows])
 
     @property
     def parameters(self) -> FloatArray:

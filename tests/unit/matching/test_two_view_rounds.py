@@ -107,7 +107,7 @@ def test_static_features_that_were_matched_otherwise_are_dropped_too() -> None:
 
 def test_images_that_share_nothing_are_rejected_by_the_prescreen() -> None:
     one, other = _pairing(0, 400), _pairing(0, 400, seed=1)
-    together = replace(one, features=FeatureStore.of([*one.features[:2], *other.features[:2]]))
+    together = replace(one, features=FeatureStore((*one.features.items[:2], *other.features.items[:2])))
     assert list(together.prescreen_pairs(ALL)) == [(0, 1), (2, 3)]
 
 
