@@ -200,15 +200,6 @@ def _profiles_differ(sources: Sequence[Source]) -> list[Message]:
     return [Message(text, tuple(others), code="colour-profiles")]
 
 
-@dataclass(frozen=True, eq=False)
-class BlockTask:
-    """A block, and what its worker must know beside."""
-
-    block: Block
-    sources: tuple[Source, ...]  # its images
-    store: Cache  # where its strips go
-
-
 def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None) -> BlockRunner | None:
     """What computes blocks of an output on the workers of an executor; None for threads, which need no blocks.
 
@@ -224,8 +215,8 @@ def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None
 
     def run(blocks: Iterable[Block]) -> Generator[list[Stored[OutputStrip]]]:
         store = Cache.for_this_run(folder)
-        tasks = (BlockTask(block, tuple(sources[k] for k in block.images), store) for block in blocks)
-        with closing(in_order(executor, compose_block, tasks)) as done:
+        tasks = ((block, [sources[k] for k in block.images]) for block in blocks)
+        with closing(in_order(executor, partial(compose_block, store=store), tasks)) as done:
             for strips, notes in done:
                 sources[0].guard.learn(notes)
                 yield strips
@@ -233,13 +224,14 @@ def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None
     return run
 
 
-def compose_block(task: BlockTask) -> tuple[list[Stored[OutputStrip]], GuardNotes]:
-    """Compute a block; and what was noticed of its files."""
-    strips = task.block.compute(task.store)
-    if not task.sources:
-        return strips, ({}, {})
+def compose_block(
+    task: tuple[Block, Sequence[Source]], *, store: Cache
+) -> tuple[list[Stored[OutputStrip]], GuardNotes]:
+    """Compute a block of these images into a store; and what was noticed of their files."""
+    block, sources = task
+    strips = block.compute(store)
     # All have one guard, which travels with them.
-    return strips, task.sources[0].guard.notes_on([source.path for source in task.sources])
+    return strips, sources[0].guard.notes_on([source.path for source in sources]) if sources else ({}, {})
 
 
 def write_page(

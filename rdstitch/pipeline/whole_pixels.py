@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.matching.match_graph import spanning_tree
 from rdstitch.registration import Registration
@@ -64,7 +63,8 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
         link = pair.link()
         moved = link.points1 - link.points2
         shift = np.rint(np.median(moved, axis=0))
-        whole, fitted = moved - shift, _errors(alignment, pair.image1, pair.image2, link.points1, link.points2)
+        expected = alignment.transfer(pair.image1, pair.image2, link.points1)
+        whole, fitted = moved - shift, np.nan_to_num(expected - link.points2)  # 0 where a lens cannot see them
         # Of most sets the first pair already says no.
         if np.median(np.linalg.norm(whole, axis=1)) > 0.5 + np.median(np.linalg.norm(fitted, axis=1)):
             return None
@@ -86,8 +86,3 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
     sigma = math.hypot(math.sqrt(float(np.median(fit))) / RAYLEIGH_MEDIAN, _EXACTNESS)
     worse = float((robust_cost(squared, ALIGNMENT_WIDTH * sigma) - robust_cost(fit, ALIGNMENT_WIDTH * sigma)).sum())
     return places if worse <= _FREEDOM * (len(places) - 1) * math.log(len(fit)) * sigma**2 else None
-
-
-def _errors(alignment: Alignment, image1: int, image2: int, points1: FloatArray, points2: FloatArray) -> FloatArray:
-    """What the alignment leaves of matches (M, 2), pixels; 0 where a lens cannot see them."""
-    return np.nan_to_num(alignment.transfer(image1, image2, points1) - points2)
