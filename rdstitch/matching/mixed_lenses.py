@@ -99,7 +99,7 @@ def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> d
     sizes = []
     for second in (False, True):
         own = [pair for pair in linked if mixed.second[[pair.image1, pair.image2]].tolist() == [second] * 2]
-        members = {image for pair in own for image in (pair.image1, pair.image2)}
+        members = {image for pair in own for image in pair.images}
         sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in own)))
     kept = sizes[1] > sizes[0]
     there, here = mixed.distortion[not kept], mixed.distortion[kept]

@@ -135,7 +135,7 @@ class Aligner:
         errors = [np.zeros(0)]
         for pair, more in zip(pairs, ground, strict=True):
             new = more.relation.inliers & ~pair.relation.inliers
-            if (pair.image1, pair.image2) in alignment.support and new.any():
+            if pair.images in alignment.support and new.any():
                 errors.append(pair.errors(alignment.transfer)[new])
         every = np.concatenate(errors)
         return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
@@ -166,11 +166,11 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
     """Register images that the poses put beside each other, and the candidate pairs of images without a pose."""
     for _ in range(_CLOSURE_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
-        tried = {(pair.image1, pair.image2) for pair in pairs}
+        tried = {pair.images for pair in pairs}
         loop_closures = neighbours(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
         unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
         found = pairing.estimate(sorted(unaligned.union(loop_closures)), distortion=alignment.distortion)
-        pairs = tuple(sorted([*pairs, *found], key=lambda pair: (pair.image1, pair.image2)))
+        pairs = tuple(sorted([*pairs, *found], key=lambda pair: pair.images))
         if not any(pair.relation for pair in found):
             return replace(aligned, pairs=pairs)
         aligned = aligner.align(pairs)

@@ -58,7 +58,7 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
     number = np.cumsum(alignment.used) - 1
     pairs, shifts, spread, left = [], [], [], []
     for pair in registration.pairs:
-        if (pair.image1, pair.image2) not in support:
+        if pair.images not in support:
             continue
         link = pair.link()
         moved = link.points1 - link.points2
