@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.photometric import Exposure, full_scale
+from rdstitch.compositing.sampling import border_weight
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean
@@ -119,7 +120,9 @@ def find_seams(survey: Survey, exposure: Exposure, graphcut: bool, progress: Sha
             x0, y0, x1, y1 = tile.box
             cut = np.s_[y0:y1, x0:x1]
             geometry = locate(survey.warps[index], tile.box)
-            weight = tile.weight(geometry)
+            weight = border_weight(geometry)
+            if tile.opacity is not None:
+                weight *= tile.opacity
             if composite is None:
                 won = tile.inside & (weight > weights[cut])
             else:
