@@ -21,6 +21,7 @@ from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
 from rdstitch.messages import Message, ignored
 from rdstitch.outputs import IMAGE_SUFFIXES, check_outputs
+from rdstitch.pipeline.layers import make_folder
 from rdstitch.progress import Progress, silent
 
 Framing = Literal["same", "all", "valid"]
@@ -134,10 +135,7 @@ def _undistorted(source: Source, view: Framing) -> Composite:
 def _existing(folder: Path) -> Iterator[None]:
     """A folder that exists inside the block, and afterwards if anything was written into it."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
+    make_folder(folder)
     try:
         yield
     except BaseException:
