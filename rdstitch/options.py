@@ -15,11 +15,13 @@ from rdstitch.features import FeatureOptions
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.local_alignment import MAX_CELLS, LocalAlignmentMode
 from rdstitch.machine import processor_count
-from rdstitch.matching.options import MatchingOptions, PairOptions
-from rdstitch.robust import SOLVERS, SolverName
+from rdstitch.robust import SOLVERS, EstimationOptions, SolverName
 
 LensName = Literal["auto", "division", "division-center", "division2", "division3"]
 ModelName = Literal["auto", "rigid", "similarity", "tilting", "pose", "homography", "rotation"]
+
+_SELECT_MODEL_BELOW = 50
+"""Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
 
 _MAX_WORKERS = 1024  # threads; more than any machine has cores for
 _MAX_THRESHOLD = 1e4  # pixels; more than an image is wide
@@ -212,12 +214,17 @@ class StitchOptions:
         return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
 
     @property
-    def matching(self) -> MatchingOptions:
-        """What concerns matching and the estimation of pairs."""
-        pair = PairOptions(
-            self.solver, self.known_distortion, self.threshold, self.confidence, self.max_iterations, self.seed
+    def estimation(self) -> EstimationOptions:
+        """How pairs are estimated."""
+        return EstimationOptions(
+            self.solver,
+            self.known_distortion,
+            self.threshold,
+            self.confidence,
+            self.max_iterations,
+            self.seed,
+            _SELECT_MODEL_BELOW,
         )
-        return MatchingOptions(pair, self.ratio, self.lightglue_model, self.threads)
 
     def executor(self, images: int) -> Executor:
         """Where the tasks of a set of so many images are computed; to be used in a ``with`` block."""

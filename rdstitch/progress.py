@@ -11,6 +11,14 @@ def silent(stage: str, done: int, total: int) -> None:
     """A progress that nobody watches."""
 
 
+ShareProgress = Callable[[float], None]
+"""Called with the share of the work done, 0 to 1."""
+
+
+def unheard(share: float) -> None:
+    """A progress of one stage that nobody watches."""
+
+
 class StageTimer:
     """A progress that passes everything on, and records how long each stage took."""
 

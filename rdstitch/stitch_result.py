@@ -1,6 +1,6 @@
 """What stitching gives: the image, in memory or in a file, and everything that was estimated for it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,40 @@ from rdstitch.registration import Registration, Verdict
 _PREVIEW = 800  # pixels of the longer side
 
 
+@dataclass(frozen=True, repr=False, kw_only=True)
 class OutputImage:
-    """Base of results that have an image."""
+    """An image that was put together, or the plan of doing so; base of all results that have one.
+
+    Attributes
+    ----------
+    canvas : Canvas
+        Where the images lie in the output.
+    output : Path or None
+        File that the image was written to.
+    composite : Composite or None
+        The image itself; None where it went to a file, or was only planned.
+    plan : CompositePlan or None
+        Of a dry run.
+    fingerprint : Fingerprint or None
+        Size and digest of the file.
+    georeference : Georeference or None
+        Where the output lies on the Earth.
+    not_georeferenced : str
+        Why that is not known; empty where it is.
+    """
 
     canvas: Canvas
-    output: Path | None
-    composite: Composite | None
-    plan: CompositePlan | None
+    output: Path | None = None
+    composite: Composite | None = None
+    plan: CompositePlan | None = None
+    fingerprint: Fingerprint | None = None
+    georeference: Georeference | None = None
+    not_georeferenced: str = "not tried"
+
+    @property
+    def output_fields(self) -> dict[str, Any]:
+        """All of these by name, for a result that has the same image."""
+        return {each.name: getattr(self, each.name) for each in fields(OutputImage)}
 
     @property
     def image_order(self) -> ChannelOrder:
@@ -77,43 +104,22 @@ class OutputImage:
         return encode_preview(pixels, _PREVIEW, alpha, "PNG")
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class StitchResult(OutputImage):
-    """A stitched image and everything that was estimated for it.
+    """A stitched image and everything that was estimated for it; also as :class:`OutputImage` has it.
 
     Attributes
     ----------
     registration : Registration
         With all that there is to know of the result in its ``messages``.
-    canvas : Canvas
-        Where the images lie in the output.
     options : StitchOptions
-    output : Path or None
-        File that the image was written to.
-    composite : Composite or None
-        The image itself; None where it went to a file, or was only planned.
-    plan : CompositePlan or None
-        Of a dry run.
-    fingerprint : Fingerprint or None
-        Size and digest of the file.
     local_alignment : LocalAlignment
         Displacement fields of the images that are used, in their order.
-    georeference : Georeference or None
-        Where the output lies on the Earth.
-    not_georeferenced : str
-        Why that is not known; empty where it is.
     """
 
     registration: Registration
-    canvas: Canvas
     options: StitchOptions
-    output: Path | None = None
-    composite: Composite | None = None
-    plan: CompositePlan | None = None
-    fingerprint: Fingerprint | None = None
     local_alignment: LocalAlignment = field(default_factory=partial(no_local_alignment, "not tried"))
-    georeference: Georeference | None = None
-    not_georeferenced: str = "not tried"
 
     @property
     def ok(self) -> bool:

@@ -7,12 +7,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from examples.judging.comparison import plane_under
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import Canvas, PlacedImage, place_images, plan_canvas
+from rdstitch.compositing import Canvas, PlacedImage, plan_canvas
+from rdstitch.compositing.placed_image import Displacement, ImageLoader
 from rdstitch.io import DecodedImage, Metadata
 from rdstitch.synthetic.layouts import grid_poses
 from rdstitch.synthetic.rendering import Photometry, sequence_over
@@ -93,3 +94,19 @@ def inner(alpha: NDArray[np.uint8], margin: int = 4) -> NDArray[np.bool_]:
     """Covered px at least ``margin`` px from what is not."""
     kernel = np.ones((2 * margin + 1,) * 2, np.uint8)
     return cv2.erode((alpha > 0).astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0
+
+
+def place_images(
+    loaders: Sequence[ImageLoader],
+    cameras: Sequence[Camera],
+    homographies: ArrayLike,
+    *,
+    exposure: Sequence[float | None] | None = None,
+    displacement: Sequence[Displacement | None] | None = None,
+    paths: Sequence[str] | None = None,
+) -> list[PlacedImage]:
+    """Images from lists of what is known of each; see :class:`PlacedImage`."""
+    count, matrices = len(loaders), np.asarray(homographies, dtype=np.float64)
+    nothing = [None] * count
+    more = (nothing, exposure or nothing, displacement or nothing, paths or [""] * count)
+    return [PlacedImage(*known) for known in zip(loaders, cameras, matrices, *more, strict=True)]

@@ -13,14 +13,14 @@ from rdstitch.matching.links import Link
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import to_plane
-from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
+from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
 
 LENS = Camera((640, 480), -0.2, focal=520.0)
 _MATCHES = 300
 _NOISE = 0.3
 """Pixels, of each coordinate of a keypoint."""
-_OPTIONS = EstimationOptions("auto", None, RansacOptions(3.0, 0.999, 10000, 0), 50)
+_OPTIONS = EstimationOptions(select_below=50)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def strip(kind: str, height: float, seed: int, images: int) -> Strip:
         for (i, j), found, relation in zip(pairs, matched, relations, strict=True)
         if relation
     ]
-    links = [pair.link() for pair in over_rough_ground(registered, _OPTIONS.ransac.threshold)]
+    links = [pair.link() for pair in over_rough_ground(registered, _OPTIONS.threshold)]
     return Strip(truth, lens.distortion, [Camera(lens.image_size).with_focal() for _ in range(images)], links)
 
 

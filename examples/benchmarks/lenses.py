@@ -87,7 +87,7 @@ def measure(name: str, seed: int, chosen: LensName, files: list[Path], sequence:
     sources, _ = read_sources(files, camera=None, focal=None, distortion=None, skip_bad=False)
     with open_executor(1, len(sources)) as executor:
         options = StitchOptions(lens=chosen, workers=1)
-        found = register(sources, options, executor, skip_bad=False).alignment
+        found = register(sources, options, executor).alignment
     error = _error(sequence, found)
     print(
         f"{name:20s} {seed:3d} {chosen:9s} {found.lens:16s} λ {found.distortion:+.4f} ± "

@@ -1,6 +1,6 @@
 """Why images found no place in an alignment, with a remedy."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -12,8 +12,13 @@ _FEW = 1.0 / 3.0
 have as many as are looked for at the most."""
 
 
-def explain_unaligned(alignment: Alignment, paths: Sequence[str], keypoints: Sequence[int]) -> list[Message]:
-    """One message for each image that the alignment does not use, by the paths of all and their numbers of features."""
+def explain_unaligned(
+    alignment: Alignment, paths: Sequence[str], keypoints: Sequence[int], known: Mapping[int, str]
+) -> list[Message]:
+    """One message for each image that the alignment does not use, by the paths of all and their numbers of features.
+
+    ``known`` are the reasons of those of which it is known beforehand.
+    """
     contradicting: dict[int, list[int]] = {}
     for fit in alignment.links:
         if not fit.used and fit.reason == CONTRADICTS:
@@ -25,7 +30,9 @@ def explain_unaligned(alignment: Alignment, paths: Sequence[str], keypoints: Seq
     for image, path in enumerate(paths):
         if alignment.used[image]:
             continue
-        if image in block_of:
+        if image in known:
+            reason = known[image]
+        elif image in block_of:
             number, size = block_of[image], len(blocks[block_of[image]])
             reason = (
                 f"in block {number + 1} of {len(blocks)}, whose {size} images overlap with none of the others; "

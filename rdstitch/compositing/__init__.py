@@ -1,10 +1,10 @@
 """From registered images to one image: canvas, resampling, exposure, seams, blending."""
 
 from rdstitch.compositing.canvas import Canvas, plan_canvas
-from rdstitch.compositing.compositor import Composite, FileComposite, OutputFile, compose, compose_to_file
+from rdstitch.compositing.compositor import Composite, FileComposite, compose, compose_to_file
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.panorama_canvas import plan_panorama
-from rdstitch.compositing.placed_image import PlacedImage, place_images
+from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 
 __all__ = [
@@ -13,11 +13,9 @@ __all__ = [
     "CompositeOptions",
     "CompositePlan",
     "FileComposite",
-    "OutputFile",
     "PlacedImage",
     "compose",
     "compose_to_file",
-    "place_images",
     "plan_canvas",
     "plan_composite",
     "plan_panorama",

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.cache import Cache
-from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
+from rdstitch.compositing.tiles import OutputStrip, TiledOutput
 from rdstitch.opencv_state import one_opencv_thread
+from rdstitch.progress import ShareProgress, unheard
 from rdstitch.stored import Stored
 
 
@@ -37,9 +38,7 @@ BlockRunner = Callable[[Iterable[Block]], Generator[list[Stored[OutputStrip]]]]
 """Computes blocks elsewhere: their strips, in the order of the blocks, which are taken as they are needed."""
 
 
-def strips_of_blocks(
-    whole: TiledOutput, run: BlockRunner, progress: ShareProgress | None = None
-) -> Generator[OutputStrip]:
+def strips_of_blocks(whole: TiledOutput, run: BlockRunner, progress: ShareProgress = unheard) -> Generator[OutputStrip]:
     """The strips of an output (h, W, ...) that is computed in blocks; the same, bit for bit, as here."""
     (x0, y0, x1, y1), (width, height) = whole.box, _block_size(whole)
     lefts = range(x0, x1, width)
@@ -54,9 +53,8 @@ def strips_of_blocks(
             row = []
             for left in lefts:
                 row.append(next(done))
-                if progress is not None:
-                    below = (min(top + height, y1) - top) * (min(left + width, x1) - x0)
-                    progress(((top - y0) * (x1 - x0) + below) / ((x1 - x0) * (y1 - y0)))
+                below = (min(top + height, y1) - top) * (min(left + width, x1) - x0)
+                progress(((top - y0) * (x1 - x0) + below) / ((x1 - x0) * (y1 - y0)))
             for parts in zip(*row, strict=True):
                 strips = [part.load() for part in parts]
                 for part in parts:

@@ -17,13 +17,13 @@ from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
-from rdstitch.compositing.tiles import ShareProgress
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, check_memory, write_strips
 from rdstitch.messages import Message
 from rdstitch.outputs import Fingerprint, Outputs
+from rdstitch.progress import ShareProgress, unheard
 
 
 @dataclass(frozen=True, repr=False)
@@ -58,37 +58,18 @@ class Composite:
 class FileComposite:
     """A stitched image that went to a file; attributes as of :class:`Composite`."""
 
-    path: Path
     canvas: Canvas
-    exposure: Exposure
     fingerprint: Fingerprint  # size and digest of the file
-    messages: tuple[Message, ...] = ()
-    seams: SeamMap | None = None  # which image owns what of the canvas before cropping; None without seams
-    origin: tuple[int, int] = (0, 0)  # where the output begins in that canvas, pixels
-
-    def __repr__(self) -> str:
-        return f"<FileComposite {self.path}: {self.canvas.size[0]} x {self.canvas.size[1]} pixels>"
-
-
-@dataclass(frozen=True)
-class OutputFile:
-    """A file to compose into."""
-
-    # ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
-    # (held in memory whole)
-    path: str | Path
-    metadata: Metadata | None = None  # colour profile, EXIF and resolution to keep
-    # gives further tags of a TIFF file for the canvas after cropping
-    extra_tags: Callable[[Canvas], Iterable[ExtraTag]] | None = None
-    # where the file is staged, to be published with what belongs to it; without, it replaces what is there
-    outputs: Outputs | None = None
+    messages: tuple[Message, ...]
+    seams: SeamMap | None  # which image owns what of the canvas before cropping; None without seams
+    origin: tuple[int, int]  # where the output begins in that canvas, pixels
 
 
 def compose(
     images: Sequence[PlacedImage],
     canvas: Canvas,
     options: CompositeOptions | None = None,
-    progress: ShareProgress | None = None,
+    progress: ShareProgress = unheard,
     elsewhere: BlockRunner | None = None,
 ) -> Composite:
     """Put images together on a canvas, in memory.
@@ -116,19 +97,32 @@ def compose(
 
 
 def compose_to_file(
-    file: OutputFile,
+    path: str | Path,
     images: Sequence[PlacedImage],
     canvas: Canvas,
     options: CompositeOptions | None = None,
-    progress: ShareProgress | None = None,
+    progress: ShareProgress = unheard,
     elsewhere: BlockRunner | None = None,
+    *,
+    metadata: Metadata | None = None,
+    extra_tags: Callable[[Canvas], Iterable[ExtraTag]] = lambda canvas: (),
+    outputs: Outputs | None = None,
 ) -> FileComposite:
     """Put images together straight into a file, whatever its size: memory is that of a strip of tiles.
 
     Parameters
     ----------
+    path : path
+        ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
+        (held in memory whole).
     images, canvas, options, progress, elsewhere
         As for :func:`compose`.
+    metadata : Metadata, optional
+        Colour profile, EXIF and resolution to keep.
+    extra_tags : callable
+        Gives further tags of a TIFF file for the canvas after cropping.
+    outputs : Outputs, optional
+        Where the file is staged, to be published with what belongs to it; without, it replaces what is there.
     """
     with prepare_composite(images, canvas, options, progress, elsewhere) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
@@ -137,22 +131,13 @@ def compose_to_file(
             renderer.channels,
             renderer.dtype,
             transparent=True,
-            metadata=replace(file.metadata or Metadata(size), xmp=photo_sphere_xmp(prepared.canvas)),
+            metadata=replace(metadata or Metadata(size), xmp=photo_sphere_xmp(prepared.canvas)),
             quality=renderer.options.quality,
             background=renderer.options.background,
         )
-        check_format(file.path, layout)
-        check_memory(file.path, size, renderer.options.max_memory)
-        tags = () if file.extra_tags is None else file.extra_tags(prepared.canvas)
+        check_format(path, layout)
+        check_memory(path, size, renderer.options.max_memory)
         # Nothing goes on behind a writer that fails.
         with closing(prepared.strips(progress)) as strips:
-            written = write_strips(file.path, layout, strips, tags, outputs=file.outputs)
-    return FileComposite(
-        Path(file.path),
-        prepared.canvas,
-        renderer.exposure,
-        written,
-        prepared.messages,
-        renderer.seams,
-        prepared.tiles.box[:2],
-    )
+            written = write_strips(path, layout, strips, extra_tags(prepared.canvas), outputs=outputs)
+    return FileComposite(prepared.canvas, written, prepared.messages, renderer.seams, prepared.tiles.box[:2])

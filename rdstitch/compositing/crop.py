@@ -1,42 +1,25 @@
 """Cropping: the largest upright rectangle of the canvas that images cover without a hole."""
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.placed_image import PlacedImage
+from rdstitch.compositing.boxes import Box, cut
 from rdstitch.compositing.survey import Survey
-from rdstitch.compositing.warp import locate, plan_warps
 
-# Coverage is computed with this many pixels along the longer side of the canvas.
+# Rectangles are sought with at most this many pixels along the longer side of the canvas.
 _RESOLUTION = 1500
 # A rectangle that keeps less of what is covered is not worth cropping to.
 _MIN_KEPT = 0.25
 
 
-def coverage_map(
-    images: Sequence[PlacedImage], canvas: Canvas, survey: Survey | None = None
-) -> tuple[NDArray[np.bool_], int]:
-    """Which pixels of a reduced canvas are covered, and the reduction; with the masks of a survey if given."""
-    if survey is not None:
-        width, height = survey.canvas.size
-        covered = np.zeros((height, width), dtype=np.bool_)
-        for tile in survey.tiles:
-            if tile is not None:
-                x0, y0, x1, y1 = tile.box
-                covered[y0:y1, x0:x1] |= tile.inside
-        return covered, survey.factor
-    factor = max(1, -(-max(canvas.size) // _RESOLUTION))
-    small = canvas.reduced(factor)
-    covered = np.zeros(small.size[::-1], dtype=np.bool_)
-    for warp in plan_warps(images, small):
-        x0, y0, x1, y1 = warp.box
-        covered[y0:y1, x0:x1] |= locate(warp, warp.box).inside
-    return covered, factor
+def covered_pixels(survey: Survey) -> NDArray[np.bool_]:
+    """Which pixels of the reduced canvas images cover."""
+    covered = np.zeros(survey.canvas.size[::-1], dtype=np.bool_)
+    for tile in survey.tiles:
+        if tile is not None:
+            cut(covered, (0, 0, *survey.canvas.size), tile.box)[...] |= tile.inside
+    return covered
 
 
 def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> tuple[Box | None, str]:
@@ -45,7 +28,7 @@ def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> 
     Parameters
     ----------
     covered : ndarray of shape (h, w), bool
-        From :func:`coverage_map`.
+        From :func:`covered_pixels`.
     factor : int
         Canvas pixels per pixel of ``covered``.
     size : (int, int)

@@ -23,14 +23,6 @@ _CYLINDER_HEIGHT = math.radians(70.0)
 # A full turn is a multiple of this many pixels, or of less than 1/256 of it, so that both ends of a canvas have the
 # same lattices, reduced pixels and bands.
 _UNIT, _UNITS_PER_TURN = 32, 256
-_PROPERTIES = (
-    "FullPanoWidthPixels",
-    "FullPanoHeightPixels",
-    "CroppedAreaLeftPixels",
-    "CroppedAreaTopPixels",
-    "CroppedAreaImageWidthPixels",
-    "CroppedAreaImageHeightPixels",
-)
 
 
 @dataclass(frozen=True)
@@ -296,7 +288,14 @@ def photo_sphere_xmp(canvas: Canvas) -> bytes:
     width, height = canvas.size
     left = 0 if canvas.period is not None else min(max(round(full_width / 2 - origin[0]), 0), full_width - width)
     top = min(max(round(full_height / 2 - origin[1]), 0), full_height - height)
-    numbers = dict(zip(_PROPERTIES, (full_width, full_height, left, top, width, height), strict=True))
+    numbers = {
+        "FullPanoWidthPixels": full_width,
+        "FullPanoHeightPixels": full_height,
+        "CroppedAreaLeftPixels": left,
+        "CroppedAreaTopPixels": top,
+        "CroppedAreaImageWidthPixels": width,
+        "CroppedAreaImageHeightPixels": height,
+    }
     attributes = " ".join(f'GPano:{name}="{number}"' for name, number in numbers.items())
     return (
         '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>'

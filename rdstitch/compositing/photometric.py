@@ -72,11 +72,9 @@ class Exposure:
         if not (self.vignetting.any() or self.fields.size):
             return pixels if (gain == 1).all() else self._apply(pixels, [gain], [self._compression(gain)])
         nodes = self._smooth_nodes(index, geometry) * gain
-        factors, rates = (
-            [interpolated(values[..., k], geometry.box, _LATTICE) for k in range(len(gain))] if values.any() else []
-            for values in (nodes, self._compression(nodes))
-        )
-        return self._apply(pixels, factors, rates)
+        compression = self._compression(nodes)
+        rates = _planes(compression, geometry) if compression.any() else []
+        return self._apply(pixels, _planes(nodes, geometry), rates)
 
     def factors(self, index: int, geometry: Geometry) -> Float32Array:
         """What samples of image ``index`` are multiplied by, (h, w, C), before highlights are compressed."""
@@ -84,7 +82,7 @@ class Exposure:
         if not (self.vignetting.any() or self.fields.size):
             return np.broadcast_to(gain, (*geometry.shape, len(gain)))
         nodes = self._smooth_nodes(index, geometry) * gain
-        return _joined([interpolated(nodes[..., k], geometry.box, _LATTICE) for k in range(len(gain))])
+        return _joined(_planes(nodes, geometry))
 
     def _apply(self, pixels: NDArray[Any], factors: list[Any], rates: list[Any]) -> NDArray[Any]:
         """``q (v + b) - b``, compressed above the knee; one array for all channels, or one plane a channel."""
@@ -154,6 +152,11 @@ def squared_radius(camera: Camera, points: FloatArray) -> FloatArray:
 def bilinear_weights(camera: Camera, points: FloatArray, side: int) -> tuple[NDArray[np.intp], FloatArray]:
     """Interpolation on a grid of ``side`` x ``side`` nodes over an image: four nodes (..., 4) and their shares."""
     return nodes_around((np.asarray(points) + 0.5) / camera.image_size * (side - 1), (side, side))
+
+
+def _planes(nodes: Float32Array, geometry: Geometry) -> list[Float32Array]:
+    """Values at nodes around a box (m, n, C), interpolated to its pixels, a plane (h, w) a channel."""
+    return [interpolated(nodes[..., k], geometry.box, _LATTICE) for k in range(nodes.shape[2])]
 
 
 def _joined(planes: list[Float32Array]) -> Float32Array:

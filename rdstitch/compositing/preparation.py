@@ -9,7 +9,7 @@ from rdstitch.compositing.blender import margin
 from rdstitch.compositing.blocks import BlockRunner, strips_of_blocks
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.crop import coverage_map, crop_box, crop_rows
+from rdstitch.compositing.crop import covered_pixels, crop_box, crop_rows
 from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.options import CompositeOptions
@@ -20,11 +20,12 @@ from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
 from rdstitch.compositing.source_images import ImageReader
 from rdstitch.compositing.survey import survey_factor, survey_images
-from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
+from rdstitch.compositing.tiles import OutputStrip, TiledOutput
 from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.messages import Message
 from rdstitch.process_memory import return_freed_memory
+from rdstitch.progress import ShareProgress, unheard
 
 _PREPARATION = 0.25
 # Images that the survey reads at one time: what the tiles need is not there yet.
@@ -41,7 +42,7 @@ class Prepared:
     messages: tuple[Message, ...]
     elsewhere: BlockRunner | None = None  # computes the pixels in blocks, see :mod:`rdstitch.compositing.blocks`
 
-    def strips(self, progress: ShareProgress | None = None) -> Generator[OutputStrip]:
+    def strips(self, progress: ShareProgress = unheard) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
         progress = _part_of(progress, _PREPARATION, 1.0)
         if self.elsewhere is None:
@@ -54,7 +55,7 @@ def prepare_composite(
     images: Sequence[PlacedImage],
     canvas: Canvas,
     options: CompositeOptions | None = None,
-    progress: ShareProgress | None = None,
+    progress: ShareProgress = unheard,
     elsewhere: BlockRunner | None = None,
 ) -> Iterator[Prepared]:
     """Decide on exposure, seams and cropping, from a small version of each image; see :func:`compose`.
@@ -88,30 +89,30 @@ def _decided(
     images: Sequence[PlacedImage],
     canvas: Canvas,
     plan: CompositePlan,
-    progress: ShareProgress | None,
+    progress: ShareProgress,
 ) -> Prepared:
     """Decide for a renderer that has neither exposure nor seams yet."""
     options, warps, exposure = renderer.options, renderer.warps, renderer.exposure
     seams = survey = None
-    if len(images) > 1 and (options.exposure != "none" or options.seam != "none"):
+    joined = len(images) > 1 and (options.exposure != "none" or options.seam != "none")
+    if joined or options.crop == "auto":
         surveyed = _part_of(progress, 0.0, 0.7)
         survey = survey_images(reader, images, canvas, min(plan.workers, _READERS), surveyed)
         # The first tiles need most of them, however the seams run.
         topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
         renderer.images.prefetch(sorted(topmost, key=lambda index: warps[index].box))
-        if options.exposure != "none":
+        if joined and options.exposure != "none":
             exposure = estimate_exposure(survey, images, options.exposure)
-        if options.seam != "none":
+        if joined and options.seam != "none":
             seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
             if canvas.period is not None:
                 seams = seams.repeated(round(canvas.period))
             if options.blend == "feather":
                 seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
     box, note = _unwidened(canvas), ""
-    if options.crop == "auto":
-        covered, factor = coverage_map(images, canvas, survey)
+    if survey is not None and options.crop == "auto":
         find = crop_box if box is None else partial(crop_rows, whole=box)
-        found, note = find(covered, factor, canvas.size)
+        found, note = find(covered_pixels(survey), survey.factor, canvas.size)
         box = found or box
     cropped = canvas if box is None else canvas.cropped(box)
     renderer = replace(renderer, exposure=exposure, seams=seams)
@@ -137,8 +138,6 @@ def _unwidened(canvas: Canvas) -> Box | None:
     return left, 0, left + turn, height
 
 
-def _part_of(progress: ShareProgress | None, start: float, stop: float) -> ShareProgress | None:
+def _part_of(progress: ShareProgress, start: float, stop: float) -> ShareProgress:
     """A progress that fills a part of another."""
-    if progress is None:
-        return None
     return lambda share: progress(start + (stop - start) * share)

@@ -209,11 +209,7 @@ class Renderer:
 
     def _placed(self, index: int, part: Box, box: Box) -> Geometry:
         """The geometry of an image on its part of a box, with a lattice for all that blending can need of it there."""
-        return locate(self.warps[index], self._support_within(part, box)).on(part)
-
-    def _support_within(self, part: Box, box: Box) -> Box:
-        """What blending can need around a part of a box."""
-        return (intersection(self._blend_support(part), box) or part) if self.options.blend == "multiband" else part
+        return locate(self.warps[index], intersection(self.support(part), box) or part).on(part)
 
     def _opacity(self, index: int, geometry: Geometry) -> Float32Array | None:
         """Opacity of an image that has a mask."""

@@ -6,7 +6,7 @@ cut), so that what moved or stands out of the plane is taken from one of them wh
 other, so that memory is that of one label per pixel of the reduced canvas.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.photometric import Exposure, full_scale
+from rdstitch.compositing.sampling import border_weight
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean
+from rdstitch.progress import ShareProgress, unheard
 
 NO_OWNER = -1
 
@@ -96,9 +98,7 @@ class SeamMap:
         return self.labels[np.ix_(rows, columns)]
 
 
-def find_seams(
-    survey: Survey, exposure: Exposure, graphcut: bool, progress: Callable[[float], None] | None = None
-) -> SeamMap:
+def find_seams(survey: Survey, exposure: Exposure, graphcut: bool, progress: ShareProgress = unheard) -> SeamMap:
     """Owner of every pixel.
 
     Parameters
@@ -120,7 +120,9 @@ def find_seams(
             x0, y0, x1, y1 = tile.box
             cut = np.s_[y0:y1, x0:x1]
             geometry = locate(survey.warps[index], tile.box)
-            weight = tile.weight(geometry)
+            weight = border_weight(geometry)
+            if tile.opacity is not None:
+                weight *= tile.opacity
             if composite is None:
                 won = tile.inside & (weight > weights[cut])
             else:
@@ -131,8 +133,7 @@ def find_seams(
                 composite[cut][won] = pixels[won]
             labels[cut][won] = index
             weights[cut][won] = weight[won]
-        if progress is not None:
-            progress((index + 1) / len(survey.tiles))
+        progress((index + 1) / len(survey.tiles))
     return SeamMap(labels, survey.factor)
 
 

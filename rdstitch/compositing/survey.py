@@ -1,6 +1,6 @@
 """All images on a reduced canvas: what exposure and seams are decided on."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection, overlapping_pairs
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.placed_image import PlacedImage
-from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
+from rdstitch.compositing.sampling import sample, sample_opacity
 from rdstitch.compositing.source_images import ImageReader
-from rdstitch.compositing.warp import Geometry, Warp, locate, plan_warps
+from rdstitch.compositing.warp import Warp, locate, plan_warps
+from rdstitch.progress import ShareProgress, unheard
 
 _MAX_IMAGE = 600_000
 _MAX_TOTAL = 16_000_000
@@ -28,14 +29,6 @@ class SurveyTile:
     pixels: NDArray[Any]  # (h, w, C): in the image's sample type
     inside: NDArray[np.bool_]  # (h, w), bool
     opacity: Float32Array | None = None  # (h, w), float32: of an image with a mask
-
-    def weight(self, geometry: Geometry) -> Float32Array:
-        """Falls from 1 at the image's centre to 0 at its border, (h, w); not kept, since all would be half a survey.
-
-        ``geometry`` is where the box comes from.
-        """
-        weight = border_weight(geometry)
-        return weight if self.opacity is None else weight * self.opacity
 
 
 @dataclass(frozen=True)
@@ -75,7 +68,7 @@ def survey_images(
     images: Sequence[PlacedImage],
     canvas: Canvas,
     workers: int = 1,
-    progress: Callable[[float], None] | None = None,
+    progress: ShareProgress = unheard,
 ) -> Survey:
     """Read every image once, ``workers`` at a time, and lay it, small, on the reduced canvas."""
     factor = survey_factor(canvas)
@@ -85,8 +78,7 @@ def survey_images(
     with ThreadPoolExecutor(workers) as pool:
         for tile in pool.map(partial(_survey_tile, reader), range(len(warps)), warps):
             tiles.append(tile)
-            if progress is not None:
-                progress(len(tiles) / len(warps))
+            progress(len(tiles) / len(warps))
     return Survey(factor, small, warps, tuple(tiles))
 
 

@@ -39,7 +39,6 @@ class _Share:
 class CompositeTables:
     """Everything about a composite but the samples of its images."""
 
-    canvas: Canvas
     alpha: NDArray[np.uint8]  # (H, W), uint8: 255 where an image lies, else 0
     _sizes: tuple[tuple[int, int], ...]
     _shrinks: tuple[float, ...]
@@ -72,7 +71,7 @@ class CompositeTables:
             shrinks = tuple(warp.shrink for warp in renderer.warps)
             kernel = INTERPOLATION[options.interpolation]
             sizes = tuple(image.camera.image_size for image in images)
-            return cls(prepared.canvas, covered, sizes, shrinks, tuple(shares), offset, kernel)
+            return cls(covered, sizes, shrinks, tuple(shares), offset, kernel)
 
     def compose(self, images: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Put a set of images together.

@@ -15,12 +15,10 @@ from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.render import Renderer
 from rdstitch.io.layout import STRIP_ROWS
 from rdstitch.opencv_state import one_opencv_thread
+from rdstitch.progress import ShareProgress, unheard
 
 OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
 """Samples (h, W, C) and alpha (h, W)."""
-
-ShareProgress = Callable[[float], None]
-"""Called with the share of the work done, 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,7 @@ class TiledOutput:
         renderer, images = self.renderer.part(box, self.workers)
         return TiledOutput(renderer, box, self.tile_size, 1), images
 
-    def strips(self, progress: ShareProgress | None = None) -> Generator[OutputStrip]:
+    def strips(self, progress: ShareProgress = unheard) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
         if self.workers == 1:
             yield from self._strips(map, progress)
@@ -65,7 +63,7 @@ class TiledOutput:
         with one_opencv_thread(), ThreadPoolExecutor(self.workers) as pool:
             yield from self._strips(pool.map, progress)
 
-    def _strips(self, run: Callable[..., Iterator[Any]], progress: ShareProgress | None) -> Iterator[OutputStrip]:
+    def _strips(self, run: Callable[..., Iterator[Any]], progress: ShareProgress) -> Iterator[OutputStrip]:
         """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
         (width, height), side = self.size, self.tile_size
         tops = iter(range(0, height, side))
@@ -75,9 +73,8 @@ class TiledOutput:
         while under_way:
             (samples, alpha), tiles = under_way.popleft()
             for box in tiles:
-                if progress is not None:
-                    done += (box[2] - box[0]) * (box[3] - box[1])
-                    progress(done / (width * height))
+                done += (box[2] - box[0]) * (box[3] - box[1])
+                progress(done / (width * height))
             # Computed while this strip is written.
             under_way.extend(self._start(top, run) for top in islice(tops, 1))
             for start in range(0, len(samples), STRIP_ROWS):

@@ -122,17 +122,11 @@ class Warp:
     def source_points(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Measured pixels (..., 2) of the image at canvas pixels ``x``, ``y``; NaN where there are none."""
         m = self.from_canvas
-        if self.surface is None:
-            z = m[2, 0] * x + m[2, 1] * y + m[2, 2]
-            z = np.where(z > 0.0, z, np.nan)
-            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / z
-            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / z
-        else:
-            dx, dy, dz = self.surface.directions(x, y)
-            z = m[2, 0] * dx + m[2, 1] * dy + m[2, 2] * dz
-            z = np.where(z > 0.0, z, np.nan)
-            u = (m[0, 0] * dx + m[0, 1] * dy + m[0, 2] * dz) / z
-            v = (m[1, 0] * dx + m[1, 1] * dy + m[1, 2] * dz) / z
+        dx, dy, dz = (x, y, 1.0) if self.surface is None else self.surface.directions(x, y)
+        z = m[2, 0] * dx + m[2, 1] * dy + m[2, 2] * dz
+        z = np.where(z > 0.0, z, np.nan)
+        u = (m[0, 0] * dx + m[0, 1] * dy + m[0, 2] * dz) / z
+        v = (m[1, 0] * dx + m[1, 1] * dy + m[1, 2] * dz) / z
         points = self.camera.distort(self.camera.denormalize(np.stack([u, v], axis=-1)))
         return points if self.displacement is None else points + self.displacement(points)
 

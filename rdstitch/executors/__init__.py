@@ -6,7 +6,7 @@ package with small arguments and results; what is large lies in the cache of the
 
 import sys
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
@@ -14,7 +14,7 @@ from typing import TypeVar
 from rdstitch.executors.dask_cluster import LOCAL, DaskExecutor
 from rdstitch.executors.processes import ProcessExecutor
 
-__all__ = ["LOCAL", "DaskExecutor", "ProcessExecutor", "in_order", "open_executor"]
+__all__ = ["LOCAL", "DaskExecutor", "ProcessExecutor", "batches", "in_order", "open_executor"]
 
 _PROCESSES_FROM = 60
 """Images from which on it pays to start worker processes: each takes a second to begin with, and an image a third of
@@ -31,6 +31,15 @@ def open_executor(workers: int, images: int, *, scheduler: str | None = None, st
     if workers > 1 and images >= _PROCESSES_FROM and sys.executable:
         return ProcessExecutor(workers)
     return ThreadPoolExecutor(workers)
+
+
+Item = TypeVar("Item")
+
+
+def batches(items: Sequence[Item], most: int, fewest: int = 1) -> Iterator[Sequence[Item]]:
+    """The items in parts of at most ``most``, ``fewest`` parts at least, so that a few keep several workers busy."""
+    size = max(min(most, -(-len(items) // fewest)), 1)
+    return (items[start : start + size] for start in range(0, len(items), size))
 
 
 Task = TypeVar("Task")

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,27 +20,8 @@ _MIN_KEYPOINT_SHARE = 0.5  # of the keypoints wanted: where a reduced image show
 _LASTING = 0.5  # share of the keypoints that must be seen at less contrast, too; of fewer, contrast is what is missing
 
 
-class Detection(Protocol):
-    """Keypoints of one image, not yet described; always in the same order for the same image."""
-
-    @property
-    def points(self) -> FloatArray:
-        """Places, pixels of the image, (N, 2)."""
-        ...
-
-    @property
-    def scale(self) -> FloatArray:
-        """Diameters, pixels, (N,)."""
-        ...
-
-    @property
-    def response(self) -> FloatArray:
-        """Strengths, (N,)."""
-        ...
-
-    def describe(self, chosen: NDArray[np.intp]) -> Features:
-        """Features of the chosen keypoints, in their order; some may have no descriptor and drop out."""
-        ...
+Detection = SurfDetection | AlikedDetection | SiftTilesDetection | OpenCVDetection
+"""Keypoints of one image, not yet described; always in the same order for the same image."""
 
 
 def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
@@ -130,7 +110,9 @@ def _detect(source: ViewLoader, options: FeatureOptions) -> Features:
     most, megapixels = options.limits
     image, detection, usable = _look(source, options, megapixels)
     shown, few = len(usable), len(usable) < _MIN_KEYPOINT_SHARE * most
-    faint = few and len(_usable(image, _find_at_less_contrast(image, options))) <= _LASTING * shown
+    # Differences of grey levels are divided by the most that equalization multiplies them by.
+    weaker = np.rint(image.grey / CLIP_LIMIT).astype(np.uint8)
+    faint = few and len(_usable(image, find(weaker, options))) <= _LASTING * shown
     if megapixels is not None and image.reduced and few:
         image, detection, usable = _look(source, options, CLOSER * megapixels)
     points, response = detection.points[usable], detection.response[usable]
@@ -159,8 +141,3 @@ def _look(
 def _usable(image: PreparedImage, detection: Detection) -> NDArray[np.intp]:
     """Select the keypoints that keep clear of the mask."""
     return np.flatnonzero(image.covers(detection.points, detection.scale / 2))
-
-
-def _find_at_less_contrast(image: PreparedImage, options: FeatureOptions) -> Detection:
-    """Detect with differences of grey levels divided by the most that equalization multiplies them by."""
-    return find(np.rint(image.grey / CLIP_LIMIT).astype(np.uint8), options)

@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, Rows
 from rdstitch.errors import ArgumentError
 
 Descriptors = NDArray[np.float32] | NDArray[np.uint8]
@@ -113,7 +113,7 @@ def _smallest(descriptors: Descriptors) -> NDArray[Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class Correspondences:
+class Correspondences(Rows):
     """Points of two images that show the same, the most distinctive match first (PROSAC's order)."""
 
     indices: NDArray[np.intp]  # (M, 2), intp: indices into the features of image 1 and image 2
@@ -133,10 +133,6 @@ class Correspondences:
     def of(cls, features1: Features, features2: Features, indices: NDArray[np.intp], ratio: FloatArray) -> Self:
         """Correspondences between the features of two images."""
         return cls(indices, features1.points[indices[:, 0]], features2.points[indices[:, 1]], ratio)
-
-    def take(self, index: NDArray[np.intp]) -> Self:
-        """The correspondences at the given positions."""
-        return type(self)(self.indices[index], self.points1[index], self.points2[index], self.ratio[index])
 
     def __len__(self) -> int:
         return len(self.ratio)

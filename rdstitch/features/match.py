@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Correspondences, Features
-from rdstitch.features.nearest import compare, mutual_nearest
+from rdstitch.features.nearest import Similarity, mutual_nearest
 from rdstitch.late_imports import spatial
 
 Matcher = Callable[[Features, Features], Correspondences]
@@ -110,7 +110,7 @@ def match_near(
     candidates = _within(expected, features2.points, radius)
     if not len(candidates):
         return Correspondences.of(features1, features2, candidates, np.zeros(0))
-    similarity = compare(features1.descriptors, features2.descriptors)
+    similarity = Similarity(features1.descriptors, features2.descriptors)
     sign1, sign2 = features1.laplacian_sign, features2.laplacian_sign
     if sign1 is not None and sign2 is not None:
         candidates = candidates[sign1[candidates[:, 0]] == sign2[candidates[:, 1]]]

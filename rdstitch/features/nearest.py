@@ -7,7 +7,7 @@ to be exact, so there is nothing to depend on.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,53 +17,19 @@ from rdstitch.features.keypoints import Descriptors, Features
 
 # |a|² + |b|² and 2 a·b then stay below 2²³, where float32 still knows halves.
 _MAX_NORM = 1024.0
+_BYTES_EACH = 4  # of a similarity
 
 
-class DescriptorSimilarity(Protocol):
-    """Compares descriptors of image 1 with all descriptors of image 2."""
-
-    lowest: float
-    """Less than any similarity."""
-    dtype: np.dtype[Any]
-    """Type of a similarity."""
-    bytes_each: int
-    """Memory that one similarity takes while it is made."""
-
-    def block(self, rows: NDArray[np.intp]) -> NDArray[Any]:
-        """Similarities of some descriptors of image 1 to all of image 2, shape (len(rows), count 2).
-
-        Valid until the next call, which overwrites them.
-        """
-        ...
-
-    def pairs(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:
-        """Similarities of single pairs of descriptors, shape (len(rows),)."""
-        ...
-
-    def distance(self, similarity: NDArray[Any]) -> FloatArray:
-        """The distance that a similarity stands for; infinite for ``lowest``."""
-        ...
-
-
-class Euclidean:
-    """``-d²/2`` of float descriptors, one matrix product a block.
+class Similarity:
+    """``-d²/2`` of descriptors, one matrix product a block; of bits ``d²`` is the Hamming distance.
 
     SIFT's and RootSIFT's are integers as they come; others are rounded to a grid of at most 1/512 of the largest
     norm. With the products of ``(a, 1, -|a|²/2)`` and ``(b, -|b|²/2, 1)`` the BLAS does all the work.
     """
 
-    lowest = -np.inf
-    dtype = np.dtype(np.float32)
-    bytes_each = 4
-
-    def __init__(self, left: NDArray[np.float32], right: NDArray[np.float32]) -> None:
-        self._left, self._right = left, right
-        self._block = np.empty((0, len(right)), np.float32)
-
-    @classmethod
-    def of(cls, descriptors1: NDArray[np.float32], descriptors2: NDArray[np.float32]) -> Self:
-        """Prepare the descriptors of two images."""
-        both = descriptors1, descriptors2
+    def __init__(self, descriptors1: Descriptors, descriptors2: Descriptors) -> None:
+        self._bits = descriptors1.dtype == np.uint8
+        both = [_as_numbers(descriptors) for descriptors in (descriptors1, descriptors2)]
         largest = float(np.sqrt(max(np.einsum("ij,ij->i", v, v).max(initial=0.0) for v in both)))
         # A power of two, so that integers stay integers.
         scale = np.float32(2.0 ** np.floor(np.log2(_MAX_NORM / largest)) if largest > 0 else 1.0)
@@ -75,67 +41,29 @@ class Euclidean:
             side[:, one] = 1.0
             side[:, half] = np.einsum("ij,ij->i", values, values) / np.float32(-2.0)
             sides.append(side)
-        return cls(*sides)
+        self._left, self._right = sides
+        self._block = np.empty((0, len(self._right)), np.float32)
 
-    def block(self, rows: NDArray[np.intp]) -> NDArray[Any]:
+    def block(self, rows: NDArray[np.intp]) -> NDArray[np.float32]:
+        """Similarities of some descriptors of image 1 to all of image 2, (R, M); the next call overwrites them."""
         # Fresh memory for every block would cost a fifth of the time.
         if len(self._block) < len(rows):
             self._block = np.empty((len(rows), len(self._right)), np.float32)
         return np.matmul(self._left[rows], self._right.T, out=self._block[: len(rows)])
 
-    def pairs(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:
-        return np.einsum("ij,ij->i", self._left[rows], self._right[columns])  # type: ignore[no-any-return]
+    def pairs(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
+        """Similarities of single pairs of descriptors, (R,)."""
+        return np.asarray(np.einsum("ij,ij->i", self._left[rows], self._right[columns]))
 
-    def distance(self, similarity: NDArray[Any]) -> FloatArray:
-        return np.sqrt(-2.0 * similarity.astype(np.float64))
-
-
-class Hamming:
-    """Number of equal bits of binary descriptors, counted 64 at a time."""
-
-    lowest = -1.0
-    dtype = np.dtype(np.int16)
-    bytes_each = 8 + 1 + 2
-
-    def __init__(self, left: NDArray[np.uint64], right: NDArray[np.uint64]) -> None:
-        self._left, self._right = left, right
-        self._bits = 64 * left.shape[1]
-
-    @classmethod
-    def of(cls, descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8]) -> Self:
-        """Prepare the descriptors of two images."""
-        # Equal bits of a and b are the ones of a ^ ~b, and of ~a ^ b.
-        return cls(_words(descriptors1), ~_words(descriptors2))
-
-    def block(self, rows: NDArray[np.intp]) -> NDArray[Any]:
-        shape = (len(rows), len(self._right))
-        total, equal, count = np.zeros(shape, np.int16), np.empty(shape, np.uint64), np.empty(shape, np.uint8)
-        for left, right in zip(self._left[rows].T, np.ascontiguousarray(self._right.T), strict=True):
-            np.bitwise_xor(left[:, None], right, out=equal)
-            np.bitwise_count(equal, out=count)
-            np.add(total, count, out=total)
-        return total
-
-    def pairs(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:
-        equal = np.bitwise_count(self._left[rows] ^ self._right[columns])
-        total: NDArray[np.int16] = equal.sum(axis=1, dtype=np.int16)
-        return total
-
-    def distance(self, similarity: NDArray[Any]) -> FloatArray:
-        return np.where(similarity == self.lowest, np.inf, self._bits - similarity.astype(np.float64))
+    def distance(self, similarity: NDArray[np.float32]) -> FloatArray:
+        """The distance that a similarity stands for, in a unit of these descriptors; infinite for -inf."""
+        squared = np.abs(2.0 * similarity.astype(np.float64))
+        return squared if self._bits else np.sqrt(squared)
 
 
-def compare(descriptors1: Descriptors, descriptors2: Descriptors) -> DescriptorSimilarity:
-    """The similarity that fits the type of the descriptors."""
-    if descriptors1.dtype == np.uint8:
-        return Hamming.of(descriptors1.astype(np.uint8), descriptors2.astype(np.uint8))
-    return Euclidean.of(*(found.astype(np.float32, copy=False) for found in (descriptors1, descriptors2)))
-
-
-def _words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """Bytes as words of 64 bits, filled up with zeros."""
-    padded = np.pad(descriptors, ((0, 0), (0, -descriptors.shape[1] % 8)))
-    return np.ascontiguousarray(padded).view(np.uint64)
+def _as_numbers(descriptors: Descriptors) -> NDArray[np.float32]:
+    bits = descriptors.dtype == np.uint8
+    return (np.unpackbits(descriptors.astype(np.uint8), axis=1) if bits else descriptors).astype(np.float32, copy=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,62 +147,47 @@ def mutual_nearest(
     if len(features1) == 0 or len(features2) == 0:
         return np.zeros((0, 2), dtype=np.intp), np.zeros(0)
     one, two = Locations.group(features1.points), Locations.group(features2.points)
-    similarity = compare(features1.descriptors[one.order], features2.descriptors[two.order])
+    similarity = Similarity(features1.descriptors[one.order], features2.descriptors[two.order])
 
-    candidates = _two_best(similarity, one, two, block_bytes)
-    ratio = candidates.ratio(similarity)
-    chosen = np.flatnonzero(ratio < limit)
-    return _nearest_keypoints(similarity, one, two, chosen, candidates.nearest[chosen]), ratio[chosen]
+    nearest, best, second = _two_best(similarity, one, two, block_bytes)
+    distinct = np.flatnonzero(best > second)
+    ratio = np.divide(*(similarity.distance(each[distinct]) for each in (best, second)))
+    chosen, ratio = distinct[ratio < limit], ratio[ratio < limit]
+    return _nearest_keypoints(similarity, one, two, chosen, nearest[chosen]), ratio
 
 
-@dataclass(frozen=True)
-class _TwoBest:
-    """The nearest location in image 2 to each in image 1, and how alike they are; shapes (L,).
+def _two_best(
+    similarity: Similarity, one: Locations, two: Locations, block_bytes: int
+) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
+    """The nearest location in image 2 to each in image 1, how alike they are, and the best other pair of either.
 
-    ``second`` is how alike the best other pair is that either of the two is in: where that is less than ``best``, the
-    two are each other's nearest.
+    Where that is less alike, the two are each other's nearest. The descriptors are in the orders of the locations.
     """
-
-    nearest: NDArray[np.intp]
-    best: NDArray[Any]
-    second: NDArray[Any]
-
-    def ratio(self, similarity: DescriptorSimilarity) -> FloatArray:
-        """Distance of the nearest over that of the best other pair; infinite where that is as near, or nearer."""
-        ratio = np.full(len(self.best), np.inf)
-        distinct = np.flatnonzero(self.best > self.second)
-        nearest, second = (similarity.distance(each[distinct]) for each in (self.best, self.second))
-        ratio[distinct] = nearest / second
-        return ratio
-
-
-def _two_best(similarity: DescriptorSimilarity, one: Locations, two: Locations, block_bytes: int) -> _TwoBest:
-    """Both directions from one pass over the similarities; the descriptors are in the orders of the locations."""
     nearest = np.empty(len(one), dtype=np.intp)
-    best, second = np.empty((2, len(one)), similarity.dtype)
+    best, second = np.empty((2, len(one)), np.float32)
     # Of each location of image 2, the most alike of those whose nearest it is not.
-    others = np.full(len(two), similarity.lowest, similarity.dtype)
-    for here in one.blocks(block_bytes // (similarity.bytes_each * len(two.order))):
+    others = np.full(len(two), -np.inf, np.float32)
+    for here in one.blocks(block_bytes // (_BYTES_EACH * len(two.order))):
         layers = one.places(here)
         block = _merge(similarity.block(np.concatenate(layers)), layers, two)
         index = np.arange(len(block))
         nearest[here] = block.argmax(axis=1)
         best[here] = block[index, nearest[here]]
-        block[index, nearest[here]] = similarity.lowest
+        block[index, nearest[here]] = -np.inf
         second[here] = block.max(axis=1)
         np.maximum(others, block.max(axis=0), out=others)
-    rivals = _rivals(nearest, best, similarity.lowest)
-    return _TwoBest(nearest, best, np.maximum.reduce([second, others[nearest], rivals]))
+    rivals = _rivals(nearest, best)
+    return nearest, best, np.maximum.reduce([second, others[nearest], rivals])
 
 
-def _rivals(nearest: NDArray[np.intp], best: NDArray[Any], lowest: float) -> NDArray[Any]:
+def _rivals(nearest: NDArray[np.intp], best: NDArray[np.float32]) -> NDArray[np.float32]:
     """Compute how alike another location of image 1 is that has the same nearest, (L,).
 
     Of the most alike of these that is the best of the others; of the rest one that is no less alike than themselves.
     """
     order = np.lexsort((best, nearest))
     same = np.diff(nearest[order]) == 0
-    rival = np.full(len(order), lowest, best.dtype)
+    rival = np.full(len(order), -np.inf, np.float32)
     rival[1:][same] = best[order][:-1][same]
     rival[:-1][same] = best[order][1:][same]
     by_location = np.empty_like(rival)
@@ -282,7 +195,7 @@ def _rivals(nearest: NDArray[np.intp], best: NDArray[Any], lowest: float) -> NDA
     return by_location
 
 
-def _merge(block: NDArray[Any], layers: list[NDArray[np.intp]], two: Locations) -> NDArray[Any]:
+def _merge(block: NDArray[np.float32], layers: list[NDArray[np.intp]], two: Locations) -> NDArray[np.float32]:
     """From keypoints x keypoints to locations x locations, in place; returns the part that is the result."""
     top = block[: len(layers[0])]
     offset = len(top)
@@ -298,7 +211,7 @@ def _merge(block: NDArray[Any], layers: list[NDArray[np.intp]], two: Locations) 
 
 
 def _nearest_keypoints(
-    similarity: DescriptorSimilarity,
+    similarity: Similarity,
     one: Locations,
     two: Locations,
     location1: NDArray[np.intp],
@@ -306,7 +219,7 @@ def _nearest_keypoints(
 ) -> NDArray[np.intp]:
     """Select the most alike pair of keypoints of each pair of locations, as indices into the features, shape (M, 2)."""
     pairs = np.column_stack([one.layers[0][location1], two.layers[0][location2]])
-    best = np.full(len(pairs), similarity.lowest, similarity.dtype)
+    best = np.full(len(pairs), -np.inf, np.float32)
     row = 0
     for layer1 in one.layers:
         column = 0

@@ -10,7 +10,7 @@ from itertools import combinations, islice
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.late_imports import sparse, spatial
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
@@ -78,9 +78,13 @@ def _nearest_positions(positions: FloatArray) -> set[tuple[int, int]]:
     known = np.flatnonzero(np.isfinite(positions).all(axis=1))
     if len(known) < 2:
         return set()
-    places = positions[known]
-    nearest = spatial.KDTree(places).query(places, k=min(_NEAREST + 1, len(known)))[1].reshape(len(known), -1)
-    pairs = np.sort(np.stack([np.repeat(known, nearest.shape[1]), known[nearest.ravel()]], axis=1), axis=1)
+    return _nearest_pairs(positions[known], known, _NEAREST)
+
+
+def _nearest_pairs(places: FloatArray, images: IntArray, most: int) -> set[tuple[int, int]]:
+    """Pairs of images of which one is among the nearest of the other, by their places."""
+    nearest = spatial.KDTree(places).query(places, k=min(most + 1, len(images)))[1].reshape(len(images), -1)
+    pairs = np.sort(np.stack([np.repeat(images, nearest.shape[1]), images[nearest.ravel()]], axis=1), axis=1)
     return {(i, j) for i, j in pairs.tolist() if i != j}
 
 
@@ -143,7 +147,6 @@ def neighbours(
         return []
     size = np.linalg.norm(middles[known], axis=1) if on_sphere else middles[known, 2]
     centres = middles[known] / size[:, None]
-    nearest = spatial.KDTree(centres).query(centres, k=min(_NEIGHBOURS + 1, len(known)))[1].reshape(len(known), -1)
     partners: dict[int, set[int]] = {}
     for i, j in tried:
         partners.setdefault(i, set()).add(j)
@@ -153,10 +156,9 @@ def neighbours(
         first, second = partners.get(i, set()), partners.get(j, set())
         return min(len(first), len(second)) < _PARTNERS or not first & second
 
-    near = np.sort(np.stack([np.repeat(known, nearest.shape[1]), known[nearest.ravel()]], axis=1), axis=1)
     return [
         pair
-        for pair in sorted({(i, j) for i, j in near.tolist() if i != j} - tried)
+        for pair in sorted(_nearest_pairs(centres, known, _NEIGHBOURS) - tried)
         if needed(*pair)
         and max(_share_seen(cameras, homographies, *both) for both in (pair, pair[::-1])) >= _MIN_OVERLAP
     ]

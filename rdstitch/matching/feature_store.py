@@ -1,8 +1,8 @@
 """Features and matches of a whole set, on disk: between stages, processes and machines travel their names."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Self, overload
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +61,7 @@ class StoredFeatures:
 
 
 @dataclass(frozen=True, eq=False)
-class FeatureStore(Sequence[Features]):
+class FeatureStore:
     """Features of the images of a set; an item is read when it is asked for."""
 
     items: tuple[StoredFeatures, ...]
@@ -75,15 +75,13 @@ class FeatureStore(Sequence[Features]):
         """Number of images."""
         return len(self.items)
 
-    @overload
-    def __getitem__(self, index: int) -> Features: ...
+    def __iter__(self) -> Iterator[Features]:
+        """The features of all images, one after another."""
+        return (item.load() for item in self.items)
 
-    @overload
-    def __getitem__(self, index: slice) -> "FeatureStore": ...
-
-    def __getitem__(self, index: int | slice) -> "Features | FeatureStore":
-        """The features of an image, or of some of them."""
-        return FeatureStore(self.items[index]) if isinstance(index, slice) else self.items[index].load()
+    def __getitem__(self, index: int) -> Features:
+        """The features of an image."""
+        return self.items[index].load()
 
     @property
     def counts(self) -> NDArray[np.intp]:

@@ -43,10 +43,9 @@ class Votes:
             and np.isfinite(pair.relation.distortion_std)
             and int(pair.relation.inliers.sum()) >= _MIN_INLIERS
         ]
-        found = list(zip(registered, _votes(registered, threshold), strict=True))
         seen = [
             (pair, vote)
-            for pair, vote in found
+            for pair, vote in zip(registered, _votes(registered, threshold), strict=True)
             if np.isfinite(vote.covariance).all() and vote.coherence < _MAX_COHERENCE
         ]
         return cls(

@@ -99,7 +99,7 @@ def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> d
     sizes = []
     for second in (False, True):
         own = [pair for pair in linked if mixed.second[[pair.image1, pair.image2]].tolist() == [second] * 2]
-        members = {image for pair in own for image in (pair.image1, pair.image2)}
+        members = {image for pair in own for image in pair.images}
         sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in own)))
     kept = sizes[1] > sizes[0]
     there, here = mixed.distortion[not kept], mixed.distortion[kept]
@@ -127,14 +127,7 @@ def _margins(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) ->
     """By how much more the votes were missed if an image came from the other lens, for each image (N,)."""
     which = votes.which(second)
     missed = votes.mahalanobis_residuals(lenses[which])
-    return _per_image(
-        count, votes, *(votes.mahalanobis_residuals(lenses[which ^ other]) - missed for other in np.eye(2, dtype=int))
-    )
-
-
-def _per_image(count: int, votes: Votes, of_first: FloatArray, of_last: FloatArray) -> FloatArray:
-    """What the votes say of their first and second images, added up, shape (N,)."""
     total: FloatArray = np.zeros(count)
-    np.add.at(total, votes.image1, of_first)
-    np.add.at(total, votes.image2, of_last)
+    for image, other in zip((votes.image1, votes.image2), np.eye(2, dtype=int), strict=True):
+        np.add.at(total, image, votes.mahalanobis_residuals(lenses[which ^ other]) - missed)
     return total

@@ -49,7 +49,7 @@ def over_rough_ground(pairs: Sequence[PairRegistration], threshold: float) -> Se
     inliers = sum(int(pair.relation.inliers.sum()) for pair in found)
     if sum(len(pair.relation.inliers) for pair in found) - inliers < _ROUGH * inliers:
         return pairs
-    rough = {(pair.image1, pair.image2): _continued(pair, threshold) for pair in found}
+    rough = {pair.images: _continued(pair, threshold) for pair in found}
     if sum(int(own.sum()) for own in rough.values()) - inliers < _ROUGH * inliers:
         return pairs
     return [_fitted(pair, rough[pair.image1, pair.image2]) if pair.relation else pair for pair in pairs]

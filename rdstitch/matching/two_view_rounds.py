@@ -3,17 +3,17 @@
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from pathlib import Path
 
 import numpy as np
 
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.camera import Camera
-from rdstitch.executors import in_order
-from rdstitch.features import Correspondences, Matcher, match_near
+from rdstitch.executors import batches, in_order
+from rdstitch.features import Matcher, match_near
 from rdstitch.matching.candidate_pairs import pairs_that_matter
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
-from rdstitch.matching.options import MatchingOptions, PairOptions
 from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
 from rdstitch.matching.static_background import (
     has_static_background,
@@ -21,18 +21,19 @@ from rdstitch.matching.static_background import (
     show_motion,
 )
 from rdstitch.matching.two_view import (
-    EstimationTask,
-    MatchingTask,
+    PAIRS_ESTIMATED_AT_ONCE,
     Pair,
     PairRegistration,
+    Tilt,
     Transfer,
     estimate_pairs,
-    estimation_batches,
     match_pairs,
-    matching_batches,
 )
 from rdstitch.progress import Progress
+from rdstitch.radial_homography import RadialHomography
+from rdstitch.robust import EstimationOptions
 
+_PAIRS_MATCHED_AT_ONCE, _MIN_BATCHES = 32, 8  # pairs of a task at the most; tasks at the least
 _PRESCREEN_FEATURES = 1000  # strongest features of an image, by which pairs are prescreened
 _MIN_PRESCREEN_MATCHES = 8  # matches among these; images that share nothing have three to six by chance
 _MIN_RELATIVE_MATCHES = 0.05  # share of the matches that an image has with the one most like it; less adds nothing
@@ -49,12 +50,14 @@ class Pairing:
     features: FeatureStore
     cameras: Sequence[Camera]
     matcher: Matcher
-    options: MatchingOptions
+    estimation: EstimationOptions  # its λ is that of all images, where it is known
     progress: Progress
     executor: Executor  # where batches of pairs are matched and estimated
     cache: Cache = NO_CACHE  # of results of earlier runs
     store: Cache = NO_CACHE  # of what need not be in memory all the time
-    tilts: Sequence[tuple[float, float]] | None = None  # (ψ, θ), radians, of each image, where they are known exactly
+    ratio: float | None = None  # largest ratio of distances of a match; None: what suits the features
+    network: str | Path | None = None  # ONNX file of a network that matches the features instead
+    tilts: Sequence[Tilt] | None = None  # (ψ, θ), radians, of each image, where they are known exactly
 
     def prescreen_pairs(self, pairs: Sequence[Pair]) -> dict[Pair, StoredMatches]:
         """The pairs whose strongest features match and that matter for the place of an image, with those matches.
@@ -86,7 +89,7 @@ class Pairing:
         chosen = list(pairs)
         if not chosen:
             return []
-        known = self.options.pair.distortion
+        known = self.estimation.distortion
         lens = distortion if known is None else known
         found = self._relate(chosen, self._match(chosen, "matching", shared or {}), lens, "registering pairs")
         return found if known is not None or distortion is None else [_without_vote(pair) for pair in found]
@@ -105,10 +108,10 @@ class Pairing:
         What the images have in common was static then, so that it says nothing of which of the candidate pairs
         matter: all of them are compared.
         """
-        threshold = self.options.pair.threshold
+        threshold = self.estimation.threshold
         if not has_static_background(pairs, threshold):
             return None
-        compared = [(pair.image1, pair.image2) for pair in pairs]
+        compared = [pair.images for pair in pairs]
         others = sorted(set(candidates).difference(compared))
         everything = [*pairs, *self.estimate(others)]
         chosen = sorted([*compared, *others])
@@ -126,7 +129,7 @@ class Pairing:
         weak = [k for k, pair in enumerate(pairs) if not pair.relation or pair.relation.inliers.sum() < _FEW_INLIERS]
         chosen = [(pairs[k].image1, pairs[k].image2) for k in weak]
         matched = [StoredMatches.of(match_pattern(self.features[i], self.features[j])) for i, j in chosen]
-        again = self._relate(chosen, matched, self.options.pair.distortion, "matching a repeated pattern")
+        again = self._relate(chosen, matched, self.estimation.distortion, "matching a repeated pattern")
         result = list(pairs)
         for k, pair in zip(weak, again, strict=True):
             inliers = pair.relation.inliers.sum()
@@ -137,46 +140,33 @@ class Pairing:
     @cached_property
     def shows_repeated_pattern(self) -> bool:
         """Whether keypoints of most of the images look like others elsewhere in the same image."""
-        if self.options.lightglue_model is not None:
+        if self.network is not None:
             return False
         sampled = np.unique(np.linspace(0, len(self.features) - 1, _SAMPLED).astype(np.intp)).tolist()
         return bool(np.median([repetition(self.features[k]) for k in sampled]) >= MIN_REPETITION)
 
     def rematch_elsewhere(self, pairs: Sequence[PairRegistration], transfer: Transfer) -> list[PairRegistration]:
         """Match registered pairs again, only near where ``transfer`` puts them."""
-        matched = [StoredMatches.of(self._near(pair, transfer)) for pair in pairs]
-        return self._relate([(pair.image1, pair.image2) for pair in pairs], matched, self.options.pair.distortion)
-
-    def _near(self, pair: PairRegistration, transfer: Transfer) -> Correspondences:
-        """Matches of a pair near the places where the alignment expects them."""
-        features1, features2 = self.features[pair.image1], self.features[pair.image2]
-        return match_near(
-            features1,
-            features2,
-            transfer(pair.image1, pair.image2, features1.points),
-            _SEARCH_RADIUS * self.options.pair.threshold,
-            pair.correspondences.indices[pair.relation.inliers],
-            self.options.ratio,
-        )
+        matched = []
+        for pair in pairs:
+            features1, features2 = self.features[pair.image1], self.features[pair.image2]
+            expected = transfer(pair.image1, pair.image2, features1.points)
+            known = pair.correspondences.indices[pair.relation.inliers]
+            radius = _SEARCH_RADIUS * self.estimation.threshold
+            matched.append(StoredMatches.of(match_near(features1, features2, expected, radius, known, self.ratio)))
+        return self._relate([pair.images for pair in pairs], matched, self.estimation.distortion)
 
     def _match(
         self, pairs: Sequence[Pair], stage: str, shared: Mapping[Pair, StoredMatches] | None = None
     ) -> list[StoredMatches]:
         """Matches of every pair, from an earlier run where the cache has them."""
         # What a network finds depends on all that it is shown.
-        known = {} if shared is None or self.options.lightglue_model is not None else shared
-        tasks = (
-            MatchingTask(
-                [(self.features.items[i], self.features.items[j]) for i, j in batch],
-                [known.get(pair) for pair in batch],
-                self.matcher,
-                self._matching,
-                self.store,
-            )
-            for batch in matching_batches(pairs)
-        )
+        known = {} if shared is None or self.network is not None else shared
+        tasks = [(self.features.items[i], self.features.items[j], known.get((i, j))) for i, j in pairs]
+        how = self.ratio, None if self.network is None else self.cache.file(self.network)
+        run = partial(match_pairs, matcher=self.matcher, how=how, cache=self.store)
         done: list[StoredMatches] = []
-        for found in in_order(self.executor, match_pairs, tasks):
+        for found in in_order(self.executor, run, batches(tasks, _PAIRS_MATCHED_AT_ONCE, _MIN_BATCHES)):
             done += found
             self.progress(stage, len(done), len(pairs))
         return done
@@ -189,39 +179,21 @@ class Pairing:
         stage: str | None = None,
     ) -> list[PairRegistration]:
         """The relation of every pair, from an earlier run where the cache has it."""
-        options = self._pair_options(distortion)
-        tasks = (
-            EstimationTask(
-                [(self.cameras[pairs[k][0]], self.cameras[pairs[k][1]]) for k in batch],
-                [matched[k] for k in batch],
-                [(self._tilt(pairs[k][0]), self._tilt(pairs[k][1])) for k in batch],
-                options,
-                self.cache,
-            )
-            for batch in estimation_batches(range(len(pairs)))
-        )
-        done: list[PairRegistration] = []
-        for found in in_order(self.executor, estimate_pairs, tasks):
-            start = len(done)
-            done += [
-                PairRegistration(*pairs[start + k], matched[start + k], relation) for k, relation in enumerate(found)
-            ]
+        solver = self.estimation.solver if distortion is None else "auto"
+        options = replace(self.estimation, solver=solver, distortion=distortion)
+        tilts: Sequence[Tilt | None] = self.tilts or [None] * len(self.cameras)
+        tasks = [
+            (self.cameras[i], self.cameras[j], found, tilts[i], tilts[j])
+            for (i, j), found in zip(pairs, matched, strict=True)
+        ]
+        run = partial(estimate_pairs, options=options, cache=self.cache)
+        relations: list[RadialHomography] = []
+        for estimated in in_order(self.executor, run, batches(tasks, PAIRS_ESTIMATED_AT_ONCE)):
+            relations += estimated
             if stage is not None:
-                self.progress(stage, len(done), len(pairs))
-        return done
-
-    @cached_property
-    def _matching(self) -> tuple[float | str | None, ...]:
-        """What stands for the way of matching."""
-        model = self.options.lightglue_model
-        return self.options.ratio, None if model is None else self.cache.file(model)
-
-    def _tilt(self, image: int) -> tuple[float, float] | None:
-        return None if self.tilts is None else self.tilts[image]
-
-    def _pair_options(self, distortion: float | None) -> PairOptions:
-        pair = self.options.pair
-        return replace(pair, solver=pair.solver if distortion is None else "auto", distortion=distortion)
+                self.progress(stage, len(relations), len(pairs))
+        every = zip(pairs, matched, relations, strict=True)
+        return [PairRegistration(*images, found, relation) for images, found, relation in every]
 
 
 def _without_vote(pair: PairRegistration) -> PairRegistration:

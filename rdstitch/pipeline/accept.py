@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -11,9 +10,9 @@ from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
 from rdstitch.errors import PartialResultError, RegistrationError
-from rdstitch.messages import Message, left_out, names_of, told_once
+from rdstitch.messages import Message, names_of, told_once
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
+from rdstitch.pipeline.aligner import AlignedPairs, Aligner, Purpose, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
 from rdstitch.verification.evidence import Evidence
@@ -31,35 +30,26 @@ Offenders = Mapping[tuple[int, ...], Message]
 
 
 @impossible_estimates_fail()
-def accept(
-    registration: Registration,
-    options: StitchOptions,
-    *,
-    metric: bool = False,
-    lens_only: bool = False,
-    prefer_turn: bool = False,
-) -> Registration:
+def accept(registration: Registration, options: StitchOptions, purpose: Purpose = "mosaic") -> Registration:
     """The registration of what passes all checks, with everything that the user should know of it.
 
     Parameters
     ----------
     registration : Registration
         In pixels of the working size; the result is in those of the images.
-    metric : bool
-        Metric poses are needed, also of what remains.
-    lens_only : bool
-        Only the lens is wanted, so that doubts about the places of images do not matter.
-    prefer_turn : bool
+    purpose : str
         As for :func:`rdstitch.pipeline.register.register`.
     """
     cache = Cache(options.cache)
-    layout_matters = not (lens_only or metric)
-    aligner = Aligner.of(registration.sources, options, cache, prefer_turn=prefer_turn, layout_matters=layout_matters)
-    aligner = replace(aligner, needs_poses=metric)
+    aligner = Aligner.of(registration.sources, options, cache, purpose)
+    aligner, lens_only = replace(aligner, needs_poses=purpose == "trajectory"), purpose == "calibrate"
     undamaged = None if options.force else _without_damage(registration, aligner)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None
-    checked = partial(_judged, options=options, cache=cache, lens_only=lens_only)
+
+    def checked(candidate: Registration) -> tuple[Finding, ...]:
+        return judge(Evidence(candidate, options.threshold, options.threads, cache, lens_only))
+
     current, found = registration, checked(registration)
     first, found_first = registration, found
     if _fails(found) and undamaged is not None and not _fails(judged := checked(undamaged)):
@@ -89,12 +79,6 @@ def accept(
     if options.strict and accepted.left_out:
         raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
     return accepted
-
-
-def _judged(
-    registration: Registration, options: StitchOptions, cache: Cache, *, lens_only: bool
-) -> tuple[Finding, ...]:
-    return judge(Evidence(registration, options.threshold, options.threads, cache, lens_only))
 
 
 def _without_damage(registration: Registration, aligner: Aligner) -> Registration | None:
@@ -221,13 +205,10 @@ def _aligned_anew(
     registration: Registration, aligned: AlignedPairs, paths: Sequence[str], reasons: Mapping[int, Message]
 ) -> Registration:
     """The registration with another alignment, and why images are not in it."""
-    known = {message.images: message for message in registration.left_out}
-    unaligned = np.flatnonzero(~aligned.alignment.used).tolist()
-    explained = zip(unaligned, explain_unaligned(aligned.alignment, paths, registration.keypoints), strict=True)
-    unused = [
-        known.get(message.images, left_out(paths[k], reasons[k].text) if k in reasons else message)
-        for k, message in explained
-    ]
+    known = {k: message.text for k, message in reasons.items()}
+    number = {path: k for k, path in enumerate(paths)}
+    known |= {number[m.images[0]]: m.text for m in registration.left_out if m.images[0] in number}
+    unused = explain_unaligned(aligned.alignment, paths, registration.keypoints, known)
     dropped = (*registration.alignment.messages, *registration.left_out)
     whole = [message for message in registration.messages if message not in dropped]
     messages = (*aligned.alignment.messages, *whole, *unused)

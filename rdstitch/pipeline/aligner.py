@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
@@ -28,6 +28,12 @@ from rdstitch.pipeline.inlier_selection import reselect_inliers
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.process_memory import return_freed_memory
 from rdstitch.verification.limits import limit
+
+Purpose = Literal["pano", "mosaic", "calibrate", "trajectory"]
+"""The recipe that a registration is for. In "pano" every image must be readable, and a turn on the spot is taken where
+a plane explains the images as well; for "calibrate" images of a repeated pattern may be off by whole periods of it, and
+doubts about their places do not matter; for "trajectory" poses must be metric, so that the freest model is that of
+planar motion with small tilts."""
 
 _CLOSURE_ROUNDS = 2
 
@@ -80,16 +86,16 @@ class Aligner:
         sources: Sequence[Source],
         options: StitchOptions,
         cache: Cache,
-        *,
-        prefer_turn: bool = False,
-        layout_matters: bool = True,
+        purpose: Purpose = "mosaic",
     ) -> Self:
         """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`."""
         paths = tuple(str(source.path) for source in sources)
         megapixels = options.features.for_images(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
         orientations = tuple(quarter_turn(source.metadata.orientation) for source in sources)
-        decided = replace(alignment_options(sources, options), prefer_turn=prefer_turn, layout_matters=layout_matters)
+        layout_matters = purpose in ("pano", "mosaic")
+        decided = alignment_options(sources, options)
+        decided = replace(decided, prefer_turn=purpose == "pano", layout_matters=layout_matters)
         return cls(paths, cameras, decided, cache, options.threshold, orientations=orientations)
 
     @property
@@ -129,7 +135,7 @@ class Aligner:
         errors = [np.zeros(0)]
         for pair, more in zip(pairs, ground, strict=True):
             new = more.relation.inliers & ~pair.relation.inliers
-            if (pair.image1, pair.image2) in alignment.support and new.any():
+            if pair.images in alignment.support and new.any():
                 errors.append(pair.errors(alignment.transfer)[new])
         every = np.concatenate(errors)
         return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
@@ -160,11 +166,11 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
     """Register images that the poses put beside each other, and the candidate pairs of images without a pose."""
     for _ in range(_CLOSURE_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
-        tried = {(pair.image1, pair.image2) for pair in pairs}
+        tried = {pair.images for pair in pairs}
         loop_closures = neighbours(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
         unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
         found = pairing.estimate(sorted(unaligned.union(loop_closures)), distortion=alignment.distortion)
-        pairs = tuple(sorted([*pairs, *found], key=lambda pair: (pair.image1, pair.image2)))
+        pairs = tuple(sorted([*pairs, *found], key=lambda pair: pair.images))
         if not any(pair.relation for pair in found):
             return replace(aligned, pairs=pairs)
         aligned = aligner.align(pairs)

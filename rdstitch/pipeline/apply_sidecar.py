@@ -135,21 +135,15 @@ def apply(
             dry_run=dry_run,
         )
         result = Recomposition(
-            saved,
-            tuple(sources),
-            matched,
-            left_out,
-            placed,
-            composed.canvas,
-            options,
-            None if output is None else Path(output),
-            composed.composite,
-            composed.plan,
-            (*doubts, *found.messages, *guard.messages, *composed.messages),
-            channel_order,
-            composed.fingerprint,
-            composed.place,
-            composed.place_reason,
+            saved=saved,
+            sources=tuple(sources),
+            matched=matched,
+            left_out=left_out,
+            placed=placed,
+            composite_options=options,
+            messages=(*doubts, *found.messages, *guard.messages, *composed.messages),
+            channel_order=channel_order,
+            **composed.output_fields,
         )
         if dry_run or output is None:
             return result

@@ -12,11 +12,9 @@ import numpy as np
 from rdstitch.cache import Cache
 from rdstitch.compositing import (
     Canvas,
-    Composite,
     CompositeOptions,
     CompositePlan,
     FileComposite,
-    OutputFile,
     compose,
     compose_to_file,
     plan_composite,
@@ -33,12 +31,12 @@ from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.messages import Message, names_of, shortened
-from rdstitch.outputs import Fingerprint, Outputs, check_output, text_bytes
+from rdstitch.outputs import Outputs, check_output, text_bytes
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.process_memory import return_freed_memory
 from rdstitch.progress import Progress
-from rdstitch.stitch_result import StitchResult
+from rdstitch.stitch_result import OutputImage, StitchResult
 from rdstitch.stored import Stored
 from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
 
@@ -46,18 +44,12 @@ from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
 _PROBE_REDUCTION = 8
 
 
-@dataclass(frozen=True)
-class Composed:
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Composed(OutputImage):
     """Images put together, or the plan of doing so."""
 
-    canvas: Canvas  # where the images lie in the output
-    composite: Composite | None = None  # the image; None where it went to a file, or was only planned
-    plan: CompositePlan | None = None  # of a dry run
-    messages: tuple[Message, ...] = ()  # what the user should know, such as why nothing was cropped
-    fingerprint: Fingerprint | None = None  # size and digest of the file
+    messages: tuple[Message, ...]  # what the user should know, such as why nothing was cropped
     written: FileComposite | None = None  # the image in its file
-    place: Georeference | None = None  # of the canvas
-    place_reason: str = ""  # why there is none
 
 
 def compose_images(
@@ -98,22 +90,23 @@ def compose_images(
         check_memory(output, canvas.size, options.max_memory)
     options = replace(options, workers=threads)
     images = placed.images(canvas.near)
+    composed = Composed(
+        canvas=canvas,
+        output=None if output is None else Path(output),
+        georeference=place,
+        not_georeferenced=reason,
+        messages=tuple(notes),
+    )
     if dry_run:
-        planned = _planned(placed, canvas, options)
-        return Composed(canvas, plan=planned, messages=tuple(notes), place=place, place_reason=reason)
+        return replace(composed, plan=_planned(placed, canvas, options))
 
     def report(share: float) -> None:
         progress("compositing", round(100 * share), 100)
 
     if output is None:
         composite = compose(images, canvas, options, report, elsewhere)
-        return Composed(
-            composite.canvas,
-            composite,
-            messages=(*notes, *composite.messages),
-            place=moved(place, canvas, composite.canvas),
-            place_reason=reason,
-        )
+        place, messages = moved(place, canvas, composite.canvas), (*notes, *composite.messages)
+        return replace(composed, canvas=composite.canvas, composite=composite, georeference=place, messages=messages)
 
     def tags(final: Canvas) -> list[ExtraTag]:
         there = moved(place, canvas, final)
@@ -123,8 +116,9 @@ def compose_images(
     if metadata.pixel_size is not None:
         scaled = None if options.max_size is not None else metadata.pixel_size / options.scale
         metadata = replace(metadata, pixel_size=scaled)
-    file = OutputFile(output, metadata, tags, outputs)
-    written = compose_to_file(file, images, canvas, options, report, elsewhere)
+    written = compose_to_file(
+        output, images, canvas, options, report, elsewhere, metadata=metadata, extra_tags=tags, outputs=outputs
+    )
     place = moved(place, canvas, written.canvas)
     beside = []
     if place is not None and world_files:
@@ -136,13 +130,13 @@ def compose_images(
         *_profiles_differ(placed.sources),
         *beside,
     )
-    return Composed(
-        written.canvas,
+    return replace(
+        composed,
+        canvas=written.canvas,
         messages=messages,
         fingerprint=written.fingerprint,
         written=written,
-        place=place,
-        place_reason=reason,
+        georeference=place,
     )
 
 
@@ -206,15 +200,6 @@ def _profiles_differ(sources: Sequence[Source]) -> list[Message]:
     return [Message(text, tuple(others), code="colour-profiles")]
 
 
-@dataclass(frozen=True, eq=False)
-class BlockTask:
-    """A block, and what its worker must know beside."""
-
-    block: Block
-    sources: tuple[Source, ...]  # its images
-    store: Cache  # where its strips go
-
-
 def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None) -> BlockRunner | None:
     """What computes blocks of an output on the workers of an executor; None for threads, which need no blocks.
 
@@ -230,8 +215,8 @@ def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None
 
     def run(blocks: Iterable[Block]) -> Generator[list[Stored[OutputStrip]]]:
         store = Cache.for_this_run(folder)
-        tasks = (BlockTask(block, tuple(sources[k] for k in block.images), store) for block in blocks)
-        with closing(in_order(executor, compose_block, tasks)) as done:
+        tasks = ((block, [sources[k] for k in block.images]) for block in blocks)
+        with closing(in_order(executor, partial(compose_block, store=store), tasks)) as done:
             for strips, notes in done:
                 sources[0].guard.learn(notes)
                 yield strips
@@ -239,13 +224,14 @@ def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None
     return run
 
 
-def compose_block(task: BlockTask) -> tuple[list[Stored[OutputStrip]], GuardNotes]:
-    """Compute a block; and what was noticed of its files."""
-    strips = task.block.compute(task.store)
-    if not task.sources:
-        return strips, ({}, {})
+def compose_block(
+    task: tuple[Block, Sequence[Source]], *, store: Cache
+) -> tuple[list[Stored[OutputStrip]], GuardNotes]:
+    """Compute a block of these images into a store; and what was noticed of their files."""
+    block, sources = task
+    strips = block.compute(store)
     # All have one guard, which travels with them.
-    return strips, task.sources[0].guard.notes_on([source.path for source in task.sources])
+    return strips, sources[0].guard.notes_on([source.path for source in sources]) if sources else ({}, {})
 
 
 def write_page(
@@ -256,7 +242,7 @@ def write_page(
     if page is None or written is None:
         return []
 
-    gsd = None if composed.place is None else composed.place.gsd
+    gsd = None if composed.georeference is None else composed.georeference.gsd
 
     def stage() -> None:
         text = viewer_page(output, composed.canvas.size, images(), written.seams, written.origin, gsd)

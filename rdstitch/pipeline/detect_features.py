@@ -15,7 +15,7 @@ import numpy as np
 from rdstitch.arrays import IntArray
 from rdstitch.cache import Cache
 from rdstitch.errors import InputError
-from rdstitch.executors import in_order
+from rdstitch.executors import batches, in_order
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, detect, detect_view
 from rdstitch.features.options import CLOSER
 from rdstitch.features.prepared_image import Stretch, common_stretch, halving, usual_stretch
@@ -25,8 +25,7 @@ from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
 from rdstitch.process_memory import reuse_freed_memory
 from rdstitch.progress import Progress
 
-_MIN_BATCHES = 16  # batches that images are at least divided into, so that a few keep several workers busy
-_IMAGES_AT_ONCE = 8  # images of a task at the most
+_IMAGES_AT_ONCE, _MIN_BATCHES = 8, 16  # images of a task at the most; tasks at the least
 _USUAL_DENSITY = 2000
 """Features per 10⁶ pixels that images of usual contrast show at least; flights show 10,000 to 15,000."""
 
@@ -36,19 +35,12 @@ _LOW_SHARE = 0.5
 
 @dataclass(frozen=True)
 class DetectedFeatures:
-    """Features of N images."""
+    """Features of N images, and how the images were rendered for detection."""
 
     features: FeatureStore  # in pixels of the images; a damaged image has none
     damaged: Mapping[int, str]  # why the pixels of an image could not be read, by its index
-
-
-@dataclass(frozen=True)
-class DetectionTask:
-    """Images whose features are to be detected together."""
-
-    sources: Sequence[Source]
-    options: FeatureOptions
-    store: Cache
+    stretch: Stretch | None = None  # grey levels that became 0 and 255 in all images; None: those of 8 bits
+    equalized: tuple[int, ...] = ()  # images whose local contrast was equalized, as they showed too little otherwise
 
 
 def detect_features(
@@ -70,9 +62,8 @@ def detect_features(
         Go on without damaged images instead of raising.
     """
     results: list[StoredFeatures | InputError] = []
-    size = min(_IMAGES_AT_ONCE, -(-len(sources) // _MIN_BATCHES))
-    tasks = (DetectionTask(sources[start : start + size], options, store) for start in range(0, len(sources), size))
-    for found, notes in in_order(executor, detect_batch, tasks):
+    run = partial(detect_batch, options=options, store=store)
+    for found, notes in in_order(executor, run, batches(sources, _IMAGES_AT_ONCE, _MIN_BATCHES)):
         sources[0].guard.learn(notes)
         errors = [result for result in found if isinstance(result, InputError)]
         if errors and not skip_bad:
@@ -87,23 +78,25 @@ def detect_features(
             )
         ),
         {index: str(result) for index, result in enumerate(results) if isinstance(result, InputError)},
+        options.stretch,
     )
 
 
-def detect_batch(task: DetectionTask) -> tuple[list[StoredFeatures | InputError], GuardNotes]:
-    """The features of each image of a task, or why it cannot be read; and what was noticed of the files."""
+def detect_batch(
+    sources: Sequence[Source], *, options: FeatureOptions, store: Cache
+) -> tuple[list[StoredFeatures | InputError], GuardNotes]:
+    """The features of each image, or why it cannot be read; and what was noticed of the files."""
     found: list[StoredFeatures | InputError] = []
-    for source in task.sources:
+    for source in sources:
         try:
-            found.append(_detected(source, task))
+            found.append(_detected(source, options, store))
         except InputError as error:
             found.append(error)
-    return found, task.sources[0].guard.notes_on([source.path for source in task.sources])
+    return found, sources[0].guard.notes_on([source.path for source in sources])
 
 
-def _detected(source: Source, task: DetectionTask) -> StoredFeatures:
+def _detected(source: Source, options: FeatureOptions, store: Cache) -> StoredFeatures:
     """The features of an image, from an earlier run where the store has them."""
-    store, options = task.store, task.options
     network = store.file(options.aliked_model)
     # What stands for its content, whatever the file is called.
     wanted = replace(options, aliked_model="") if network else options
@@ -124,15 +117,6 @@ def _no_features(options: FeatureOptions, source: Source) -> Features:
     return replace(detect(np.zeros((1, 1), dtype=np.uint8), options), image_size=source.camera.image_size)
 
 
-@dataclass(frozen=True)
-class DetectionByContrast:
-    """Features, and how the images were rendered for detection."""
-
-    detected: DetectedFeatures
-    stretch: Stretch | None  # grey levels that became 0 and 255 in all images; None where they are those of 8 bits
-    equalized: tuple[int, ...]  # the images whose local contrast was equalized because they showed too little otherwise
-
-
 def detect_by_contrast(
     sources: Sequence[Source],
     options: FeatureOptions,
@@ -141,7 +125,7 @@ def detect_by_contrast(
     *,
     skip_bad: bool,
     progress: Progress,
-) -> DetectionByContrast:
+) -> DetectedFeatures:
     """Detect the features of all images, if necessary once more; see :func:`detect_features`."""
     reuse_freed_memory()
     detect = partial(detect_features, executor=executor, store=store, skip_bad=skip_bad, progress=progress)
@@ -153,17 +137,17 @@ def detect_by_contrast(
     poor = [] if options.equalize is not None or len(depths) > 1 else _show_little(sources, detected, options)
     all_of_them = tuple(range(len(sources)))
     if not poor:
-        return DetectionByContrast(detected, stretch, all_of_them if options.equalize else ())
+        return replace(detected, equalized=all_of_them if options.equalize else ())
     most = 2 * len(poor) >= len(sources) - len(detected.damaged)
     chosen = all_of_them if most else tuple(poor)
     wanted = [sources[k] for k in chosen]
     own = options.stretch or _stretch_of(wanted, options, executor, store)
     again = detect(wanted, replace(options, stretch=own, equalize=True))
     if np.median(_shown(again.features.items)) <= np.median(_shown(detected.features.items)[list(chosen)]):
-        return DetectionByContrast(detected, stretch, ())
+        return detected
     items = dict(enumerate(detected.features.items)) | dict(zip(chosen, again.features.items, strict=True))
-    merged = replace(detected, features=FeatureStore(tuple(items.values())))
-    return DetectionByContrast(merged, own if most else stretch, chosen)
+    features = FeatureStore(tuple(items.values()))
+    return replace(detected, features=features, stretch=own if most else stretch, equalized=chosen)
 
 
 def _show_little(sources: Sequence[Source], detected: DetectedFeatures, options: FeatureOptions) -> list[int]:
@@ -190,32 +174,23 @@ def _shown(features: Sequence[StoredFeatures]) -> IntArray:
 
 def _stretch_of(sources: Sequence[Source], options: FeatureOptions, executor: Executor, store: Cache) -> Stretch | None:
     """The stretch that suits all images together."""
-    tasks = (_StretchTask(source, options.limits[1], store) for source in sources)
     found = []
-    for stretch, notes in in_order(executor, _stretch_of_one, tasks):
+    for stretch, notes in in_order(
+        executor, partial(_stretch_of_one, megapixels=options.limits[1], store=store), sources
+    ):
         sources[0].guard.learn(notes)
         found.append(stretch)
     return common_stretch(found)
 
 
-@dataclass(frozen=True)
-class _StretchTask:
-    """An image whose own stretch is wanted, at so many 10⁶ pixels."""
-
-    source: Source
-    megapixels: float | None
-    store: Cache
-
-
-def _stretch_of_one(task: _StretchTask) -> tuple[Stretch | None, GuardNotes]:
+def _stretch_of_one(source: Source, *, megapixels: float | None, store: Cache) -> tuple[Stretch | None, GuardNotes]:
     """The stretch of an image, None for one that cannot be read; and what was noticed of its file."""
-    source, store = task.source, task.store
 
     def compute() -> Stretch | None:
         try:
-            return usual_stretch(source.view(task.megapixels))
+            return usual_stretch(source.view(megapixels))
         except InputError:  # left out, or reported, by the detection
             return None
 
-    inputs = (source.content(store), source.mask_content(store), task.megapixels)
+    inputs = (source.content(store), source.mask_content(store), megapixels)
     return store.recall("stretches", inputs, compute), source.guard.notes_on([source.path])

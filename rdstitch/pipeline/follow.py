@@ -211,7 +211,7 @@ class Tracker:
     def __init__(self, options: StitchOptions | None = None, poses: FollowedPoses | None = None) -> None:
         self._options, self._poses = options or StitchOptions(), poses or FollowedPoses()
         self._detection = _live_features(self._options.features)
-        how = TrackingOptions(self._options.matching.pair, alignment_options([], self._options))
+        how = TrackingOptions(self._options.estimation, alignment_options([], self._options))
         self._frames = FrameTracker(how, partial(match, ratio=self._options.ratio))
         self._labels: dict[int, Pose] = {}  # of the frames that may still find their place
         self._numbers = count()
@@ -243,7 +243,18 @@ class Tracker:
 
     def read(self, frame: Frame) -> tuple[Source | None, PreparedImage | None, str]:
         """The frame as a source, and as it is tracked; or why it is not."""
-        return _read(frame, self._options, self._detection)
+        options, features = self._options, self._detection
+        sources, unread = read_frames([frame], options, skip_bad=True)
+        if not sources:
+            return None, None, unread[0].text
+        common = options.mask is not None and not Path(options.mask).is_dir()
+        source = with_masks(sources, options.mask if common else None)[0]
+        megapixels = features.limits[1]
+        try:
+            view = source.view(megapixels)
+            return source, prepare(view, megapixels, stretch=features.stretch, equalize=bool(features.equalize)), ""
+        except InputError as error:
+            return source, None, str(error)
 
     def register(self, frame: Frame, source: Source | None, image: PreparedImage | None, reason: str) -> list[Pose]:
         """Register a frame that was read; it comes last, after those before it that only now have found their place."""
@@ -298,23 +309,6 @@ def _live_features(options: FeatureOptions) -> FeatureOptions:
         max_features=min(most, _FEATURES),
         work_megapixels=_MEGAPIXELS if megapixels is None else min(megapixels, _MEGAPIXELS),
     )
-
-
-def _read(
-    frame: Frame, options: StitchOptions, features: FeatureOptions
-) -> tuple[Source | None, PreparedImage | None, str]:
-    """The frame as a source, and as it is tracked; or why it is not."""
-    sources, unread = read_frames([frame], options, skip_bad=True)
-    if not sources:
-        return None, None, unread[0].text
-    common = options.mask is not None and not Path(options.mask).is_dir()
-    source = with_masks(sources, options.mask if common else None)[0]
-    megapixels = features.limits[1]
-    try:
-        view = source.view(megapixels)
-        return source, prepare(view, megapixels, stretch=features.stretch, equalize=bool(features.equalize)), ""
-    except InputError as error:
-        return source, None, str(error)
 
 
 def _features(source: Source, options: FeatureOptions, camera: Camera) -> Features:

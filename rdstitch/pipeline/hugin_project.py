@@ -47,7 +47,7 @@ def project_of_hugin(result: StitchResult) -> str:
             variables += [f"v {name}{place}" for name in _pose(alignment, k)]
     control = []
     for pair in registration.pairs:
-        ends = (pair.image1, pair.image2)
+        ends = pair.images
         if ends in alignment.support and set(ends) <= number.keys():
             link = pair.link().thinned(_CONTROL_POINTS)
             points = [

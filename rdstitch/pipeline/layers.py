@@ -30,7 +30,7 @@ def layer_files(names: list[str], folder: str | Path) -> list[Path]:
 
 
 def make_folder(folder: str | Path) -> None:
-    """Make the folder of layers, which is better known before long work than after it."""
+    """Make a folder of outputs, or say why not, which is better known before long work than after it."""
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -75,9 +75,7 @@ def match_crossings(
         with ThreadPoolExecutor(workers) as pool:
             crossings.update(zip(new, pool.map(crossings_of, new), strict=True))
         pairs = [
-            _matched(pair, alignment, crossings, aligner.threshold)
-            if (pair.image1, pair.image2) in alignment.support
-            else pair
+            _matched(pair, alignment, crossings, aligner.threshold) if pair.images in alignment.support else pair
             for pair in aligned.pairs
         ]
         if all(new is old for new, old in zip(pairs, aligned.pairs, strict=True)):

@@ -71,11 +71,11 @@ def settle_repeated_pattern(
         there = to_plane(alignment.cameras[i], alignment.homographies[i], points) + shifts[i, j].shift
         return from_plane(alignment.cameras[j], alignment.homographies[j], there)
 
-    decided = [pair for pair in compared if (pair.image1, pair.image2) in shifts]
-    sound = [pair for pair in compared if (pair.image1, pair.image2) not in doubtful]
-    again = {(pair.image1, pair.image2): pair for pair in [*sound, *pairing.rematch_elsewhere(decided, transfer)]}
+    decided = [pair for pair in compared if pair.images in shifts]
+    sound = [pair for pair in compared if pair.images not in doubtful]
+    again = {pair.images: pair for pair in [*sound, *pairing.rematch_elsewhere(decided, transfer)]}
     try:
-        settled = aligner.align([again.get((pair.image1, pair.image2), _undecided(pair)) for pair in aligned.pairs])
+        settled = aligner.align([again.get(pair.images, _undecided(pair)) for pair in aligned.pairs])
     except RegistrationError:
         return aligned, {}
     placed = settled.alignment.used

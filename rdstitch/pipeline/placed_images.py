@@ -13,7 +13,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.compositing.near_part import NearPart
-from rdstitch.compositing.placed_image import Displacement, PlacedImage, place_images
+from rdstitch.compositing.placed_image import Displacement, PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference, has_place
@@ -123,15 +123,17 @@ class PlacedImages:
                 partial(_read_moving, reader, self.static) if camera.image_size == common else reader
                 for reader, camera in zip(read, self.cameras, strict=True)
             ]
-        return place_images(
-            read,
-            self.cameras,
-            self.homographies,
-            preview=read,
-            exposure=[source.metadata.exposure for source in self.sources],
-            displacement=self.displacements or None,
-            paths=[str(source.path) for source in self.sources],
-        )
+        return [
+            PlacedImage(reader, camera, matrix, reader, source.metadata.exposure, displacement, str(source.path))
+            for reader, camera, matrix, source, displacement in zip(
+                read,
+                self.cameras,
+                self.homographies,
+                self.sources,
+                self.displacements or [None] * len(self.sources),
+                strict=True,
+            )
+        ]
 
 
 def _read_moving(read: Callable[..., DecodedImage], static: NDArray[np.bool_], reduction: int = 1) -> DecodedImage:

@@ -22,6 +22,7 @@ from rdstitch.options import StitchOptions
 from rdstitch.orientation import quarter_turn
 from rdstitch.outputs import Outputs, check_distinct, check_output, json_bytes, temporary_folder, text_bytes
 from rdstitch.pipeline.accept import accept, scale_uncertainty
+from rdstitch.pipeline.aligner import Purpose
 from rdstitch.pipeline.compose import blocks_on, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
@@ -227,7 +228,7 @@ def _stitch(
         check_map(sources, options.composite)
         with options.executor(len(sources)) as executor:
             known = [*unread, *found.messages]
-            accepted = _accepted(sources, known, options, executor, progress, skip_bad=not pano, prefer_turn=pano)
+            accepted = _accepted(sources, known, options, executor, progress, "pano" if pano else "mosaic")
             registration = on_whole_pixels(with_frontal_reference(accepted, options, always=pano))
             local = align_registration_locally(registration, options.local_alignment)
             with Outputs(options.overwrite) as outputs:
@@ -267,7 +268,7 @@ def calibrate(
         sources, unread = read_inputs(found.frames, options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *found.messages]
-            result = _finished(_accepted(sources, known, options, executor, progress, skip_bad=True, lens_only=True))
+            result = _finished(_accepted(sources, known, options, executor, progress, "calibrate"))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
         if beside is not None:
@@ -325,7 +326,7 @@ def trajectory(
         times = timestamps_of(sources, timestamps)
         with options.executor(len(sources)) as executor:
             known = [*unread, *found.messages]
-            registration = _accepted(sources, known, options, executor, progress, skip_bad=True, metric=True)
+            registration = _accepted(sources, known, options, executor, progress, "trajectory")
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])
@@ -349,17 +350,12 @@ def _accepted(
     options: StitchOptions,
     executor: Executor,
     progress: Progress,
-    *,
-    skip_bad: bool,
-    metric: bool = False,
-    lens_only: bool = False,
-    prefer_turn: bool = False,
+    purpose: Purpose,
 ) -> Registration:
     """Register and check, with what is known of the inputs already; a failure names those that could not be read."""
-    purpose = {"metric": metric, "lens_only": lens_only, "prefer_turn": prefer_turn}
     try:
-        registration = register(sources, options, executor, skip_bad=skip_bad, progress=progress, **purpose)
-        return accept(registration.with_messages(known), options, **purpose)
+        registration = register(sources, options, executor, purpose=purpose, progress=progress)
+        return accept(registration.with_messages(known), options, purpose)
     except RegistrationError as error:
         unread = [str(replace(message, code="")) for message in told_once(known) if message.severity == "left out"]
         error.args = ("; ".join([str(error), *unread]),)
@@ -406,16 +402,10 @@ def compose_registration(
         dry_run=options.dry_run,
     )
     result = StitchResult(
-        _finished(registration).with_messages((*said, *composed.messages)),
-        composed.canvas,
-        options.for_images(len(registration.sources)),
-        None if output is None else Path(output),
-        composed.composite,
-        composed.plan,
-        composed.fingerprint,
-        local,
-        composed.place,
-        composed.place_reason,
+        registration=_finished(registration).with_messages((*said, *composed.messages)),
+        options=options.for_images(len(registration.sources)),
+        local_alignment=local,
+        **composed.output_fields,
     )
     if options.dry_run:
         return result

@@ -2,16 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from rdstitch.compositing import Canvas, Composite, CompositeOptions, CompositePlan
-from rdstitch.export.georeference import Georeference
+from rdstitch.compositing import CompositeOptions
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.inputs.source import Source
 from rdstitch.messages import Message
 from rdstitch.orientation import inverse
-from rdstitch.outputs import Fingerprint
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.write import (
@@ -27,9 +24,9 @@ from rdstitch.sidecar.write import (
 from rdstitch.stitch_result import OutputImage
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class Recomposition(OutputImage):
-    """An image made from a saved registration.
+    """An image made from a saved registration; also as :class:`rdstitch.stitch_result.OutputImage` has it.
 
     Attributes
     ----------
@@ -42,22 +39,11 @@ class Recomposition(OutputImage):
         Images that the registration used and that are not in the output, by their number, with the reason.
     placed : PlacedImages
         Those that are in the output.
-    canvas : Canvas
     composite_options : CompositeOptions
-    output : Path or None
-        File that the image was written to.
-    composite : Composite or None
-        The image itself; None where it went to a file, or was only planned.
-    plan : CompositePlan or None
-        Of a dry run.
     messages : tuple of Message
         What the user should know of the compositing, and of the sidecar.
     channel_order : str
         Of :attr:`image`: "bgr" or "rgb".
-    fingerprint : Fingerprint or None
-        Size and digest of the file.
-    georeference, not_georeferenced : Georeference or None, and str
-        As of :class:`rdstitch.StitchResult`.
     """
 
     saved: SavedRegistration
@@ -65,16 +51,9 @@ class Recomposition(OutputImage):
     matched: str
     left_out: Mapping[int, Message]
     placed: PlacedImages
-    canvas: Canvas
     composite_options: CompositeOptions
-    output: Path | None = None
-    composite: Composite | None = None
-    plan: CompositePlan | None = None
     messages: tuple[Message, ...] = ()
     channel_order: ChannelOrder = "bgr"
-    fingerprint: Fingerprint | None = None
-    georeference: Georeference | None = None
-    not_georeferenced: str = "not tried"
 
     @property
     def image_order(self) -> ChannelOrder:

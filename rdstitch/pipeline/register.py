@@ -1,11 +1,9 @@
 """The registration that pano, mosaic, calibrate and trajectory share: features, pairs, one alignment."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
-
-import numpy as np
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames import frontal_reference, in_frame_of
@@ -18,9 +16,9 @@ from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.messages import Message, left_out, names_of, shortened
+from rdstitch.messages import Message, names_of, shortened
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail, select_by_whole_lens
+from rdstitch.pipeline.aligner import Aligner, Purpose, close_loops, impossible_estimates_fail, select_by_whole_lens
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.pattern_crossings import match_crossings
 from rdstitch.pipeline.pattern_shifts import settle_repeated_pattern
@@ -42,10 +40,7 @@ def register(
     options: StitchOptions,
     executor: Executor,
     *,
-    skip_bad: bool,
-    metric: bool = False,
-    lens_only: bool = False,
-    prefer_turn: bool = False,
+    purpose: Purpose = "mosaic",
     progress: Progress = silent,
 ) -> Registration:
     """Detect features, register pairs, and align all images as one.
@@ -58,24 +53,17 @@ def register(
     ----------
     executor : concurrent.futures.Executor
         Where features are detected and pairs are registered; see :func:`rdstitch.executors.open_executor`.
-    skip_bad : bool
-        Leave out damaged images instead of raising.
-    metric : bool
-        Metric poses are needed, so that the freest model is that of planar motion with small tilts.
-    lens_only : bool
-        Only the lens is wanted, so that images of a repeated pattern may be off by whole periods of it.
-    prefer_turn : bool
-        A turn on the spot is taken where a plane explains the images as well.
+    purpose : str
+        See :data:`rdstitch.pipeline.aligner.Purpose`.
     """
     options = options.for_images(len(sources))
     cache = Cache.at(options.cache)
-    layout_matters = not (lens_only or metric)
     if options.known_distortion is None:
         sources = with_image_circle(sources, executor, cache, options.features.limits[1])
-    aligner = Aligner.of(sources, options, cache, prefer_turn=prefer_turn, layout_matters=layout_matters)
+    aligner = Aligner.of(sources, options, cache, purpose)
     store = cache if options.cache is not None else Cache.for_this_run()
-    rendered = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)
-    detected = rendered.detected
+    skip_bad = purpose != "pano"
+    detected = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))
@@ -84,26 +72,29 @@ def register(
         features,
         cameras,
         _matcher(options),
-        options.matching,
+        options.estimation,
         progress,
         executor,
         cache,
         store,
+        options.ratio,
+        options.lightglue_model,
         aligner.exact_tilts,
     )
     found = pairing.estimate_candidates(candidates)
     moving = pairing.without_static_background(found, candidates)
     pairing, found = moving or (pairing, found)
-    found = pairing.match_repeated_patterns(found) if lens_only else found
+    found = pairing.match_repeated_patterns(found) if purpose == "calibrate" else found
     mixed, other_lens = separate_lenses(aligner.cameras, found, options.threshold, options.known_distortion)
     aligned = aligner.align([pair for pair in found if not {*pair.images} & other_lens.keys()])
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
     aligned = close_loops(aligner, pairing, aligned, candidates)
     aligned = select_by_whole_lens(aligner, aligned)
-    settle = match_crossings if lens_only else settle_repeated_pattern
-    aligned, undecided = settle(aligner, pairing, aligned, sources, rendered.stretch, options.threads)
-    if metric:
+    settle = match_crossings if purpose == "calibrate" else settle_repeated_pattern
+    aligned, undecided = settle(aligner, pairing, aligned, sources, detected.stretch, options.threads)
+    if purpose == "trajectory":
         aligned = aligner.metric(aligned)
+    unplaced = {**other_lens, **detected.damaged, **undecided}
     return Registration(
         tuple(sources),
         counts := tuple(features.counts.tolist()),
@@ -112,11 +103,11 @@ def register(
         (
             *aligned.alignment.messages,
             *([_STATIC_BACKGROUND] if moving else []),
-            *_low_contrast(rendered.equalized, aligned.alignment, aligner.paths),
-            *_left_out(aligned.alignment, aligner.paths, counts, {**other_lens, **detected.damaged, **undecided}),
+            *_low_contrast(detected.equalized, aligned.alignment, aligner.paths),
+            *explain_unaligned(aligned.alignment, aligner.paths, counts, unplaced),
         ),
         static_background=moving is not None,
-        stretch=rendered.stretch,
+        stretch=detected.stretch,
         mixed=mixed,
     )
 
@@ -158,15 +149,3 @@ def _low_contrast(equalized: Sequence[int], alignment: Alignment, paths: Sequenc
     who = "shows" if len(images) == 1 else f"{several} show"
     text = f"{who} little contrast: features were found after equalizing it locally"
     return [Message(text, images, "detail", code="low-contrast")]
-
-
-def _left_out(
-    alignment: Alignment, paths: Sequence[str], keypoints: Sequence[int], reasons: Mapping[int, str]
-) -> list[Message]:
-    """Why images are not in the alignment, which is known beforehand of those that never reached it."""
-    return [
-        message if index not in reasons else left_out(paths[index], reasons[index])
-        for index, message in zip(
-            np.flatnonzero(~alignment.used).tolist(), explain_unaligned(alignment, paths, keypoints), strict=True
-        )
-    ]

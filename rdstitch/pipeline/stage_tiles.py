@@ -22,7 +22,7 @@ from rdstitch.io.reduction import mean_of_channels
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.messages import MAX_NAMED, Message, names_of
+from rdstitch.messages import Message, names_of, shortened
 from rdstitch.options import StitchOptions
 from rdstitch.outputs import Outputs, check_distinct, check_output, text_bytes
 from rdstitch.pipeline.flat_field import check_size, with_flat_field
@@ -260,14 +260,14 @@ def _messages(sources: Sequence[Source], tiled: TileRegistration) -> tuple[Messa
     alone = np.flatnonzero(~tiled.linked)
     if len(alone):
         paths = [str(sources[k].path) for k in alone.tolist()]
-        named = ", ".join(names_of(paths)[:MAX_NAMED]) + (" …" if len(alone) > MAX_NAMED else "")
+        named = shortened(names_of(paths))
         who = "1 tile has its place" if len(alone) == 1 else f"{len(alone)} tiles have their places"
         text = f"{who} from the stage alone, ± {stage.std:.1f} pixels, since no neighbour shows the same: {named}"
         messages.append(Message(text, severity="note", code="nominal-places"))
     if len(tiled.groups) > 1:
         others = [k for group in tiled.groups[1:] for k in group]
         paths = [str(sources[k].path) for k in others]
-        named = ", ".join(names_of(paths)[:MAX_NAMED]) + (" …" if len(others) > MAX_NAMED else "")
+        named = shortened(names_of(paths))
         text = (
             f"tiles form {len(tiled.groups)} groups that only the stage holds together, ± "
             f"{max(stage.std, stage.row_std, stage.column_std):.1f} pixels: {named} have no link to the largest"

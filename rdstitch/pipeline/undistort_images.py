@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal, get_args, overload
+from typing import Any, Literal, TypedDict, Unpack, get_args, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
 from rdstitch.messages import Message, ignored
 from rdstitch.outputs import IMAGE_SUFFIXES, check_outputs
+from rdstitch.pipeline.layers import make_folder
 from rdstitch.progress import Progress, silent
 
 Framing = Literal["same", "all", "valid"]
@@ -30,40 +31,22 @@ ImageFormat = Literal["jpg", "png", "tif", "webp"]
 _POINTS_PER_SIDE = 256
 
 
-@overload
-def undistort(
-    inputs: Images,
-    folder: str | Path,
-    *,
-    camera: Camera | None = None,
-    distortion: float | None = None,
-    view: Framing = "same",
-    image_format: ImageFormat | None = None,
-    overwrite: bool = False,
-    topic: str | None = None,
-    channel_order: ChannelOrder = "bgr",
-    warn: Callable[[Message], None] = ignored,
-    progress: Progress = silent,
-) -> list[Path]: ...
+class _Choices(TypedDict, total=False):
+    camera: Camera | None
+    distortion: float | None
+    view: Framing
+    image_format: ImageFormat | None
+    overwrite: bool
+    topic: str | None
+    channel_order: ChannelOrder
+    warn: Callable[[Message], None]
+    progress: Progress
 
 
 @overload
-def undistort(
-    inputs: Images,
-    folder: None = None,
-    *,
-    camera: Camera | None = None,
-    distortion: float | None = None,
-    view: Framing = "same",
-    image_format: ImageFormat | None = None,
-    overwrite: bool = False,
-    topic: str | None = None,
-    channel_order: ChannelOrder = "bgr",
-    warn: Callable[[Message], None] = ignored,
-    progress: Progress = silent,
-) -> list[NDArray[Any]]: ...
-
-
+def undistort(inputs: Images, folder: str | Path, **choices: Unpack[_Choices]) -> list[Path]: ...
+@overload
+def undistort(inputs: Images, folder: None = None, **choices: Unpack[_Choices]) -> list[NDArray[Any]]: ...
 def undistort(
     inputs: Images,
     folder: str | Path | None = None,
@@ -152,10 +135,7 @@ def _undistorted(source: Source, view: Framing) -> Composite:
 def _existing(folder: Path) -> Iterator[None]:
     """A folder that exists inside the block, and afterwards if anything was written into it."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
+    make_folder(folder)
     try:
         yield
     except BaseException:

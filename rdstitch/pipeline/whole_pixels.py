@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rdstitch.alignment import Alignment
-from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.arrays import FloatArray
 from rdstitch.matching.match_graph import spanning_tree
 from rdstitch.registration import Registration
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
@@ -59,12 +58,13 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
     number = np.cumsum(alignment.used) - 1
     pairs, shifts, spread, left = [], [], [], []
     for pair in registration.pairs:
-        if (pair.image1, pair.image2) not in support:
+        if pair.images not in support:
             continue
         link = pair.link()
         moved = link.points1 - link.points2
         shift = np.rint(np.median(moved, axis=0))
-        whole, fitted = moved - shift, _errors(alignment, pair.image1, pair.image2, link.points1, link.points2)
+        expected = alignment.transfer(pair.image1, pair.image2, link.points1)
+        whole, fitted = moved - shift, np.nan_to_num(expected - link.points2)  # 0 where a lens cannot see them
         # Of most sets the first pair already says no.
         if np.median(np.linalg.norm(whole, axis=1)) > 0.5 + np.median(np.linalg.norm(fitted, axis=1)):
             return None
@@ -75,23 +75,14 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
     if not pairs or max(spread) > _RESOLVED:
         return None
     first, second = np.array(pairs, dtype=np.intp).T
-    places = _chained(first, second, np.array(shifts), int(number[alignment.reference]), int(alignment.used.sum()))
+    motions = np.tile(np.eye(3), (len(first), 1, 1))
+    motions[:, :2, 2] = shifts
+    root = int(number[alignment.reference])
+    tree = spanning_tree(int(alignment.used.sum()), first, second, np.ones(len(first)), root)
+    places = np.rint(tree.chained(motions, first, np.eye(3))[:, :2, 2])
     if (places[second] - places[first] != shifts).any():
         return None
     squared, fit = (np.concatenate([errors[k] for errors in left]) for k in (0, 1))
     sigma = math.hypot(math.sqrt(float(np.median(fit))) / RAYLEIGH_MEDIAN, _EXACTNESS)
     worse = float((robust_cost(squared, ALIGNMENT_WIDTH * sigma) - robust_cost(fit, ALIGNMENT_WIDTH * sigma)).sum())
     return places if worse <= _FREEDOM * (len(places) - 1) * math.log(len(fit)) * sigma**2 else None
-
-
-def _errors(alignment: Alignment, image1: int, image2: int, points1: FloatArray, points2: FloatArray) -> FloatArray:
-    """What the alignment leaves of matches (M, 2), pixels; 0 where a lens cannot see them."""
-    return np.nan_to_num(alignment.transfer(image1, image2, points1) - points2)
-
-
-def _chained(first: IntArray, second: IntArray, shifts: FloatArray, root: int, count: int) -> FloatArray:
-    """Sums of shifts along a spanning tree of the links."""
-    tree, places = spanning_tree(count, first, second, np.ones(len(first)), root), np.zeros((count, 2))
-    for link, parent, child in zip(tree.link, tree.parent, tree.child, strict=True):
-        places[child] = places[parent] + (shifts[link] if first[link] == parent else -shifts[link])
-    return places

@@ -1,9 +1,7 @@
 """Homography and distortion of pairs of images from their matches: the public functions."""
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,12 +13,10 @@ from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
+from rdstitch.robust.options import EstimationOptions, SolverName
 from rdstitch.robust.pair_models import PlanarPairModel
-from rdstitch.robust.ransac import RansacOptions, ransac
+from rdstitch.robust.ransac import ransac
 from rdstitch.robust.verification import MIN_PLACES, places, rejection_reason
-
-SolverName = Literal["auto", "two_point", "three_point", "three_point_similarity", "four_point", "five_point"]
-SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 
 _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
 _MATCHES_AT_ONCE = 1 << 14
@@ -59,30 +55,6 @@ class PairMatches:
         return np.arange(len(self)) if self.quality is None else np.argsort(-self.quality, kind="stable")
 
 
-@dataclass(frozen=True)
-class EstimationOptions:
-    """How pairs are estimated."""
-
-    solver: str = "auto"  # one of :data:`SOLVERS`
-    distortion: float | None = None  # known λ in the half-diagonal frame; it is then not estimated
-    ransac: RansacOptions = field(default_factory=RansacOptions)
-    # inliers below which the models of planar motion compete with the free homography, which needs more of them; None:
-    # always
-    select_below: int | None = None
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if self.solver not in SOLVERS:
-            raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
-        if self.distortion is not None and self.solver != "auto":
-            raise ArgumentError(f"with known distortion there is nothing to choose; leave out solver={self.solver!r}")
-        if self.distortion is not None and not -math.inf < self.distortion < 1.0:
-            raise ArgumentError(f"distortion must be a number below 1, not {self.distortion}")
-        limits = self.ransac
-        if not limits.threshold > 0.0 or not 0.0 < limits.confidence < 1.0 or limits.max_iterations < 1:
-            raise ArgumentError("threshold and max_iterations must be positive, confidence between 0 and 1")
-
-
 def estimate_radial_homography(
     points1: ArrayLike,
     points2: ArrayLike,
@@ -118,7 +90,7 @@ def estimate_radial_homography(
     center : (float, float), optional
         Distortion centre of image 1, pixels; the image centre if not given.
     solver : str
-        One of :data:`SOLVERS`. "auto" lets all solvers that the input allows compete.
+        One of :data:`rdstitch.robust.SOLVERS`. "auto" lets all solvers that the input allows compete.
     tilt : array_like of shape (2,) or (2, 2), optional
         Known tilt (ψ, θ), radians, or one an image.
     distortion : float, optional
@@ -154,8 +126,7 @@ def estimate_radial_homography(
     """
     camera1 = Camera(image_size, focal=focal, focal_source=None if focal is None else focal_source or "option")
     camera1 = (camera1 if center is None else replace(camera1, center=center)).with_focal()
-    limits = RansacOptions(threshold, confidence, max_iterations, seed, MIN_PLACES)
-    options = EstimationOptions(solver, distortion, limits)
+    options = EstimationOptions(solver, distortion, threshold, confidence, max_iterations, seed)
     tilts = _tilts(tilt)
     p1, p2 = checked_matches(points1, points2)
     weights = None if quality is None else np.asarray(quality, dtype=np.float64)
@@ -197,8 +168,8 @@ def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> lis
     ordered = np.array([pair.quality is not None for pair in pairs])
     focal, std = pairs[0].focal, pairs[0].camera1.focal_log_std
     solvers = _solvers(options, focal, std, tilts is not None)
-    search = ransac(solvers, data, ordered, tilts, options.ransac)
-    threshold = options.ransac.threshold
+    search = ransac(solvers, data, ordered, tilts, options)
+    threshold = options.threshold
 
     found = np.flatnonzero(np.isfinite(search.best.cost))
     limit = np.inf if options.select_below is None else options.select_below

@@ -1,12 +1,11 @@
 """Levenberg-Marquardt for many small problems in lockstep."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, Self
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 
 MIN_GAIN = 1e-5
 """Expected relative fall of the loss of all images that is worth another step: a hundredth of the noise."""
@@ -21,7 +20,7 @@ _MIN_DAMPING = 1e-9
 
 
 @dataclass
-class BatchedNormalEquations:
+class BatchedNormalEquations(Rows):
     """The loss of B problems at some parameters, and what a step from there takes."""
 
     cost: FloatArray  # (B,)
@@ -33,15 +32,6 @@ class BatchedNormalEquations:
     def errors(self) -> FloatArray:
         """Errors of the measurements, (B, N); inf where there is none."""
         return np.sqrt(self.squared)
-
-    def take(self, rows: BoolArray | IntArray) -> "BatchedNormalEquations":
-        """Those of some problems."""
-        return BatchedNormalEquations(self.cost[rows], self.information[rows], self.gradient[rows], self.squared[rows])
-
-    def put(self, rows: IntArray, others: "BatchedNormalEquations") -> None:
-        """Replace those of some problems."""
-        self.cost[rows], self.information[rows] = others.cost, others.information
-        self.gradient[rows], self.squared[rows] = others.gradient, others.squared
 
     def where(self, better: BoolArray, others: "BatchedNormalEquations") -> "BatchedNormalEquations":
         """The others where they are better."""
@@ -63,14 +53,13 @@ class Problems(Protocol):
         """At parameters (B, K)."""
         ...
 
-
-Retract = Callable[[FloatArray, FloatArray], tuple[FloatArray, BoolArray]]
-"""Parameters (B, K) and steps (B, P) to the parameters after the step, and whether these are possible (B,)."""
+    def retract(self, parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Parameters after steps (B, P), and whether they are possible."""
+        ...
 
 
 def descend(
     problems: Problems,
-    retract: Retract,
     start: FloatArray,
     iterations: int,
     *,
@@ -94,7 +83,7 @@ def descend(
         if not going.all():
             rows, step, parameters, damping = rows[going], step[going], parameters[going], damping[going]
             problems, current = problems.take(going), current.take(going)
-        moved, possible = retract(parameters, step)
+        moved, possible = problems.retract(parameters, step)
         there = problems.normal_equations(moved)
         better = possible & (there.cost < current.cost)
         damping = next_damping(damping, better)

@@ -12,6 +12,7 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.division_model import distorted_ratio
+from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
 from rdstitch.robust.loss import loss_ratio
 from rdstitch.robust.measurements import Measurements
 
@@ -133,20 +134,10 @@ def _precision(by_point: FloatArray) -> FloatArray:
     return np.stack([yy * scale, -xy * scale, xx * scale], axis=1)
 
 
-@dataclass(frozen=True)
-class EntryEquations:
-    """Loss and normal equations by the entries of H, row by row, and then by the lens: 9 + E of them."""
-
-    cost: FloatArray  # (B,)
-    information: FloatArray  # (B, 9 + E, 9 + E)
-    gradient: FloatArray  # (B, 9 + E)
-    squared: FloatArray  # (B, N): squared whitened errors, px²; inf where there is no transfer, or no match
-
-
 def entry_equations(
     found: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool
-) -> EntryEquations:
-    """The loss with its scale ``c`` (B,), pixels, and its normal equations by the entries of H and the lens."""
+) -> BatchedNormalEquations:
+    """The loss with its scale ``c`` (B,), pixels, and its normal equations by the entries of H, then by the lens."""
     squared = found.squared
     relative = loss_ratio(squared, scale[:, None])
     lost, useless = found.lost & present, found.lost | ~present
@@ -181,7 +172,7 @@ def entry_equations(
         own = across[:, 3:-1] @ left_across[:, 3:].swapaxes(1, 2) + down[:, 3:-1] @ left_down[:, 3:].swapaxes(1, 2)
         information[:, 9:, 9:] = own[:, :, :extra]
         gradient[:, 9:] = own[:, :, extra]
-    return EntryEquations(cost, information, gradient, squared)
+    return BatchedNormalEquations(cost, information, gradient, squared)
 
 
 def influence(found: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool) -> FloatArray:

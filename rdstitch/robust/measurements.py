@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 
@@ -17,7 +17,7 @@ _MIN_WIDTH = 16
 
 
 @dataclass(frozen=True)
-class Measurements:
+class Measurements(Rows):
     """Matches of B pairs of images, normalized by half the diagonal of their image, padded to N a pair.
 
     Attributes
@@ -69,10 +69,6 @@ class Measurements:
         """Squared distance of the points of image 1 from the distortion centre, (B, N)."""
         return self.x1[:, 0] ** 2 + self.x1[:, 1] ** 2
 
-    def take(self, pairs: NDArray[Any]) -> Self:
-        """Some of the pairs, by index or as a mask."""
-        return type(self)(*(getattr(self, name)[pairs] for name in _COLUMNS))
-
     def only(self, chosen: BoolArray) -> Self:
         """Without the matches that are not chosen (B, N)."""
         return type(self)(self.x1, self.x2, self.present & chosen, self.count, self.px, self.px_ratio)
@@ -83,9 +79,6 @@ class Measurements:
         x1, x2 = (np.take_along_axis(x, places[:, None], axis=2) for x in (self.x1, self.x2))
         present = np.take_along_axis(self.present, places, axis=1) & (index < self.count[:, None])
         return type(self)(x1, x2, present, present.sum(axis=1), self.px, self.px_ratio)
-
-
-_COLUMNS = ("x1", "x2", "present", "count", "px", "px_ratio")
 
 
 def padded_length(count: int) -> int:

@@ -52,24 +52,26 @@ def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortio
         points2 = partial(solvers.two_point_similarity, distortion=known)
         dlt = partial(solvers.four_point_dlt, distortion=distortion)
         return [
-            MinimalSolver("two_point_similarity", 2, _tilted(points2, focal), similarity, True),
-            MinimalSolver("four_point_dlt", 4, _untilted(dlt), HomographyPairModel(), True),
+            MinimalSolver("two_point_similarity", 2, _scaled(points2, focal, tilted=True), similarity, True),
+            MinimalSolver("four_point_dlt", 4, _scaled(dlt), HomographyPairModel(), True),
         ]
     low, high = SEARCHED_DISTORTION
     searched = {"distortion_range": (low * focal**2, high * focal**2)}
     if tilts_known:
-        planar = MinimalSolver("two_point", 2, _tilted(partial(solvers.two_point, **searched), focal), rigid)
+        planar = MinimalSolver(
+            "two_point", 2, _scaled(partial(solvers.two_point, **searched), focal, tilted=True), rigid
+        )
     else:
-        planar = MinimalSolver("three_point", 3, _untilted(partial(solvers.three_point, **searched), focal), rigid)
-    scaled = partial(solvers.three_point_similarity, **searched)
+        planar = MinimalSolver("three_point", 3, _scaled(partial(solvers.three_point, **searched), focal), rigid)
+    changing = partial(solvers.three_point_similarity, **searched)
     four_point = partial(solvers.four_point, **searched)
     five_point = partial(solvers.five_point, distortion_range=SEARCHED_DISTORTION)
     return [
         planar,
-        MinimalSolver("three_point_similarity", 3, _tilted(scaled, focal), similarity),
-        MinimalSolver("four_point", 4, _untilted(four_point, focal), rigid),
-        MinimalSolver("five_point", 5, _untilted(five_point), HomographyPairModel()),
-        MinimalSolver("four_point_dlt", 4, _untilted(_sampled_distortion), HomographyPairModel()),
+        MinimalSolver("three_point_similarity", 3, _scaled(changing, focal, tilted=True), similarity),
+        MinimalSolver("four_point", 4, _scaled(four_point, focal), rigid),
+        MinimalSolver("five_point", 5, _scaled(five_point), HomographyPairModel()),
+        MinimalSolver("four_point_dlt", 4, _scaled(_sampled_distortion), HomographyPairModel()),
     ]
 
 
@@ -86,26 +88,17 @@ def _sampled_distortion(x1: FloatArray, x2: FloatArray) -> Solutions:
     return Solutions(sample[order], homography[order], distortion[order])
 
 
-def _tilted(solve: Callable[..., Solutions], focal: float) -> Solve:
-    """A solver of focal-normalized points that takes tilts; without any, the camera is taken to be level."""
+def _scaled(solve: Callable[..., Solutions], focal: float = 1.0, *, tilted: bool = False) -> Solve:
+    """A solver of focal-normalized points as one of points in half diagonals.
 
-    def solve_in_half_diagonals(x1: FloatArray, x2: FloatArray, tilts: FloatArray | None = None) -> Solutions:
-        known = (0.0, 0.0) if tilts is None else tilts
-        return _in_half_diagonals(solve(x1 / focal, x2 / focal, tilt=known), focal)
-
-    return solve_in_half_diagonals
-
-
-def _untilted(solve: Callable[..., Solutions], focal: float = 1.0) -> Solve:
-    """A solver of focal-normalized points that does not need tilts."""
-
-    def solve_in_half_diagonals(x1: FloatArray, x2: FloatArray, tilts: FloatArray | None = None) -> Solutions:
-        return _in_half_diagonals(solve(x1 / focal, x2 / focal), focal)
-
-    return solve_in_half_diagonals
-
-
-def _in_half_diagonals(found: Solutions, focal: float) -> Solutions:
-    """With ``x_f = x / focal``: ``λ = λ_f / focal²`` and ``H = K H_f K⁻¹``, ``K = diag(focal, focal, 1)``."""
+    With ``x_f = x / focal``: ``λ = λ_f / focal²`` and ``H = K H_f K⁻¹``, ``K = diag(focal, focal, 1)``. ``tilted``:
+    it takes tilts; without any, the camera is taken to be level.
+    """
     k = np.array([focal, focal, 1.0])
-    return Solutions(found.sample, found.homography * (k[:, None] / k), found.distortion / focal**2)
+
+    def solve_in_half_diagonals(x1: FloatArray, x2: FloatArray, tilts: FloatArray | None = None) -> Solutions:
+        known = {"tilt": (0.0, 0.0) if tilts is None else tilts} if tilted else {}
+        found = solve(x1 / focal, x2 / focal, **known)
+        return Solutions(found.sample, found.homography * (k[:, None] / k), found.distortion / focal**2)
+
+    return solve_in_half_diagonals

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import OBSERVABLE_STD
 from rdstitch.robust.covariance import covariances
+from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
 from rdstitch.robust.loss import PAIR_WIDTH, RAYLEIGH_MEDIAN
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
@@ -34,15 +35,12 @@ class PairFit:
     reason: str
 
 
-@dataclass(frozen=True)
-class _Fitted:
-    """One model fitted to B pairs: the whitened errors (B, N), the loss, px², and the normal matrix at the fits."""
+class _Fitted(NamedTuple):
+    """One model fitted to B pairs, and the equations at the fits."""
 
     model: PairModel
     fits: Fits
-    errors: FloatArray
-    cost: FloatArray
-    information: FloatArray
+    found: BatchedNormalEquations
 
 
 @dataclass(frozen=True)
@@ -73,8 +71,7 @@ class PairSelection:
         """A model fitted to every pair from where it stands, with a loss of the given widths (B,), pixels."""
         start = Fits(model.initialize(self.homography, self.tilts), self.homography, self.distortion)
         problems = PairProblems(model, self.data, width, self.noise, self.fixed_distortion)
-        fits, found = refine_pairs(problems, start, steps, rough=rough)
-        return _Fitted(model, fits, found.errors, found.cost, found.information)
+        return _Fitted(model, *refine_pairs(problems, start, steps, rough=rough))
 
     def at(self, fits: Fits) -> Self:
         """Standing at fits."""
@@ -96,22 +93,23 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
     """
     threshold, homography = pairs.threshold, HomographyPairModel()
     free = pairs.fit(homography, np.full(len(pairs.data), threshold), _FREE_STEPS, rough=True)
-    noise = noise_of(free.errors, threshold)
-    near = replace(pairs.at(free.fits), noise=noise, data=pairs.data.only(free.errors < _MAX_RESIDUAL * threshold))
-    inliers = np.maximum((free.errors < threshold).sum(axis=1), 1)
+    errors = free.found.errors
+    noise = noise_of(errors, threshold)
+    near = replace(pairs.at(free.fits), noise=noise, data=pairs.data.only(errors < _MAX_RESIDUAL * threshold))
+    inliers = np.maximum((errors < threshold).sum(axis=1), 1)
     width, price = loss_width(noise, threshold), noise**2 * np.log(2 * inliers)
     freest = near.fit(homography, width, _STEPS)
     fitted = [*(near.fit(model, width, _STEPS) for model in planar), freest]
-    chosen = np.argmin([found.cost + found.information.shape[1] * price for found in fitted], axis=0)
-    rms = np.stack([rms_of(found.errors, threshold) for found in fitted], axis=1)
+    chosen = np.argmin([each.found.cost + each.found.information.shape[1] * price for each in fitted], axis=0)
+    rms = np.stack([rms_of(each.found.errors, threshold) for each in fitted], axis=1)
     result: dict[int, PairFit] = {}
 
     def finished(index: int, rows: IntArray) -> dict[int, PairFit]:
-        found = fitted[index]
-        own = replace(near.at(found.fits), noise=noise_of(found.errors, threshold)).take(rows)
+        model, fits, found = fitted[index]
+        own = replace(near.at(fits), noise=noise_of(found.errors, threshold)).take(rows)
         reasons = [_explained(fitted, index, rms[row]) for row in rows]
-        fits = _finished(found.model, found.fits.take(rows), own, pairs.data.take(rows), reasons)
-        return dict(zip(rows.tolist(), fits, strict=True))
+        chosen_fits = _finished(model, fits.take(rows), own, pairs.data.take(rows), reasons)
+        return dict(zip(rows.tolist(), chosen_fits, strict=True))
 
     for index in range(len(fitted)):
         rows = np.flatnonzero(chosen == index)
@@ -142,53 +140,28 @@ def _finished(
     reasons : list of str
         Why this model was chosen, for each pair.
     """
-    found = _inspected(model, fits, near, data)
-    std = np.zeros(len(data)) if near.fixed_distortion else np.sqrt(found.covariance[:, 0, 0])
+    errors, covariance = _inspected(model, fits, near, data)
+    std = np.zeros(len(data)) if near.fixed_distortion else np.sqrt(covariance[:, 0, 0])
+    known = [(fits, row, errors[row], covariance[row], std[row], reason) for row, reason in enumerate(reasons)]
     unseen = np.flatnonzero(~(std < OBSERVABLE_STD))
-    straight = None
     if len(unseen):
         level = replace(near.take(unseen), distortion=np.zeros(len(unseen)), fixed_distortion=True)
-        straightened = level.fit(model, loss_width(level.noise, near.threshold), _STEPS).fits
-        straight = _inspected(model, straightened, level, data.take(unseen))
-    place = {row: index for index, row in enumerate(unseen.tolist())}
-    for row, reason in enumerate(reasons):
-        if row not in place or straight is None:
-            yield found.pair(model, row, float(std[row]), reason)
-        else:
-            why = f"{reason}; λ is not observable (standard deviation {std[row]:.2g}) and was set to 0"
-            yield straight.pair(model, place[row], np.inf, why)
+        straight = level.fit(model, loss_width(level.noise, near.threshold), _STEPS).fits
+        errors, covariance = _inspected(model, straight, level, data.take(unseen))
+        for index, row in enumerate(unseen.tolist()):
+            why = f"{reasons[row]}; λ is not observable (standard deviation {std[row]:.2g}) and was set to 0"
+            known[row] = straight, index, errors[index], covariance[index], np.inf, why
+    for own, k, error, spread, deviation, why in known:
+        distortion = float(own.distortion[k])
+        yield PairFit(model, own.state[k], own.homography[k], distortion, error, spread, float(deviation), why)
 
 
-@dataclass(frozen=True)
-class _Inspected:
-    """Fits of B pairs with errors and covariances."""
-
-    fits: Fits
-    errors: FloatArray
-    covariance: FloatArray
-
-    def pair(self, model: PairModel, row: int, std: float, reason: str) -> PairFit:
-        """One of the pairs."""
-        fits = self.fits
-        distortion = float(fits.distortion[row])
-        return PairFit(
-            model,
-            fits.state[row],
-            fits.homography[row],
-            distortion,
-            self.errors[row],
-            self.covariance[row],
-            std,
-            reason,
-        )
-
-
-def _inspected(model: PairModel, fits: Fits, pairs: PairSelection, data: Measurements) -> _Inspected:
-    """The fits as they stand, on all matches."""
+def _inspected(model: PairModel, fits: Fits, pairs: PairSelection, data: Measurements) -> tuple[FloatArray, FloatArray]:
+    """Errors and covariances of fits as they stand, on all matches."""
     width = loss_width(pairs.noise, pairs.threshold)
-    found, shares = PairProblems(model, data, width, pairs.noise, pairs.fixed_distortion).inspect(fits)
-    covariance = covariances(found.information, shares, pairs.noise, data)
-    return _Inspected(fits, found.errors, covariance)
+    problems = PairProblems(model, data, width, pairs.noise, pairs.fixed_distortion)
+    found, shares = problems.inspect(fits.parameters)
+    return found.errors, covariances(found.information, shares, pairs.noise, data)
 
 
 def noise_of(errors: FloatArray, threshold: float) -> FloatArray:

@@ -9,7 +9,6 @@ The functions of a model take the states of B pairs at once. The state of the pl
 """
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
@@ -26,40 +25,6 @@ from rdstitch.planar_motion import (
 
 _TILTS, _YAW, _TX, _TY, _HEIGHT, _FOCAL = slice(0, 4), 4, 5, 6, 7, 8
 _PSI, _THETA = (0, 2), (1, 3)
-
-
-class PairModel(Protocol):
-    """A parametrisation of the homography between two images, in the half-diagonal frame."""
-
-    @property
-    def name(self) -> str:
-        """Name of the model in the family."""
-        ...
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the P entries of a step."""
-        ...
-
-    def initialize(self, homography: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
-        """States (B, S) that describe homographies (B, 3, 3), or come close; known tilts (B, 2, 2), radians."""
-        ...
-
-    def homography(self, state: FloatArray) -> FloatArray:
-        """H (B, 3, 3)."""
-        ...
-
-    def jacobian(self, state: FloatArray) -> FloatArray:
-        """Derivative of the entries of H, row by row, by a step, shape (B, 9, P)."""
-        ...
-
-    def retract(self, state: FloatArray, step: FloatArray) -> FloatArray:
-        """The states after steps of shape (B, P)."""
-        ...
-
-    def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Priors: residuals in standard deviations (B, K), and their derivative (K, P)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -206,3 +171,6 @@ class PlanarPairModel:
 
 
 _IN_PLANE = np.array([1.0, 1.0, 0.0])
+
+PairModel = HomographyPairModel | PlanarPairModel
+"""A parametrisation of the homography between two images, in the half-diagonal frame."""

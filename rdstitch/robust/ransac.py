@@ -7,13 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
+from rdstitch.robust.options import EstimationOptions
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel
 from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
+from rdstitch.robust.verification import MIN_PLACES
 from rdstitch.solvers.solutions import Solutions
 
 # Halved or doubled, none of these changes what is found, only the time.
@@ -28,19 +30,8 @@ _FREE_REFINEMENT = 12  # inliers from which on refinement may leave the model th
 _LOCAL_STEPS = 4
 
 
-@dataclass(frozen=True)
-class RansacOptions:
-    """When to stop, and what counts as agreement."""
-
-    threshold: float = 3.0  # pixels, largest transfer error of an inlier
-    confidence: float = 0.999  # probability that a better model was not missed
-    max_iterations: int = 10000  # samples a pair, over all solvers
-    seed: int = 0
-    least_inliers: int = 8  # a model with fewer would not be accepted, so none such is searched for
-
-
 @dataclass
-class Hypotheses:
+class Hypotheses(Rows):
     """For each of B pairs a homography with λ, and how well it explains the matches."""
 
     homography: FloatArray  # (B, 3, 3): in the half-diagonal frame
@@ -74,19 +65,6 @@ class Hypotheses:
         missed = (relative * data.present).sum(axis=1)
         return cls(homography, distortion, missed / data.count, inliers, np.full(len(data), solver))
 
-    def take(self, rows: IntArray) -> "Hypotheses":
-        """Those of some pairs; copies."""
-        return Hypotheses(
-            self.homography[rows], self.distortion[rows], self.cost[rows], self.inliers[rows], self.solver[rows]
-        )
-
-    def put(self, rows: IntArray, others: "Hypotheses", better: BoolArray) -> None:
-        """Replace those of some pairs where others are better."""
-        where = rows[better]
-        self.homography[where], self.distortion[where] = others.homography[better], others.distortion[better]
-        self.cost[where], self.inliers[where] = others.cost[better], others.inliers[better]
-        self.solver[where] = others.solver[better]
-
 
 @dataclass(frozen=True)
 class Search:
@@ -103,7 +81,7 @@ def ransac(
     data: Measurements,
     ordered: BoolArray,
     tilts: FloatArray | None,
-    options: RansacOptions,
+    options: EstimationOptions,
 ) -> Search:
     """Search the model that explains most matches of each pair, with all solvers taking turns.
 
@@ -120,7 +98,7 @@ def ransac(
         Whether the best matches of a pair come first.
     tilts : ndarray of shape (B, 2, 2) or None
         Known tilts (ψ, θ) of both images, radians.
-    options : RansacOptions
+    options : EstimationOptions
     """
     quick = _subset(data, options.seed)
     lanes = [_Lane(solver, data, quick, ordered, tilts, options, index) for index, solver in enumerate(solvers)]
@@ -144,42 +122,40 @@ def ransac(
     return Search(best, np.sum([lane.drawn for lane in lanes], axis=0), confident)
 
 
+@dataclass(eq=False)
 class _Lane:
     """One minimal solver's share of the search."""
 
-    def __init__(
-        self,
-        solver: MinimalSolver,
-        data: Measurements,
-        quick: Measurements,
-        ordered: BoolArray,
-        tilts: FloatArray | None,
-        options: RansacOptions,
-        index: int,
-    ) -> None:
-        self.drawn = np.zeros(len(data), dtype=np.intp)
-        self._solver, self._index = solver, index
-        self._data, self._quick, self._ordered, self._tilts = data, quick, ordered, tilts
-        self._options = options
-        self._least_raw_cost = np.ones(len(data))
-        self._sampler = Sampler(solver.sample_size, options.max_iterations, [options.seed, index])
+    solver: MinimalSolver
+    data: Measurements
+    quick: Measurements  # a part of the matches
+    ordered: BoolArray
+    tilts: FloatArray | None
+    options: EstimationOptions
+    index: int  # of the solver
+
+    def __post_init__(self) -> None:
+        self.drawn = np.zeros(len(self.data), dtype=np.intp)
+        self._least_raw_cost = np.ones(len(self.data))
+        seed = [self.options.seed, self.index]
+        self._sampler = Sampler(self.solver.sample_size, self.options.max_iterations, seed)
 
     def needed(self, best: Hypotheses, rows: IntArray, *, explore: bool = False) -> FloatArray:
         """Samples after which a better model than the best of each of some pairs is unlikely to have been missed.
 
         With ``explore`` at least as many as every solver draws.
         """
-        counts = self._data.count[rows]
-        agreeing = np.maximum(best.inliers[rows].sum(axis=1), self._options.least_inliers)
-        good = _SOLVER_SUCCESS * np.minimum(agreeing / counts, 1.0) ** self._solver.sample_size
-        needed = np.log1p(-self._options.confidence) / np.log1p(-np.minimum(good, 1.0 - 1e-12))
+        counts = self.data.count[rows]
+        agreeing = np.maximum(best.inliers[rows].sum(axis=1), MIN_PLACES)
+        good = _SOLVER_SUCCESS * np.minimum(agreeing / counts, 1.0) ** self.solver.sample_size
+        needed = np.log1p(-self.options.confidence) / np.log1p(-np.minimum(good, 1.0 - 1e-12))
         return np.asarray(np.maximum(needed, _MIN_EXPLORATION) if explore else needed)
 
     def advance(self, best: Hypotheses, rows: IntArray, batch: int) -> None:
         """Draw a batch of samples of some pairs, and put the best hypotheses where they are better."""
         if not len(rows) or batch < 1:
             return
-        picks = self._sampler.draw(self.drawn[rows], batch, self._data.count[rows], self._ordered[rows])
+        picks = self._sampler.draw(self.drawn[rows], batch, self.data.count[rows], self.ordered[rows])
         self.drawn[rows] += batch
         step = max(1, _SAMPLES_AT_ONCE // batch)
         found = [self._best_of(rows[i : i + step], picks[i : i + step]) for i in range(0, len(rows), step)]
@@ -189,13 +165,14 @@ class _Lane:
         self._least_raw_cost[rows] = cost[better]
         if not len(rows):
             return
-        data, threshold = self._data.take(rows), self._options.threshold
-        judged = Hypotheses.judged(homography, distortion, data, threshold, self._index)
+        data, threshold = self.data.take(rows), self.options.threshold
+        judged = Hypotheses.judged(homography, distortion, data, threshold, self.index)
         fresh = (judged.inliers & ~best.inliers[rows]).sum(axis=1) > _NOVELTY * judged.inliers.sum(axis=1)
         worthwhile = np.flatnonzero(fresh | ~(judged.cost > best.cost[rows]))
         if len(worthwhile):
             optimized = self._optimized(judged.take(worthwhile), data.take(worthwhile), rows[worthwhile])
-            best.put(rows[worthwhile], optimized, optimized.cost < best.cost[rows[worthwhile]])
+            better = optimized.cost < best.cost[rows[worthwhile]]
+            best.put(rows[worthwhile][better], optimized.take(better))
 
     def _best_of(self, rows: IntArray, picks: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of each pair the hypothesis that explains a part of its matches best: H, λ and cost; inf where none is."""
@@ -203,17 +180,15 @@ class _Lane:
         places = picks.reshape(len(rows), 1, -1)
         x1, x2 = (
             np.take_along_axis(x[rows], places, axis=2).reshape(len(rows), 2, batch, size).transpose(0, 2, 3, 1)
-            for x in (self._data.x1, self._data.x2)
+            for x in (self.data.x1, self.data.x2)
         )
-        tilts = None if self._tilts is None else np.repeat(self._tilts[rows], batch, axis=0)
-        found = self._solver.solve(x1.reshape(-1, size, 2), x2.reshape(-1, size, 2), tilts)
+        tilts = None if self.tilts is None else np.repeat(self.tilts[rows], batch, axis=0)
+        found = self.solver.solve(x1.reshape(-1, size, 2), x2.reshape(-1, size, 2), tilts)
         # A lens that is known may see beyond the horizon at the corners: what is there is no inlier.
-        keep = plausible(found, corner_radius=0.0 if self._solver.fixed_distortion else 1.0)
+        keep = plausible(found, corner_radius=0.0 if self.solver.fixed_distortion else 1.0)
         found = Solutions(found.sample[keep], found.homography[keep], found.distortion[keep])
         pair = found.sample // batch
-        costs = truncated_costs(
-            found.homography, found.distortion, pair, self._quick.take(rows), self._options.threshold
-        )
+        costs = truncated_costs(found.homography, found.distortion, pair, self.quick.take(rows), self.options.threshold)
         order = np.lexsort((costs, pair))
         first = order[np.flatnonzero(np.diff(pair[order], prepend=-1))]
         homography, distortion = np.zeros((len(rows), 3, 3)), np.zeros(len(rows))
@@ -229,16 +204,17 @@ class _Lane:
         Where the solver assumes none, one refinement is enough to count inliers by; the choice of the model refines the
         last of them again.
         """
-        wide = 3.0 * self._options.threshold
-        if isinstance(self._solver.model, HomographyPairModel):
-            return self._refined(start, data, rows, self._solver.model, wide)
+        wide = 3.0 * self.options.threshold
+        if isinstance(self.solver.model, HomographyPairModel):
+            return self._refined(start, data, rows, self.solver.model, wide)
         best = start
         enough = start.inliers.sum(axis=1) >= _FREE_REFINEMENT
-        for chosen, model in ((enough, HomographyPairModel()), (~enough, self._solver.model)):
+        for chosen, model in ((enough, HomographyPairModel()), (~enough, self.solver.model)):
             part = np.flatnonzero(chosen)
             if len(part):
                 refined = self._refined(best.take(part), data.take(part), rows[part], model, wide)
-                best.put(part, refined, refined.cost < best.cost[part])
+                better = refined.cost < best.cost[part]
+                best.put(part[better], refined.take(better))
         return best
 
     def _refined(
@@ -246,14 +222,15 @@ class _Lane:
     ) -> Hypotheses:
         """The start or its refinement, whichever is better."""
         problems = PairProblems(
-            model, data, np.full(len(data), scale), np.ones(len(data)), self._solver.fixed_distortion
+            model, data, np.full(len(data), scale), np.ones(len(data)), self.solver.fixed_distortion
         )
-        state = model.initialize(start.homography, None if self._tilts is None else self._tilts[rows])
+        state = model.initialize(start.homography, None if self.tilts is None else self.tilts[rows])
         begin = Fits(state, start.homography, start.distortion)
         fits, _ = refine_pairs(problems, begin, _LOCAL_STEPS, rough=True)
-        judged = Hypotheses.judged(fits.homography, fits.distortion, data, self._options.threshold, self._index)
+        judged = Hypotheses.judged(fits.homography, fits.distortion, data, self.options.threshold, self.index)
         result = start.take(np.arange(len(data)))
-        result.put(np.arange(len(data)), judged, judged.cost < start.cost)
+        better = judged.cost < start.cost
+        result.put(better, judged.take(better))
         return result
 
 

@@ -5,86 +5,103 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.division_model import MAX_ABS_DISTORTION
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, descend
 from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 
+_STATE = 9  # numbers of a state of any pair model; before these, parameters have those of the lens
+
 
 @dataclass(frozen=True)
-class Fits:
+class Fits(Rows):
     """One model fitted to the matches of B pairs."""
 
     state: FloatArray  # (B, S): the model's states
     homography: FloatArray  # (B, 3, 3)
     distortion: FloatArray  # (B,): λ in the half-diagonal frame
 
-    def take(self, rows: BoolArray | IntArray | slice) -> "Fits":
-        """Those of some pairs."""
-        return Fits(self.state[rows], self.homography[rows], self.distortion[rows])
+    @property
+    def parameters(self) -> FloatArray:
+        """As those of :class:`PairProblems`."""
+        return np.column_stack([self.distortion, self.state])
 
 
 @dataclass(frozen=True)
 class PairProblems:
-    """Refinement of B pairs as problems of least squares; parameters are ``(λ, state)``."""
+    """Refinement of B pairs as problems of least squares.
+
+    Parameters are ``(λ, state)``; where ``lens_std`` is given, ``(λ of image 1, λ of image 2, μ, centre, state)``.
+    """
 
     model: PairModel
     data: Measurements
     scale: FloatArray  # (B,): of the loss, pixels
     noise: FloatArray  # (B,): standard deviation of the errors per axis, pixels
-    fixed_distortion: bool  # whether λ is known
+    fixed_distortion: bool = False  # whether λ is known
+    lens_std: FloatArray | None = None  # (5,): standard deviations of the priors of the lens
+
+    @property
+    def free(self) -> int:
+        """Number of parameters of the lens that are estimated."""
+        return 0 if self.fixed_distortion else 1 if self.lens_std is None else len(self.lens_std)
 
     def take(self, rows: BoolArray | IntArray) -> Self:
         """Some of them."""
         return replace(self, data=self.data.take(rows), scale=self.scale[rows], noise=self.noise[rows])
 
+    def transfer(self, parameters: FloatArray) -> TransferDerivatives:
+        """The matches transferred, with derivatives by the entries of H and the lens."""
+        lens = parameters[:, :-_STATE].T
+        lenses = PairLenses(lens[0]) if self.lens_std is None else PairLenses(lens[0], lens[1], lens[2], lens[3:].T)
+        return differentiate(self.model.homography(parameters[:, -_STATE:]), lenses, self.data)
+
     def normal_equations(self, parameters: FloatArray) -> BatchedNormalEquations:
         """Loss, normal matrix and gradient."""
-        distortion, state = parameters[:, 0], parameters[:, 1:]
-        found = differentiate(self.model.homography(state), PairLenses(distortion), self.data)
-        return self._equations(found, state, self.chain(state))
+        return self._equations(self.transfer(parameters), parameters, self.chain(parameters))
 
-    def _equations(self, found: TransferDerivatives, state: FloatArray, chain: FloatArray) -> BatchedNormalEquations:
-        entries = entry_equations(found, self.data.present, self.scale, not self.fixed_distortion)
+    def _equations(
+        self, found: TransferDerivatives, parameters: FloatArray, chain: FloatArray
+    ) -> BatchedNormalEquations:
+        entries = entry_equations(found, self.data.present, self.scale, self.free > 0)
         information = np.swapaxes(chain, 1, 2) @ entries.information @ chain
         gradient = np.einsum("bkp,bk->bp", chain, entries.gradient)
-        cost = entries.cost
-        residual, by_state = self.model.prior(state)
+        cost, weight = entries.cost, self.noise**2
+        residual, by_state = self.model.prior(parameters[:, -_STATE:])
         if residual.shape[1]:
-            free = 0 if self.fixed_distortion else 1
-            weight = self.noise**2
-            information[:, free:, free:] += weight[:, None, None] * (by_state.T @ by_state)
-            gradient[:, free:] += weight[:, None] * (residual @ by_state)
+            information[:, self.free :, self.free :] += weight[:, None, None] * (by_state.T @ by_state)
+            gradient[:, self.free :] += weight[:, None] * (residual @ by_state)
             cost = cost + weight * (residual**2).sum(axis=1)
+        if self.lens_std is not None:
+            lens = parameters[:, :-_STATE] / self.lens_std
+            information[:, : self.free, : self.free] += weight[:, None, None] * np.diag(self.lens_std**-2.0)
+            gradient[:, : self.free] += weight[:, None] * lens / self.lens_std
+            cost = cost + weight * (lens**2).sum(axis=1)
         return BatchedNormalEquations(cost, information, gradient, entries.squared)
 
-    def chain(self, state: FloatArray) -> FloatArray:
-        """Derivative of the entries of H and λ by λ and the model's parameters, (B, 9 + E, E + P)."""
-        free = 0 if self.fixed_distortion else 1
-        by_state = self.model.jacobian(state)
-        chain = np.zeros((len(state), 9 + free, free + by_state.shape[2]))
-        chain[:, :9, free:] = by_state
-        chain[:, 9:, :free] = 1.0
+    def chain(self, parameters: FloatArray) -> FloatArray:
+        """Derivative of the entries of H and the lens by the lens and the model's parameters, (B, 9 + E, E + P)."""
+        by_state = self.model.jacobian(parameters[:, -_STATE:])
+        chain = np.zeros((len(parameters), 9 + self.free, self.free + by_state.shape[2]))
+        chain[:, :9, self.free :] = by_state
+        chain[:, 9:, : self.free] = np.eye(self.free)
         return chain
 
     def retract(self, parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Parameters after steps, and whether a lens can be so."""
-        free = 0 if self.fixed_distortion else 1
-        moved = np.empty_like(parameters)
-        moved[:, 0] = parameters[:, 0] + (step[:, 0] if free else 0.0)
-        moved[:, 1:] = self.model.retract(parameters[:, 1:], step[:, free:])
-        within = (np.abs(moved[:, 0]) < MAX_ABS_DISTORTION) | self.fixed_distortion
+        lens = parameters[:, :-_STATE] + (step[:, : self.free] if self.free else 0.0)
+        moved = np.hstack([lens, self.model.retract(parameters[:, -_STATE:], step[:, self.free :])])
+        within = (np.abs(lens[:, :2]).max(axis=1) < MAX_ABS_DISTORTION) | self.fixed_distortion
         possible = within & np.isfinite(moved).all(axis=1)
         return np.where(possible[:, None], moved, parameters), possible
 
-    def inspect(self, fits: Fits) -> tuple[BatchedNormalEquations, FloatArray]:
-        """The equations at fits, and each match's share of the gradient there, (B, N, P)."""
-        found = differentiate(fits.homography, PairLenses(fits.distortion), self.data)
-        chain = self.chain(fits.state)
-        shares = influence(found, self.data.present, self.scale, not self.fixed_distortion) @ chain
-        return self._equations(found, fits.state, chain), shares
+    def inspect(self, parameters: FloatArray) -> tuple[BatchedNormalEquations, FloatArray]:
+        """The equations, and each match's share of the gradient, (B, N, P)."""
+        found, chain = self.transfer(parameters), self.chain(parameters)
+        shares = influence(found, self.data.present, self.scale, self.free > 0) @ chain
+        return self._equations(found, parameters, chain), shares
 
 
 @np.errstate(all="ignore")  # a step may leave the domain of the lens model
@@ -107,7 +124,6 @@ def refine_pairs(
     rough : bool
         Another refinement goes on from there.
     """
-    parameters = np.column_stack([start.distortion, start.state])
-    found, equations = descend(problems, problems.retract, parameters, iterations, rough=rough)
+    found, equations = descend(problems, start.parameters, iterations, rough=rough)
     state = found[:, 1:]
     return Fits(state, problems.model.homography(state), found[:, 0]), equations

@@ -15,9 +15,8 @@ from rdstitch.features.prepared_image import PreparedImage
 from rdstitch.inputs.corner_flow import CornerFlow, fitted_affine
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
-from rdstitch.matching.options import PairOptions
 from rdstitch.radial_homography import from_plane
-from rdstitch.robust import PairMatches, estimate_radial_homographies
+from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 
 _WINDOW = 48  # keyframes that are kept
@@ -43,7 +42,7 @@ _FLOW_AGREEING = 0.5  # share of the corners that must agree on it
 class TrackingOptions:
     """Choices and knowledge of a tracker."""
 
-    pair: PairOptions = field(default_factory=PairOptions)  # with λ, where it is known
+    pair: EstimationOptions = field(default_factory=EstimationOptions)  # with λ, where it is known
     # of the windows of keyframes; λ is that of the cameras where ``pair`` has one
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
 
@@ -215,7 +214,7 @@ class Tracker:
             )
             for other, matches in zip(others, matched, strict=True)
         ]
-        relations = estimate_radial_homographies(pairs, self._options.pair.estimation)
+        relations = estimate_radial_homographies(pairs, self._options.pair)
         return [
             Link(other.number, frame.number, matches.points1[fit.inliers], matches.points2[fit.inliers], fit)
             for other, matches, fit in zip(others, matched, relations, strict=True)

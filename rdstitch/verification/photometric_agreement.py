@@ -76,19 +76,14 @@ class ComparedImage:
         return np.asarray(found, dtype=np.float32)
 
 
-def _compared_size(size: tuple[int, int]) -> tuple[int, int]:
-    """Width and height that an image is made smaller to."""
-    factor = min(1.0, COMPARED_SIDE / max(size))
-    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
-
-
 def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> Grey:
     pixels = image.pixels
     full = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else max(float(pixels.max()), 1e-12)
     if stretch is not None:  # black may be anywhere: only differences of grey levels are compared
         full = max(stretch[1] - stretch[0], 1e-12)
     height, width = pixels.shape[:2]
-    size = _compared_size((width, height))
+    factor = min(1.0, COMPARED_SIDE / max(width, height))
+    size = max(1, round(width * factor)), max(1, round(height * factor))
     small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(full)
     grey = mean_of_channels(small)
     if image.alpha is not None:

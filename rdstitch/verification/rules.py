@@ -11,10 +11,11 @@ from typing import NamedTuple
 from rdstitch.alignment.result import LinkFit
 from rdstitch.alignment.unaligned import few_features
 from rdstitch.inputs.source import Source
+from rdstitch.messages import Severity
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
 from rdstitch.verification.limits import limit
-from rdstitch.verification.overlap_check import CheckedLink, share_alike
+from rdstitch.verification.overlap_check import share_alike
 from rdstitch.verification.second_motion import is_separate, share_of
 
 MAX_WARNINGS = 3
@@ -121,9 +122,7 @@ def _unlike(found: Evidence) -> Iterator[Finding]:
     What two images share of a plane looks alike; where something else moves, it may be that which holds them.
     """
     least = limit("unlike, undecided" if _undecided(found) else "unlike")
-    for link in found.seen:
-        if link.agreement.cells >= limit("cells") and link.agreement.share < least:
-            yield Finding("unlike", link.pair, values=_cells_of(link))
+    return _less_alike(found, least, "unlike", "failure")
 
 
 def _undecided(found: Evidence) -> bool:
@@ -134,13 +133,15 @@ def _undecided(found: Evidence) -> bool:
 
 def _little_alike(found: Evidence) -> Iterator[Finding]:
     """Images that look less alike than most where they are put together."""
+    return _less_alike(found, limit("little alike"), "little alike", "warning")
+
+
+def _less_alike(found: Evidence, least: float, kind: str, severity: Severity) -> Iterator[Finding]:
+    """Pairs of whose cells fewer than a share agree."""
     for link in found.seen:
-        if link.agreement.cells >= limit("cells") and link.agreement.share < limit("little alike"):
-            yield Finding("little alike", link.pair, "warning", _cells_of(link))
-
-
-def _cells_of(link: CheckedLink) -> dict[str, object]:
-    return {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
+        if link.agreement.cells >= limit("cells") and link.agreement.share < least:
+            values = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
+            yield Finding(kind, link.pair, severity, values)
 
 
 def _ambiguous(found: Evidence) -> Iterator[Finding]:

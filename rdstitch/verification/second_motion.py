@@ -18,10 +18,11 @@ import numpy as np
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
-from rdstitch.matching.two_view import Pair, PairRegistration, estimation_batches
+from rdstitch.executors import batches
+from rdstitch.matching.two_view import PAIRS_ESTIMATED_AT_ONCE, Pair, PairRegistration
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration import Registration
-from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
+from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.verification.limits import limit
 from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, share_alike
 from rdstitch.verification.photometric_agreement import Agreement, overlap_agreement
@@ -111,10 +112,9 @@ def _strongest_motions(
 ) -> dict[Pair, RadialHomography]:
     """Of each pair the motion that most of some of its matches agree on, with the inliers among all."""
     result = {}
-    how = EstimationOptions("auto", lens, RansacOptions(threshold))
-    for batch in estimation_batches(
-        [pair for pair in pairs if len(rests[pair.images]) >= limit("inliers of a motion")]
-    ):
+    how = EstimationOptions("auto", lens, threshold)
+    enough = [pair for pair in pairs if len(rests[pair.images]) >= limit("inliers of a motion")]
+    for batch in batches(enough, PAIRS_ESTIMATED_AT_ONCE):
         given = []
         for pair in batch:
             first, second = (alignment.cameras[k] for k in pair.images)

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.blender import MultibandBlender, margin, rounding_constant
 from rdstitch.compositing.boxes import aligned, grown
-from rdstitch.compositing.placed_image import place_images
 from rdstitch.compositing.preparation import Prepared, prepare_composite
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import Scene, render
+from tests.compositing_scenes import Scene, place_images, render
 
 WAYS = [("multiband", "graphcut"), ("multiband", "none"), ("feather", "none"), ("feather", "voronoi"), ("none", "none")]
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, Rows
 
 Grey = NDArray[np.uint8]
 # The box filter of 9 pixels stands for a Gaussian of σ = 1.2 pixels; larger ones in proportion (§3.3).
@@ -83,7 +83,7 @@ def vertex(values: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.bool_]]
 
 
 @dataclass(frozen=True, eq=False)
-class Blobs:
+class Blobs(Rows):
     """Blobs of one image."""
 
     points: FloatArray  # (N, 2): centres, pixels
@@ -99,10 +99,6 @@ class Blobs:
     def scale(self) -> FloatArray:
         """The s of the paper, pixels, shape (N,)."""
         return self.size * SIGMA_PER_SIZE
-
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Self:
-        """The blobs of the given indices, or of a mask."""
-        return type(self)(*(getattr(self, field.name)[index] for field in fields(self)))
 
     @classmethod
     def concatenate(cls, parts: list[Self]) -> Self:

@@ -160,13 +160,14 @@ def test_images_without_connection_are_named() -> None:
     assert found.used.tolist() == [True] * 6 + [False] * 3
     assert found.components == ((0, 1, 2, 3, 4, 5), (6, 7), (8,))
     reasons = {
-        message.images: message.text for message in explain_unaligned(found, [f"{k}.png" for k in range(9)], [900] * 9)
+        message.images: message.text
+        for message in explain_unaligned(found, [f"{k}.png" for k in range(9)], [900] * 9, {})
     }
     assert list(reasons) == [("6.png",), ("7.png",), ("8.png",)]
     assert reasons["6.png",].startswith("in block 2 of 2, whose 2 images overlap with none of the others")
     assert reasons["7.png",] == reasons["6.png",]
     assert "no reliable overlap" in reasons["8.png",]
-    blurred = explain_unaligned(found, [f"{k}.png" for k in range(9)], [900] * 8 + [290])
+    blurred = explain_unaligned(found, [f"{k}.png" for k in range(9)], [900] * 8 + [290], {})
     assert [message.images for message in blurred if "(blurred?)" in message.text] == [("8.png",)]
     assert np.isnan(found.homographies[6:]).all()
     assert np.isfinite(found.homographies[:6]).all()
@@ -311,7 +312,7 @@ def test_an_image_that_contradicts_the_others_names_them() -> None:
     whole = replace(
         found, used=np.array([True, True, False]), components=((0, 1), (2,)), links=(*found.links, contradicting)
     )
-    (message,) = explain_unaligned(whole, ["left.png", "middle.png", "right.png"], [900] * 3)
+    (message,) = explain_unaligned(whole, ["left.png", "middle.png", "right.png"], [900] * 3, {})
     assert message.images == ("right.png",)
     assert "its overlap with left.png contradicts" in message.text
 

@@ -79,6 +79,6 @@ def test_no_image_is_read_for_more_than_two_blocks(columns: int, rows: int, tmp_
             yield replace(block, tiles=replace(block.tiles, renderer=renderer)).compute(Cache.at(tmp_path))
 
     images = [counted(index, placed) for index, placed in enumerate(scene.images)]
-    compose(images, scene.canvas, CompositeOptions(tile_size=256, bands=2, workers=2), None, elsewhere)
+    compose(images, scene.canvas, CompositeOptions(tile_size=256, bands=2, workers=2), elsewhere=elsewhere)
     assert blocks > 2
     assert max(read.values()) <= 1 + 2

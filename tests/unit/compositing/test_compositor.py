@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from examples.judging.comparison import sharpness
 from rdstitch.camera import Camera
-from rdstitch.compositing import CompositeOptions, OutputFile, compose, compose_to_file, plan_canvas
+from rdstitch.compositing import CompositeOptions, compose, compose_to_file, plan_canvas
 from rdstitch.compositing.crop import largest_rectangle
 from rdstitch.compositing.options import ExposureMethod
-from rdstitch.compositing.placed_image import ImageLoader, place_images
+from rdstitch.compositing.placed_image import ImageLoader
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.io import Metadata, read_image
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import Scene, as_image, gradient, grey, inner, render
+from tests.compositing_scenes import Scene, as_image, gradient, grey, inner, place_images, render
 from tests.sampled import sampled
 
 
@@ -269,11 +269,12 @@ def test_file_is_what_memory_is(tmp_path: Path, suffix: str) -> None:
     result = _compose(scene, tile_size=256)
     told: list[float] = []
     compose_to_file(
-        OutputFile(tmp_path / f"a.{suffix}", Metadata((1, 1), icc_profile=b"profile" * 30)),
+        tmp_path / f"a.{suffix}",
         scene.images,
         scene.canvas,
         CompositeOptions(tile_size=256),
         told.append,
+        metadata=Metadata((1, 1), icc_profile=b"profile" * 30),
     )
     back = read_image(tmp_path / f"a.{suffix}")
     assert back.metadata.icc_profile == b"profile" * 30
@@ -313,7 +314,7 @@ def test_images_that_do_not_fit() -> None:
     with pytest.raises(InputError, match="uint16"):
         compose(place_images(deep, scene.cameras, scene.homographies), scene.canvas)
     with pytest.raises(ArgumentError):
-        compose(place_images(scene.sources[:1], scene.cameras, scene.homographies), scene.canvas)
+        compose(scene.images[:1], scene.canvas)
 
 
 @pytest.mark.parametrize(

@@ -15,12 +15,12 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.compositing.image_cache import ImageCache
-from rdstitch.compositing.placed_image import PlacedImage, place_images
+from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.source_images import ImageOnDisk, ImageReader, prepare_image
 from rdstitch.errors import InputError
 from rdstitch.io import DecodedImage
 from rdstitch.io.read import reduced
-from tests.compositing_scenes import as_image
+from tests.compositing_scenes import as_image, place_images
 
 
 class DecodedImageCache:

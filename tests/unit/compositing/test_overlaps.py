@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from rdstitch.camera import Camera
-from rdstitch.compositing import gain_compensation, overlap_cells, place_images, plan_canvas
+from rdstitch.compositing import gain_compensation, overlap_cells, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
 from rdstitch.compositing.overlap_cells import compare_overlaps
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.source_images import ImageReader
 from rdstitch.compositing.survey import Survey, survey_images
-from tests.compositing_scenes import as_image
+from tests.compositing_scenes import as_image, place_images
 
 
 @pytest.mark.parametrize("shape", [(300, 80), (80, 300)])

@@ -11,12 +11,11 @@ from rdstitch.compositing import gain_compensation
 from rdstitch.compositing.canvas import plan_canvas
 from rdstitch.compositing.overlap_cells import compare_overlaps
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
-from rdstitch.compositing.placed_image import place_images
 from rdstitch.compositing.source_images import ImageReader
 from rdstitch.compositing.survey import Survey, SurveyTile, survey_images
 from rdstitch.compositing.warp import locate, plan_warp
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import render
+from tests.compositing_scenes import place_images, render
 
 OFFSET, LOG_GAIN, VIGNETTING = 0.04, np.array([[0.0, 0.0, 0.0], [0.2, -0.1, 0.05]]), np.array([-0.3, 0.1, -0.05])
 LENS = Camera((1600, 1200), distortion=-0.2)

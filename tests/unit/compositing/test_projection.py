@@ -14,13 +14,12 @@ from rdstitch.compositing.panorama_canvas import (
     photo_sphere_xmp,
     seen_directions,
 )
-from rdstitch.compositing.placed_image import place_images
 from rdstitch.compositing.projection import PLANE, PROJECTIONS
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import as_image, gradient, grey
+from tests.compositing_scenes import as_image, gradient, grey, place_images
 
 LENS = Camera((160, 120), -0.2, focal=110.0, focal_source="option")
 

@@ -7,8 +7,7 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, plan_canvas
-from rdstitch.compositing.placed_image import place_images
-from tests.compositing_scenes import as_image
+from tests.compositing_scenes import as_image, place_images
 
 SIZE = (300, 200)
 SHIFT = 100  # pixels by which the second image lies further right, or down

@@ -8,10 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from rdstitch.camera import Camera
-from rdstitch.compositing.placed_image import place_images
 from rdstitch.compositing.source_images import ImageReader
 from rdstitch.errors import InputError
-from tests.compositing_scenes import as_image
+from tests.compositing_scenes import as_image, place_images
 
 
 def test_an_image_unlike_the_first_is_named_also_in_blocks() -> None:

@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, plan_canvas
-from rdstitch.compositing.placed_image import place_images
 from rdstitch.compositing.sampling import sample
 from rdstitch.compositing.source_images import prepare_image
 from rdstitch.compositing.warp import locate, plan_warp
-from tests.compositing_scenes import as_image, grey, inner, render
+from tests.compositing_scenes import as_image, grey, inner, place_images, render
 
 PLAIN = CompositeOptions(exposure="none", seam="none", blend="none")
 

@@ -11,10 +11,10 @@ from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, match
 from rdstitch.matching.candidate_pairs import neighbours
 from rdstitch.matching.feature_store import FeatureStore
-from rdstitch.matching.options import MatchingOptions
 from rdstitch.matching.static_background import is_static_pair, moving_features
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.progress import silent
+from rdstitch.robust import EstimationOptions
 
 LENS = Camera((640, 480), distortion=-0.2, focal=520.0)
 IMAGES = 4
@@ -55,7 +55,9 @@ def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pai
         found.append(_features(points[inside], seen_as[inside]))
     matcher = partial(match, ratio=None)
     cameras = [LENS.with_focal()] * IMAGES
-    return Pairing(FeatureStore.of(found), cameras, matcher, MatchingOptions(), silent, ThreadPoolExecutor(1))
+    return Pairing(
+        FeatureStore.of(found), cameras, matcher, EstimationOptions(select_below=50), silent, ThreadPoolExecutor(1)
+    )
 
 
 ALL = [(i, j) for i in range(IMAGES) for j in range(i + 1, IMAGES)]
@@ -105,7 +107,7 @@ def test_static_features_that_were_matched_otherwise_are_dropped_too() -> None:
 
 def test_images_that_share_nothing_are_rejected_by_the_prescreen() -> None:
     one, other = _pairing(0, 400), _pairing(0, 400, seed=1)
-    together = replace(one, features=FeatureStore.of([*one.features[:2], *other.features[:2]]))
+    together = replace(one, features=FeatureStore((*one.features.items[:2], *other.features.items[:2])))
     assert list(together.prescreen_pairs(ALL)) == [(0, 1), (2, 3)]
 
 

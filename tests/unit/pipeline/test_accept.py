@@ -78,7 +78,7 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
     frames = flight(3, 3).write(tmp_path)
     sources = _read(frames)
     with open_executor(1, len(sources)) as executor:
-        found = register(sources, OPTIONS, executor, skip_bad=False)
+        found = register(sources, OPTIONS, executor)
     links = tuple(replace(fit, used=2 in (fit.image1, fit.image2)) for fit in found.alignment.links)
     spoiled = replace(
         found,
@@ -134,7 +134,7 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
         write_image(frame, np.concatenate([plane.frame(k)[:192], ahead.frame(k)[192:]]))
     sources = _read(frames)
     with open_executor(1, len(sources)) as executor:
-        found = register(sources, OPTIONS, executor, skip_bad=False)
+        found = register(sources, OPTIONS, executor)
         accepted = accept(found, OPTIONS)
     steps = [np.diff(k.alignment.homographies[:, 0, 2]) for k in (found, accepted)]
     assert np.all(np.abs(steps[0]) < 0.2)  # heights above the ground: what drives ahead moves by a sixth

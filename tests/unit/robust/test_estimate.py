@@ -8,8 +8,7 @@ import pytest
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
-from rdstitch.robust.estimate import SOLVERS, SolverName
-from rdstitch.robust.ransac import RansacOptions
+from rdstitch.robust.options import SOLVERS, SolverName
 from tests.correspondences import correspondences
 
 MATCHES = correspondences(150, seed=4, outliers=0.3)
@@ -19,11 +18,10 @@ TRUE = MATCHES.truth.motion
 
 def test_defaults_are_those_of_the_options() -> None:
     given = inspect.signature(estimate_radial_homography).parameters
-    options = RansacOptions()
+    options = EstimationOptions()
     for name in ("threshold", "confidence", "max_iterations", "seed"):
         assert given[name].default == getattr(options, name)
     assert (options.threshold, options.confidence, options.max_iterations, options.seed) == (3.0, 0.999, 10000, 0)
-    assert options.least_inliers == 8
 
 
 @pytest.mark.parametrize(

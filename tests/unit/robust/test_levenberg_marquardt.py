@@ -27,18 +27,17 @@ class _Valleys:
         cost, information, gradient = self.floor + residual**2, (slope**2)[:, None, None], (slope * residual)[:, None]
         return BatchedNormalEquations(cost, information, gradient, (residual**2)[:, None])
 
-
-def _retract(parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
-    return parameters + step, np.ones(len(step), dtype=np.bool_)
+    def retract(self, parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
+        return parameters + step, np.ones(len(step), dtype=np.bool_)
 
 
 def test_descents_in_lockstep_do_not_notice_each_other() -> None:
     """One that starts farther off goes on when the other has converged."""
     counted = np.zeros(2, dtype=np.intp)
     start = np.array([[1.5], [30.0]])
-    found, equations = descend(_Valleys(np.zeros(2), np.arange(2), counted), _retract, start, 30)
+    found, equations = descend(_Valleys(np.zeros(2), np.arange(2), counted), start, 30)
     np.testing.assert_allclose(found, 1.0, atol=1e-2)
-    alone, _ = descend(_Valleys(np.zeros(1), np.arange(1), np.zeros(1, dtype=np.intp)), _retract, start[:1], 30)
+    alone, _ = descend(_Valleys(np.zeros(1), np.arange(1), np.zeros(1, dtype=np.intp)), start[:1], 30)
     assert found[0, 0] == alone[0, 0]
     np.testing.assert_array_equal(equations.squared, (found**2 - 1.0) ** 2)
     assert counted[0] < counted[1]
@@ -47,8 +46,8 @@ def test_descents_in_lockstep_do_not_notice_each_other() -> None:
 def test_what_is_only_a_start_takes_fewer_steps() -> None:
     valley = _Valleys(np.ones(1), np.arange(1), np.zeros(1, dtype=np.intp))
     start = np.full((1, 1), 1.01)
-    assert descend(valley, _retract, start, 30, rough=True)[0] == start
-    assert abs(descend(valley, _retract, start, 30)[0] - 1.0) < 1e-3
+    assert descend(valley, start, 30, rough=True)[0] == start
+    assert abs(descend(valley, start, 30)[0] - 1.0) < 1e-3
 
 
 def test_damping_follows_what_steps_gain() -> None:

@@ -76,10 +76,10 @@ def test_it_comes_to_the_truth(model: PairModel, fixed: bool) -> None:
     problems = _problems(model, noise=0.05, fixed=fixed)
     found, equations = refine_pairs(problems, start, 30)
     assert found.distortion == pytest.approx(DISTORTION, abs=1e-4)
-    seen, shares = problems.inspect(found)
+    seen, shares = problems.inspect(found.parameters)
     np.testing.assert_array_equal(seen.errors, equations.errors)
     np.testing.assert_array_equal(seen.information, equations.information)
     assert seen.errors[0, :80].max() < 0.02
     assert np.isinf(seen.errors[0, 80:]).all()
     assert shares.shape == (1, problems.data.present.shape[1], seen.information.shape[1])
-    assert seen.cost == pytest.approx(problems.normal_equations(np.column_stack([found.distortion, found.state])).cost)
+    assert seen.cost == pytest.approx(problems.normal_equations(found.parameters).cost)

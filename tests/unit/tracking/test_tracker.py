@@ -13,7 +13,7 @@ from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, Features, detect, match
 from rdstitch.features.prepared_image import View, prepare
 from rdstitch.inputs.corner_flow import CornerFlow, fitted_affine
-from rdstitch.matching.options import PairOptions
+from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, line_poses, sequence_over, turn_poses
 from rdstitch.tracking import Tracked, Tracker, TrackingOptions
 from rdstitch.tracking import tracker as module
@@ -47,7 +47,9 @@ def _features(sequence: Sequence, world: int = 0) -> list[Features]:
 
 
 def _tracker(distortion: float | None = None) -> Tracker:
-    return Tracker(TrackingOptions(PairOptions(distortion=distortion)), partial(match, ratio=0.8))
+    return Tracker(
+        TrackingOptions(EstimationOptions(distortion=distortion, select_below=50)), partial(match, ratio=0.8)
+    )
 
 
 def _path(results: list[Tracked]) -> Trajectory:

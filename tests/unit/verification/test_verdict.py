@@ -38,7 +38,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
     sources, _ = read_sources(frames, camera=None, focal=380.0, distortion=None, skip_bad=False)
     options = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
     with open_executor(1, len(sources)) as executor:
-        return register(sources, options, executor, skip_bad=False)
+        return register(sources, options, executor)
 
 
 def judge(registration: Registration, threshold: float, *, lens_only: bool = False) -> tuple[Message, ...]:
