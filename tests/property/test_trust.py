@@ -25,6 +25,13 @@ def test_never_silently_wrong(kind: str, tmp_path: Path) -> None:
         assert "frame_0002.png" in judged.text
 
 
+def test_one_wrong_match_is_no_depth(tmp_path: Path) -> None:
+    """It lies alone in a corner of the overlap; with λ held at 0, which depth would ask for, all is off by 3 pixels."""
+    judged = judge_set(trust_set(20071), tmp_path)
+    assert (judged.kind, judged.status) == ("pair", 0)
+    assert judged.error < 0.1
+
+
 @pytest.mark.parametrize(
     ("kind", "seed", "said"),
     [
