@@ -151,7 +151,7 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rou
 
 
 def weigh_lens(problem: Problem, fit: Fit) -> Fit:
-    """λ where its prior and all of its uncertainty put it, and everything else adjusted to that.
+    """λ where its prior and its errors, correlated as they are, put it, and everything else adjusted to that.
 
     The adjustment takes errors for independent, and so its data for surer than they are: where two images show depth,
     they would be believed a fisheye. A lens of more parameters is only chosen where images show it.
@@ -160,7 +160,7 @@ def weigh_lens(problem: Problem, fit: Fit) -> Fit:
         return fit
     parameters, prior = fit.adjusted.parameters, LENS[0]
     value = float(parameters.lens[0])
-    std = math.sqrt(float(considered_covariance(problem, fit, rough=True)[0, 0]))
+    std = math.sqrt(float(sandwich_covariance(problem.adjuster_of(fit), fit.adjusted)[-1, -1]))
     near = value + std * np.linspace(-_REACH, _REACH, _STEPS)
     weighed = float(near[np.argmin([prior.cost(x) + ((x - value) / std) ** 2 for x in near.tolist()])])
     if abs(weighed - value) * float(np.median(problem.observations.scale1)) < EXACTNESS:

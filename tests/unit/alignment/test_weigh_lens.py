@@ -1,4 +1,4 @@
-"""λ is as far from what lenses usually have as the images make sure, with all that makes them unsure."""
+"""λ is as far from what lenses usually have as the images make sure, errors that neighbours share considered."""
 
 import importlib
 from dataclasses import replace
@@ -35,7 +35,7 @@ def test_depth_makes_no_lens_of_two_images(seed: int, monkeypatch: pytest.Monkey
     given = pair(seed, depth=3.0)
     before, after = unweighed(given, monkeypatch), aligned(given)
     assert before.distortion_std > 0.02
-    assert 0.0 < after.distortion < 0.7 * before.distortion
+    assert 0.0 < after.distortion < 0.9 * before.distortion
     assert after.distortion_std > 0.02
 
 
