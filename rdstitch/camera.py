@@ -349,7 +349,7 @@ class Camera:
             "center_px": list(self.center),
             "image_circle_px": self.image_circle,
             "lambda": nearest,
-            "lambda_std": self.distortion_std,
+            "lambda_std": None if self.distortion_std == math.inf else self.distortion_std,
             "lambda_fit_rms_px": rms,
             "lambda_fit_largest_px": largest,
             "coefficients": list(self.coefficients),

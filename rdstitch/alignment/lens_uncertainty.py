@@ -27,9 +27,6 @@ from rdstitch.arrays import FloatArray
 _SINGULAR = 1e-12
 """Least eigenvalue of a correlation matrix of parameters."""
 
-_REACH, _STEPS = 4.0, 801
-"""Standard deviations to either side within which λ is sought, and places where it is tried."""
-
 
 def sandwich_covariance(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> FloatArray:
     """Covariance (S', S') of the model's named parameters and the free parameters of the lens.
@@ -158,11 +155,14 @@ def weigh_lens(problem: Problem, fit: Fit) -> Fit:
     """
     if problem.free_lens.sum() != 1:
         return fit
-    parameters, prior = fit.adjusted.parameters, LENS[0]
+    parameters = fit.adjusted.parameters
     value = float(parameters.lens[0])
     std = math.sqrt(float(sandwich_covariance(problem.adjuster_of(fit), fit.adjusted)[-1, -1]))
-    near = value + std * np.linspace(-_REACH, _REACH, _STEPS)
-    weighed = float(near[np.argmin([prior.cost(x) + ((x - value) / std) ** 2 for x in near.tolist()])])
+    weight, mean, scatter = np.array(LENS[0].parts).T
+    # Of the mixture's parts the one that it comes from the most likely; each is normal, and so is what is seen.
+    spread = np.hypot(scatter, std)
+    part = int(np.argmax(np.log(weight / spread) - ((value - mean) / spread) ** 2 / 2.0))
+    weighed = float(value + (mean[part] - value) * (std / spread[part]) ** 2)
     if abs(weighed - value) * float(np.median(problem.observations.scale1)) < EXACTNESS:
         return fit
     held = replace(problem, free_lens=np.zeros_like(problem.free_lens))

@@ -76,6 +76,8 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
     if _fails(found) and not options.force:
         raise RefusedError(_told(first, found_first))
     accepted = _told(current, found)
+    if accepted.failures and not options.force:  # of the alignment itself
+        raise RefusedError(accepted)
     if options.strict and accepted.left_out:
         raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
     return accepted

@@ -1,6 +1,7 @@
 """Camera files of others: λ comes back exactly, others read what is written, and what is not λ is fitted."""
 
 import json
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -68,6 +69,13 @@ def test_a_camera_comes_back_as_it_was(tmp_path: Path, name: str, camera: Camera
     found = read_camera_file(tmp_path / name)
     assert found.camera == camera
     assert found.fit is None
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_camera_whose_lens_was_not_observable_is_written(tmp_path: Path, name: str) -> None:
+    camera = Camera((1280, 960), focal=900.0, focal_source="file", distortion_std=math.inf)
+    save_camera(camera, tmp_path / name)
+    assert load_camera(tmp_path / name) == replace(camera, distortion_std=None)
 
 
 @pytest.mark.parametrize("camera", CAMERAS[:3])

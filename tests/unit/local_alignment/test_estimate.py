@@ -3,6 +3,8 @@
 import tracemalloc
 from dataclasses import replace
 from functools import lru_cache
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +15,7 @@ from rdstitch.camera import Camera
 from rdstitch.local_alignment import LocalAlignment, Match, align_locally
 from rdstitch.local_alignment.fit import Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches, place_matches
+from rdstitch.pipeline.placed_images import align_registration_locally
 from rdstitch.radial_homography import from_directions, from_plane, to_directions, to_plane
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
 
@@ -251,3 +254,25 @@ def _expected(local: LocalAlignment, image: int, points: FloatArray) -> FloatArr
 def test_a_turn_on_the_spot_is_left_alone() -> None:
     found, matrices, _ = turn(0.0)
     assert align_locally(found, CAMERAS[:4], matrices, on_sphere=True).fields == ()
+
+
+def test_registered_turns_are_aligned_locally() -> None:
+    found, matrices, _ = turn(0.3)
+    pairs = [
+        SimpleNamespace(
+            image1=k.image1,
+            image2=k.image2,
+            relation=True,
+            correspondences=SimpleNamespace(points1=k.points1, points2=k.points2),
+        )
+        for k in found
+    ]
+    alignment = SimpleNamespace(
+        used=np.ones(4, dtype=np.bool_), cameras=CAMERAS[:4], homographies=matrices, on_sphere=True
+    )
+    registration: Any = SimpleNamespace(pairs=pairs, alignment=alignment)
+    fields = align_registration_locally(registration, "auto").fields
+    assert [f.values.tolist() for f in fields] == [
+        f.values.tolist() for f in align_locally(found, CAMERAS[:4], matrices, on_sphere=True).fields
+    ]
+    assert len(fields) == 4

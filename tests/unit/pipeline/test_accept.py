@@ -19,6 +19,7 @@ from rdstitch.pipeline.accept import _is_of_the_whole, _is_simpler, _may_be_anot
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
 from rdstitch.verification.findings import Finding
+from rdstitch.verification.verdict import RefusedError
 from tests.cli.running import flight
 
 OPTIONS = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
@@ -141,3 +142,13 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
     assert np.all(np.abs(steps[1]) > 0.7)
     (message,) = (message for message in accepted.messages if message.severity != "detail")
     assert (message.code, message.severity) == ("rival-motion", "warning")
+
+
+def test_what_the_alignment_itself_fails_by_is_refused(tmp_path: Path) -> None:
+    """Such as depth that looks like a lens, of a calibration."""
+    sources = _read(flight(2, 2).write(tmp_path))
+    with open_executor(1, len(sources)) as executor:
+        found = register(sources, OPTIONS, executor).with_messages([Message("no lens shows", severity="failure")])
+        with pytest.raises(RefusedError, match="no lens shows"):
+            accept(found, OPTIONS)
+        assert not accept(found, replace(OPTIONS, force=True)).ok
