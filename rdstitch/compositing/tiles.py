@@ -61,7 +61,11 @@ class TiledOutput:
             yield from self._strips(map, progress)
             return
         with one_opencv_thread(), ThreadPoolExecutor(self.workers) as pool:
-            yield from self._strips(pool.map, progress)
+            try:
+                yield from self._strips(pool.map, progress)
+            finally:
+                # OpenCV divides by its number of threads: it must not change while an image is smoothed.
+                self.renderer.images.settle()
 
     def _strips(self, run: Callable[..., Iterator[Any]], progress: ShareProgress) -> Iterator[OutputStrip]:
         """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
