@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from rdstitch.features import FeatureOptions as FeatureOptions
     from rdstitch.messages import Message as Message
     from rdstitch.options import StitchOptions as StitchOptions
+    from rdstitch.pipeline.apply_sidecar import Recomposition as Recomposition
     from rdstitch.pipeline.apply_sidecar import apply as apply
     from rdstitch.pipeline.composer import Composer as Composer
     from rdstitch.pipeline.follow import FollowedPoses as FollowedPoses
     from rdstitch.pipeline.follow import Pose as Pose
     from rdstitch.pipeline.follow import Tracker as Tracker
-    from rdstitch.pipeline.layers import write_layers as write_layers
     from rdstitch.pipeline.recipes import calibrate as calibrate
     from rdstitch.pipeline.recipes import mosaic as mosaic
     from rdstitch.pipeline.recipes import mosaic_blocks as mosaic_blocks
     from rdstitch.pipeline.recipes import pano as pano
     from rdstitch.pipeline.recipes import trajectory as trajectory
-    from rdstitch.pipeline.recomposition import Recomposition as Recomposition
+    from rdstitch.pipeline.result_files import write_layers as write_layers
     from rdstitch.pipeline.stage_tiles import place_tiles as place_tiles
     from rdstitch.pipeline.stage_tiles import tiles as tiles
     from rdstitch.pipeline.undistort_images import undistort as undistort
@@ -61,12 +61,11 @@ _HOMES = {
         "rdstitch.features": "FeatureOptions",
         "rdstitch.messages": "Message",
         "rdstitch.options": "StitchOptions",
-        "rdstitch.pipeline.apply_sidecar": "apply",
+        "rdstitch.pipeline.apply_sidecar": "Recomposition apply",
         "rdstitch.pipeline.composer": "Composer",
         "rdstitch.pipeline.follow": "FollowedPoses Pose Tracker",
-        "rdstitch.pipeline.layers": "write_layers",
+        "rdstitch.pipeline.result_files": "write_layers",
         "rdstitch.pipeline.recipes": "calibrate mosaic mosaic_blocks pano trajectory",
-        "rdstitch.pipeline.recomposition": "Recomposition",
         "rdstitch.pipeline.stage_tiles": "place_tiles tiles",
         "rdstitch.pipeline.undistort_images": "undistort",
         "rdstitch.radial_homography": "RadialHomography",

@@ -3,7 +3,7 @@
 import math
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rdstitch.compositing import CompositePlan
     from rdstitch.options import StitchOptions
     from rdstitch.outputs import Outputs
+    from rdstitch.pipeline.result_files import PosesFrame
     from rdstitch.registration import Registration
     from rdstitch.robust import SolverName
     from rdstitch.stitch_result import StitchResult
@@ -163,34 +164,39 @@ class Report:
 def staged_beside(
     report: Report,
     reporter: Reporter,
-    layers: Path | None,
     *,
+    layers: Path | None,
     whole_layers: bool,
-    texts: Mapping[Path | None, Callable[["StitchResult"], str]],
+    hugin_project: Path | None,
+    poses: Path | None = None,
+    frame: "PosesFrame" = "enu",
 ) -> Callable[["Outputs", "StitchResult"], None]:
-    """What stages the report, the layers where they are wanted, and texts by their files, together with the image."""
+    """What stages the report, and the layers, the project and the poses that are wanted, together with the image."""
     from rdstitch.outputs import check_distinct, check_output
 
-    given, files = click.get_current_context().params, [file for file in texts if file is not None]
+    given, files = click.get_current_context().params, [file for file in (hugin_project, poses) if file is not None]
     for file in files:
         check_output(file, given["overwrite"], given["inputs"], suffixes=())
     check_distinct([*files, given["output"], f"{given['output']}.json"])
     if whole_layers and layers is None:
         raise click.UsageError("--whole-layers goes with --layers DIR")
     if layers is not None:
-        from rdstitch.pipeline.layers import make_folder
+        from rdstitch.pipeline.result_files import make_folder
 
         make_folder(layers)
 
     def stage(outputs: "Outputs", result: "StitchResult") -> None:
-        from rdstitch.outputs import text_bytes
-        from rdstitch.pipeline.layers import write_layers
-
         report.stage(outputs, result)
+        if not files and layers is None:
+            return
+        from rdstitch.outputs import text_bytes
+        from rdstitch.pipeline.result_files import poses_table, project_of_hugin, write_layers
+
         writing: dict[Path, Callable[[], object]] = {}
-        for file, text in texts.items():
-            if file is not None and result.plan is None:
-                writing[file] = partial(lambda file, text: outputs.write(file, text_bytes(text(result))), file, text)
+        if hugin_project is not None and result.plan is None:
+            writing[hugin_project] = lambda: outputs.write(hugin_project, text_bytes(project_of_hugin(result)))
+        if poses is not None and result.plan is None:
+            writing[poses] = lambda: outputs.write(poses, text_bytes(poses_table(result, frame)))
         if layers is not None:
             how: dict[str, Any] = {"whole": whole_layers, "overwrite": result.options.overwrite, "outputs": outputs}
             writing[layers] = partial(write_layers, result, layers, **how)

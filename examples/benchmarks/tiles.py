@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from examples.benchmarks.driver import run
 from rdstitch.arrays import FloatArray
 from rdstitch.inputs.source import read_sources
-from rdstitch.pipeline.flat_field import with_flat_field
+from rdstitch.pipeline.read_inputs import with_flat_field
 from rdstitch.stage import TileGrid, register_tiles
 from tests.stage_grid import Specimen, StageGrid
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from rdstitch.compositing.options import CompositeOptions, Interpolation
 from rdstitch.compositing.tables import CompositeTables
 from rdstitch.inputs.frame import in_order
+from rdstitch.pipeline.apply_sidecar import Recomposition
 from rdstitch.pipeline.placed_images import PlacedImages
-from rdstitch.pipeline.recomposition import Recomposition
 from rdstitch.stitch_result import StitchResult
 
 

@@ -1,6 +1,8 @@
 """From frames and options to the images that are registered."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import natural_key
@@ -10,10 +12,12 @@ from rdstitch.inputs.measurements import with_attitudes
 from rdstitch.inputs.positions import with_ground_control, with_positions
 from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.io.flat_field import read_flat_field
 from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.process_memory import return_freed_memory
+from rdstitch.stage.flat_field import estimate_illumination
 
 
 def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
@@ -59,3 +63,30 @@ def read_inputs(
     sources = with_positions(sources, options.positions, options.composite.epsg, options.positions_offset)
     sources = with_ground_control(sources, options.gcp)
     return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), unread
+
+
+def check_size(sources: Sequence[Source]) -> None:
+    """Refuse tiles of several sizes."""
+    (w1, h1), other = sources[0].camera.image_size, None
+    other = next((source for source in sources if source.camera.image_size != (w1, h1)), None)
+    if other is not None:
+        w2, h2 = other.camera.image_size
+        raise InputError(f"{other.path}: has {w2} x {h2} pixels, the tiles before it have {w1} x {h1}; leave it out")
+
+
+def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
+    """The tiles, which are read without the illumination that all have; and what there is to say of that."""
+    if wanted == "off":
+        return list(sources), []
+    if wanted != "auto":
+        pixels = sources[0].read().pixels
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        field = read_flat_field(wanted, sources[0].camera.image_size, channels)
+        return [replace(source, flat_field=field) for source in sources], []
+    shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
+    if shown.field is None:
+        text = f"{len(sources)} tiles show no illumination that they have in common, and samples stay as they are"
+        return list(sources), [Message(text, severity="note", code="flat-field")]
+    dark = ", ".join(f"{value:.0f}" for value in shown.dark)
+    text = f"flat field: {shown.shading:.0%} less light where it is darkest, ± {shown.error:.1%}; dark level {dark}"
+    return [replace(source, flat_field=shown.field) for source in sources], [Message(text, severity="note")]

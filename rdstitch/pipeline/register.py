@@ -20,8 +20,7 @@ from rdstitch.messages import Message, names_of, shortened
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, Purpose, close_loops, impossible_estimates_fail, select_by_whole_lens
 from rdstitch.pipeline.detect_features import detect_by_contrast
-from rdstitch.pipeline.pattern_crossings import match_crossings
-from rdstitch.pipeline.pattern_shifts import settle_repeated_pattern
+from rdstitch.pipeline.repeated_pattern import match_crossings, settle_repeated_pattern
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.process_memory import return_freed_memory
 from rdstitch.progress import Progress, silent

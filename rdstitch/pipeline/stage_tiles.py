@@ -25,7 +25,7 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import Message, names_of, shortened
 from rdstitch.options import StitchOptions
 from rdstitch.outputs import Outputs, check_distinct, check_output, text_bytes
-from rdstitch.pipeline.flat_field import check_size, with_flat_field
+from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
 from rdstitch.progress import Progress, silent
 from rdstitch.radial_homography import RadialHomography

@@ -21,7 +21,7 @@ from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
 from rdstitch.messages import Message, ignored
 from rdstitch.outputs import IMAGE_SUFFIXES, check_outputs
-from rdstitch.pipeline.layers import make_folder
+from rdstitch.pipeline.result_files import make_folder
 from rdstitch.progress import Progress, silent
 
 Framing = Literal["same", "all", "valid"]

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -66,8 +65,6 @@ def mosaic(
     list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
-    from rdstitch.pipeline.hugin_project import project_of_hugin
-    from rdstitch.pipeline.poses import poses_table
     from rdstitch.pipeline.recipes import mosaic as recipe
     from rdstitch.pipeline.recipes import mosaic_blocks
 
@@ -81,8 +78,15 @@ def mosaic(
         if following:
             arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle, refresh=refresh)
             paths = stack.enter_context(arrived)
-        texts = {poses: partial(poses_table, frame=frame)} | {hugin_project: project_of_hugin}
-        beside = staged_beside(report_page, reporter, layers, whole_layers=whole_layers, texts=texts)
+        beside = staged_beside(
+            report_page,
+            reporter,
+            layers=layers,
+            whole_layers=whole_layers,
+            hugin_project=hugin_project,
+            poses=poses,
+            frame=frame,
+        )
         how: dict[str, Any] = {"every": every, "progress": report_page.progress, "beside": beside}
         with report_page.explaining():
             if all_blocks:

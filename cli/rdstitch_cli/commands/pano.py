@@ -42,14 +42,11 @@ def pano(
     INPUT is what 'rdstitch mosaic' takes, but every image must be readable. The image goes to the output,
     everything estimated to the output's name with .json added, and λ to standard output.
     """
-    from rdstitch.pipeline.hugin_project import project_of_hugin
     from rdstitch.pipeline.recipes import pano as recipe
 
     paths = options.resolve(inputs)
     report_page = Report(report, reporter, paths, given["overwrite"], output)
-    beside = staged_beside(
-        report_page, reporter, layers, whole_layers=whole_layers, texts={hugin_project: project_of_hugin}
-    )
+    beside = staged_beside(report_page, reporter, layers=layers, whole_layers=whole_layers, hugin_project=hugin_project)
     with report_page.explaining():
         result = recipe(
             paths,

@@ -21,8 +21,8 @@ from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
-from rdstitch.pipeline.poses import poses_table
 from rdstitch.pipeline.recipes import mosaic
+from rdstitch.pipeline.result_files import poses_table
 from rdstitch.radial_homography import from_plane
 from rdstitch.report import report_page
 from tests.cli.running import flight, transfers

@@ -15,8 +15,8 @@ from rdstitch.camera import Camera
 from rdstitch.camera_files import read_camera_file
 from rdstitch.errors import ArgumentError
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.hugin_project import project_of_hugin
 from rdstitch.pipeline.recipes import mosaic
+from rdstitch.pipeline.result_files import project_of_hugin
 from rdstitch.synthetic.panorama import panorama_rotations, turning_sequence
 from tests.cli.running import flight
 

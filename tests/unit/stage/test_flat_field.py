@@ -8,7 +8,7 @@ import pytest
 from rdstitch.errors import InputError
 from rdstitch.inputs.source import read_sources
 from rdstitch.io.flat_field import FlatField, read_flat_field
-from rdstitch.pipeline.flat_field import with_flat_field
+from rdstitch.pipeline.read_inputs import with_flat_field
 from rdstitch.stage.flat_field import estimate_illumination
 from tests.stage_grid import Specimen, StageGrid
 

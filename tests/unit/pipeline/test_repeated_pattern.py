@@ -9,7 +9,7 @@ import rdstitch
 from examples.judging import alignment_error
 from rdstitch.camera import Camera
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.pipeline import pattern_shifts
+from rdstitch.pipeline import repeated_pattern
 from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, repeated, sequence_over
 from rdstitch.verification.unique_places import UniqueShift
@@ -46,6 +46,6 @@ def test_images_that_look_alike_nowhere_else_keep_their_places(monkeypatch: pyte
     sequence = sequence_over(partial(ground, seed=2), LENS, grid_poses(LENS, 3, 1, overlap=0.6, seed=3), seed=3)
     decided = {(0, 1): UniqueShift(np.zeros(2), 1.0, 1.0, 0.0)}
     monkeypatch.setattr(Pairing, "shows_repeated_pattern", property(lambda pairing: True))
-    monkeypatch.setattr(pattern_shifts, "unique_shifts", lambda placed, pairs, workers: decided)
+    monkeypatch.setattr(repeated_pattern, "unique_shifts", lambda placed, pairs, workers: decided)
     result = rdstitch.mosaic([sequence.frame(k) for k in range(3)], None, OPTIONS)
     assert result.registration.alignment.used.all(), result.registration.messages
