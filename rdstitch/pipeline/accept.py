@@ -50,32 +50,32 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
     def checked(candidate: Registration) -> tuple[Finding, ...]:
         return judge(Evidence(candidate, options.threshold, options.threads, cache, lens_only))
 
-    current, found = registration, checked(registration)
-    first, found_first = registration, found
-    if _fails(found) and undamaged is not None and not _fails(judged := checked(undamaged)):
-        current, found = undamaged, judged
-    elif _fails(found) and not options.force:
-        another = not lens_only and _may_be_another_plane(found)
+    current, findings = registration, checked(registration)
+    first, first_findings = registration, findings
+    if _fails(findings) and undamaged is not None and not _fails(judged := checked(undamaged)):
+        current, findings = undamaged, judged
+    elif _fails(findings) and not options.force:
+        another = not lens_only and _may_be_another_plane(findings)
         plane = _plane_of_most(registration, options, aligner) if another else None
         judged = () if plane is None else checked(plane)
         if plane is not None and not any(map(_is_of_the_whole, judged)):
-            current, found = plane, judged
+            current, findings = plane, judged
         start, left = current, dict[tuple[int, ...], Message]()
         for _ in range(_MAX_ROUNDS):
-            if not _fails(found):
+            if not _fails(findings):
                 break
-            if any(map(_is_of_the_whole, found)):
-                raise RefusedError(_told(current, found))
-            worst = _worst(current, found)
+            if any(map(_is_of_the_whole, findings)):
+                raise RefusedError(_told(current, findings))
+            worst = _worst(current, findings)
             left |= worst
             shrunk = _without(start, left, aligner) if worst else None
             # Where as many images fail as pass, nobody can say which of them are right.
             if shrunk is None or shrunk.alignment.used.sum() <= len(_images(left)):
-                raise RefusedError(_told(first, found_first))
-            current, found = shrunk, checked(shrunk)
-    if _fails(found) and not options.force:
-        raise RefusedError(_told(first, found_first))
-    accepted = _told(current, found)
+                raise RefusedError(_told(first, first_findings))
+            current, findings = shrunk, checked(shrunk)
+    if _fails(findings) and not options.force:
+        raise RefusedError(_told(first, first_findings))
+    accepted = _told(current, findings)
     if accepted.failures and not options.force:  # of the alignment itself
         raise RefusedError(accepted)
     if options.strict and accepted.left_out:
@@ -106,18 +106,18 @@ def _is_simpler(model: str, former: str) -> bool:
     return {model, former} <= set(by_freedom) and by_freedom.index(model) < by_freedom.index(former)
 
 
-def _fails(found: Iterable[Finding]) -> bool:
-    return any(finding.fails for finding in found)
+def _fails(findings: Iterable[Finding]) -> bool:
+    return any(finding.fails for finding in findings)
 
 
-def _told(registration: Registration, found: Sequence[Finding]) -> Registration:
+def _told(registration: Registration, findings: Sequence[Finding]) -> Registration:
     """A registration at full size, with what was found of it in words."""
-    return at_full_size(registration).with_messages(messages_of(found, registration))
+    return at_full_size(registration).with_messages(messages_of(findings, registration))
 
 
-def _may_be_another_plane(found: Iterable[Finding]) -> bool:
+def _may_be_another_plane(findings: Iterable[Finding]) -> bool:
     """Whether something moves differently from what was registered, or the whole fails."""
-    return any(finding.kind in ("second motion", "undecided motion") or _is_of_the_whole(finding) for finding in found)
+    return any(found.kind in ("second motion", "undecided motion") or _is_of_the_whole(found) for found in findings)
 
 
 def _plane_of_most(registration: Registration, options: StitchOptions, aligner: Aligner) -> Registration | None:
@@ -145,9 +145,9 @@ def _images(offenders: Offenders) -> dict[int, Message]:
     return {images[0]: message for images, message in offenders.items() if len(images) == 1}
 
 
-def _worst(registration: Registration, found: Iterable[Finding]) -> Offenders:
+def _worst(registration: Registration, findings: Iterable[Finding]) -> Offenders:
     """The worst images, no two of them linked, since a bad image spoils its neighbours; else the failing pairs."""
-    failures = [finding for finding in found if finding.fails]
+    failures = [finding for finding in findings if finding.fails]
     single = {finding.images[0]: finding for finding in failures if len(finding.images) == 1}
     if not single:
         pairs = [finding for finding in failures if len(finding.images) == 2]
@@ -176,9 +176,9 @@ def _held_by(registration: Registration, offenders: Mapping[int, Message]) -> di
     """The images left out that each other image is linked with."""
     held: dict[int, set[int]] = {}
     for fit in registration.alignment.links:
-        for own, other in ((fit.image1, fit.image2), (fit.image2, fit.image1)):
-            if fit.used and other in offenders and own not in offenders:
-                held.setdefault(own, set()).add(other)
+        for image, other in ((fit.image1, fit.image2), (fit.image2, fit.image1)):
+            if fit.used and other in offenders and image not in offenders:
+                held.setdefault(image, set()).add(other)
     return held
 
 

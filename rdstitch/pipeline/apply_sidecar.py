@@ -233,10 +233,10 @@ def apply(
     if strict and doubts:
         raise InputError(doubts[0].text)
     given = as_inputs(images, channel_order)
-    with found_images(given, output=output, every=every, topic=topic) as found, Outputs(overwrite) as outputs:
+    with found_images(given, output=output, every=every, topic=topic) as listed, Outputs(overwrite) as outputs:
         if output is not None:
-            _check_outputs(Path(output), overwrite, found.files, saved.path)
-        chosen, matched = _match(saved, found.frames, match)
+            _check_outputs(Path(output), overwrite, listed.files, saved.path)
+        chosen, matched = _match(saved, listed.frames, match)
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
         used = _used(saved, sources, left_out, mask, strict=strict)
@@ -264,7 +264,7 @@ def apply(
             left_out=left_out,
             placed=placed,
             composite_options=options,
-            messages=(*doubts, *found.messages, *guard.messages, *composed.messages),
+            messages=(*doubts, *listed.messages, *guard.messages, *composed.messages),
             channel_order=channel_order,
             **composed.output_fields,
         )
@@ -372,11 +372,11 @@ def _sources(
         if frame is None:
             left_out[index] = left_out_message(image.path, "is not among the given images")
             continue
-        found, unread = read_sources([frame], skip_bad=True, guard=guard, max_memory=max_memory)
+        read, unread = read_sources([frame], skip_bad=True, guard=guard, max_memory=max_memory)
         if unread:
             left_out[index] = unread[0]
         else:
-            sources[-1] = replace(found[0], camera=_resized(image.camera, found[0]))
+            sources[-1] = replace(read[0], camera=_resized(image.camera, read[0]))
     return sources, left_out
 
 

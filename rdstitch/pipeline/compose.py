@@ -109,8 +109,8 @@ def compose_images(
         return replace(composed, canvas=composite.canvas, composite=composite, georeference=place, messages=messages)
 
     def tags(final: Canvas) -> list[ExtraTag]:
-        there = moved(place, canvas, final)
-        return [] if there is None else there.tiff_tags()
+        on_final = moved(place, canvas, final)
+        return [] if on_final is None else on_final.tiff_tags()
 
     metadata = placed.sources[0].metadata.of_composite()
     if metadata.pixel_size is not None:

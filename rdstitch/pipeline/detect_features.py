@@ -63,12 +63,12 @@ def detect_features(
     """
     results: list[StoredFeatures | InputError] = []
     run = partial(detect_batch, options=options, store=store)
-    for found, notes in in_order(executor, run, batches(sources, _IMAGES_AT_ONCE, _MIN_BATCHES)):
+    for batch, notes in in_order(executor, run, batches(sources, _IMAGES_AT_ONCE, _MIN_BATCHES)):
         sources[0].guard.learn(notes)
-        errors = [result for result in found if isinstance(result, InputError)]
+        errors = [result for result in batch if isinstance(result, InputError)]
         if errors and not skip_bad:
             raise errors[0]
-        results += found
+        results += batch
         progress("detecting features", len(results), len(sources))
     return DetectedFeatures(
         FeatureStore(
@@ -86,13 +86,13 @@ def detect_batch(
     sources: Sequence[Source], *, options: FeatureOptions, store: Cache
 ) -> tuple[list[StoredFeatures | InputError], GuardNotes]:
     """The features of each image, or why it cannot be read; and what was noticed of the files."""
-    found: list[StoredFeatures | InputError] = []
+    detected: list[StoredFeatures | InputError] = []
     for source in sources:
         try:
-            found.append(_detected(source, options, store))
+            detected.append(_detected(source, options, store))
         except InputError as error:
-            found.append(error)
-    return found, sources[0].guard.notes_on([source.path for source in sources])
+            detected.append(error)
+    return detected, sources[0].guard.notes_on([source.path for source in sources])
 
 
 def _detected(source: Source, options: FeatureOptions, store: Cache) -> StoredFeatures:
@@ -141,13 +141,13 @@ def detect_by_contrast(
     most = 2 * len(poor) >= len(sources) - len(detected.damaged)
     chosen = all_of_them if most else tuple(poor)
     wanted = [sources[k] for k in chosen]
-    own = options.stretch or _stretch_of(wanted, options, executor, store)
-    again = detect(wanted, replace(options, stretch=own, equalize=True))
+    common = options.stretch or _stretch_of(wanted, options, executor, store)
+    again = detect(wanted, replace(options, stretch=common, equalize=True))
     if np.median(_shown(again.features.items)) <= np.median(_shown(detected.features.items)[list(chosen)]):
         return detected
     items = dict(enumerate(detected.features.items)) | dict(zip(chosen, again.features.items, strict=True))
     features = FeatureStore(tuple(items.values()))
-    return replace(detected, features=features, stretch=own if most else stretch, equalized=chosen)
+    return replace(detected, features=features, stretch=common if most else stretch, equalized=chosen)
 
 
 def _show_little(sources: Sequence[Source], detected: DetectedFeatures, options: FeatureOptions) -> list[int]:
@@ -157,14 +157,14 @@ def _show_little(sources: Sequence[Source], detected: DetectedFeatures, options:
     of black and white squares shows few, but strong ones; equalization would only add the noise of what is plain.
     """
     most, megapixels = options.limits
-    counts, found = np.minimum(_shown(detected.features.items), most), []
+    counts, poor = np.minimum(_shown(detected.features.items), most), []
     usual = float(np.median(np.delete(counts, list(detected.damaged)))) if len(detected.damaged) < len(counts) else 0.0
     for index, (source, count) in enumerate(zip(sources, counts.tolist(), strict=True)):
         size = np.prod(source.metadata.size) / source.reduction(megapixels) ** 2 / 1e6
         few = count < _LOW_SHARE * min(most, max(_USUAL_DENSITY * size, usual))
         if few and detected.features.items[index].faint and index not in detected.damaged:
-            found.append(index)
-    return found
+            poor.append(index)
+    return poor
 
 
 def _shown(features: Sequence[StoredFeatures]) -> IntArray:
@@ -174,13 +174,13 @@ def _shown(features: Sequence[StoredFeatures]) -> IntArray:
 
 def _stretch_of(sources: Sequence[Source], options: FeatureOptions, executor: Executor, store: Cache) -> Stretch | None:
     """The stretch that suits all images together."""
-    found = []
+    stretches = []
     for stretch, notes in in_order(
         executor, partial(_stretch_of_one, megapixels=options.limits[1], store=store), sources
     ):
         sources[0].guard.learn(notes)
-        found.append(stretch)
-    return common_stretch(found)
+        stretches.append(stretch)
+    return common_stretch(stretches)
 
 
 def _stretch_of_one(source: Source, *, megapixels: float | None, store: Cache) -> tuple[Stretch | None, GuardNotes]:

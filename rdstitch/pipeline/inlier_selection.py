@@ -38,8 +38,8 @@ def reselect_inliers(
     sigma = sigma_of(np.concatenate([np.zeros(0), *known]) ** 2)
     farthest = min(max(_WIDTH_PER_SIGMA * sigma, _MIN_THRESHOLD), threshold)
     result = {}
-    for k, own in errors.items():
-        relation, inliers = pairs[k].relation, own < farthest
+    for k, distances in errors.items():
+        relation, inliers = pairs[k].relation, distances < farthest
         if inliers.sum() >= _MIN_KEPT * relation.inliers.sum():
             result[k] = replace(pairs[k], relation=replace(relation, inliers=inliers))
     return result

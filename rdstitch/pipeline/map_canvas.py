@@ -65,15 +65,15 @@ def place_messages(place: Georeference | None, reason: str, placed: PlacedImages
     """What the user should know of the place; nothing where hardly an image has a position."""
     if place is None:
         return [Message(f"not georeferenced: {reason}")] if placed.has_place else []
-    found = [Message(place.summary, severity="note")]
+    messages = [Message(place.summary, severity="note")]
     if place.rejected:
         names = [name for name, _ in place.rejected]
         more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
         off = max(away for _, away in place.rejected)
-        found.append(
+        messages.append(
             Message(
                 f"{place.source} that the images contradict, by up to {off:.0f} m, were not used: "
                 f"{', '.join(names[:MAX_NAMED])}{more}"
             )
         )
-    return found
+    return messages

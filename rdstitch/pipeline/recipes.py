@@ -164,12 +164,12 @@ def mosaic_blocks(
     results: list[StitchResult] = []
     refused: list[Message] = []
     given = as_inputs(inputs, options.channel_order)
-    with found_images(given, output=output, every=every, topic=options.topic) as found, ExitStack() as stack:
-        _check_outputs(output, options, found.files)
+    with found_images(given, output=output, every=every, topic=options.topic) as listed, ExitStack() as stack:
+        _check_outputs(output, options, listed.files)
         if options.cache is None:
             # What was found of images and pairs serves the next block.
             options = replace(options, cache=stack.enter_context(temporary_folder()))
-        frames = list(found.frames)
+        frames = list(listed.frames)
         while len(frames) > 1 or not results:
             name = file.with_name(f"{file.stem}-{len(results) + 1}{file.suffix}") if results else file
             try:
@@ -189,7 +189,7 @@ def mosaic_blocks(
             used = [source.frame or Frame(source.path) for source, used in pairs if used]
             done = {(frame.path, frame.number) for frame in used}
             frames = [frame for frame in frames if (frame.path, frame.number) not in done]
-    return (_without_blocks(results[0], results[1:], [*found.messages, *refused]), *map(_without_blocks, results[1:]))
+    return (_without_blocks(results[0], results[1:], [*listed.messages, *refused]), *map(_without_blocks, results[1:]))
 
 
 def _without_blocks(
@@ -222,12 +222,12 @@ def _stitch(
 ) -> StitchResult:
     """The stages of :func:`mosaic`, and, where every image must be readable and one gives the plane, :func:`pano`."""
     given = as_inputs(inputs, options.channel_order)
-    with found_images(given, output=output, every=every, topic=options.topic) as found:
-        _check_outputs(output, options, found.files)
-        sources, unread = read_inputs(in_lasting_order(found.frames), options, skip_bad=not pano)
+    with found_images(given, output=output, every=every, topic=options.topic) as listed:
+        _check_outputs(output, options, listed.files)
+        sources, unread = read_inputs(in_lasting_order(listed.frames), options, skip_bad=not pano)
         check_map(sources, options.composite)
         with options.executor(len(sources)) as executor:
-            known = [*unread, *found.messages]
+            known = [*unread, *listed.messages]
             accepted = _accepted(sources, known, options, executor, progress, "pano" if pano else "mosaic")
             registration = on_whole_pixels(with_frontal_reference(accepted, options, always=pano))
             local = align_registration_locally(registration, options.local_alignment)
@@ -263,11 +263,11 @@ def calibrate(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = options or StitchOptions()
-    with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
-        _check_outputs(None, options, found.files)
-        sources, unread = read_inputs(found.frames, options, skip_bad=True)
+    with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
+        _check_outputs(None, options, listed.files)
+        sources, unread = read_inputs(listed.frames, options, skip_bad=True)
         with options.executor(len(sources)) as executor:
-            known = [*unread, *found.messages]
+            known = [*unread, *listed.messages]
             result = _finished(_accepted(sources, known, options, executor, progress, "calibrate"))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
@@ -316,16 +316,16 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = replace(options or StitchOptions(), pose_covariance=True)
-    with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
+    with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
         files = [file for file in (output, plot) if file is not None]
         for file in files:
-            read = [*found.files, *options.files, *([] if timestamps is None else [timestamps])]
+            read = [*listed.files, *options.files, *([] if timestamps is None else [timestamps])]
             check_output(file, options.overwrite, read, suffixes=())
         check_distinct(files)
-        sources, unread = read_inputs(found.frames, options, skip_bad=True)
+        sources, unread = read_inputs(listed.frames, options, skip_bad=True)
         times = timestamps_of(sources, timestamps)
         with options.executor(len(sources)) as executor:
-            known = [*unread, *found.messages]
+            known = [*unread, *listed.messages]
             registration = _accepted(sources, known, options, executor, progress, "trajectory")
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.

@@ -80,12 +80,12 @@ def register(
         options.lightglue_model,
         aligner.exact_tilts,
     )
-    found = pairing.estimate_candidates(candidates)
-    moving = pairing.without_static_background(found, candidates)
-    pairing, found = moving or (pairing, found)
-    found = pairing.match_repeated_patterns(found) if purpose == "calibrate" else found
-    mixed, other_lens = separate_lenses(aligner.cameras, found, options.threshold, options.known_distortion)
-    aligned = aligner.align([pair for pair in found if not {*pair.images} & other_lens.keys()])
+    pairs = pairing.estimate_candidates(candidates)
+    moving = pairing.without_static_background(pairs, candidates)
+    pairing, pairs = moving or (pairing, pairs)
+    pairs = pairing.match_repeated_patterns(pairs) if purpose == "calibrate" else pairs
+    mixed, other_lens = separate_lenses(aligner.cameras, pairs, options.threshold, options.known_distortion)
+    aligned = aligner.align([pair for pair in pairs if not {*pair.images} & other_lens.keys()])
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
     aligned = close_loops(aligner, pairing, aligned, candidates)
     aligned = select_by_whole_lens(aligner, aligned)

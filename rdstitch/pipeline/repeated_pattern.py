@@ -69,15 +69,15 @@ def settle_repeated_pattern(
     compared = sorted(used, key=lambda pair: pair.image2 - pair.image1)[: _PAIRS_OF_AN_IMAGE * len(sources)]
     shown = ComparedImages(sources, stretch, workers).aligned(alignment, np.flatnonzero(alignment.used).tolist())
     with ThreadPoolExecutor(workers) as pool:
-        found = pool.map(lambda pair: find_ambiguity(shown[pair.image1], shown[pair.image2]).ambiguous, compared)
-        doubtful = [pair.images for pair, ambiguous in zip(compared, found, strict=True) if ambiguous]
+        ambiguities = pool.map(lambda pair: find_ambiguity(shown[pair.image1], shown[pair.image2]).ambiguous, compared)
+        doubtful = [pair.images for pair, ambiguous in zip(compared, ambiguities, strict=True) if ambiguous]
     if not doubtful:
         return aligned, {}
     shifts = unique_shifts(shown, doubtful, workers)
 
     def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
-        there = to_plane(alignment.cameras[i], alignment.homographies[i], points) + shifts[i, j].shift
-        return from_plane(alignment.cameras[j], alignment.homographies[j], there)
+        moved = to_plane(alignment.cameras[i], alignment.homographies[i], points) + shifts[i, j].shift
+        return from_plane(alignment.cameras[j], alignment.homographies[j], moved)
 
     decided = [pair for pair in compared if pair.images in shifts]
     sound = [pair for pair in compared if pair.images not in doubtful]
@@ -140,8 +140,8 @@ def match_crossings(
     former = aligned.alignment
 
     def crossings_of(k: int) -> FloatArray:
-        found = find_crossings(prepare(sources[k].view(_MEGAPIXELS), _MEGAPIXELS, stretch=stretch))
-        return (found + 0.5) * (np.array(former.cameras[k].image_size) / sources[k].camera.image_size) - 0.5
+        points = find_crossings(prepare(sources[k].view(_MEGAPIXELS), _MEGAPIXELS, stretch=stretch))
+        return (points + 0.5) * (np.array(former.cameras[k].image_size) / sources[k].camera.image_size) - 0.5
 
     crossings: dict[int, FloatArray] = {}
     by_crossings = aligned

@@ -81,8 +81,8 @@ def write_layers(
     placed, options = placed_by(result)
     files = layer_files([source.name for source in placed.sources], folder)
     if outputs is None:
-        with Outputs(overwrite) as own:
-            return write_layers(result, folder, whole=whole, overwrite=overwrite, outputs=own)
+        with Outputs(overwrite) as staging:
+            return write_layers(result, folder, whole=whole, overwrite=overwrite, outputs=staging)
     make_folder(folder)
     check_outputs(files, overwrite, [source.path for source in placed.sources])
     images = placed.images(result.canvas.near)
@@ -175,7 +175,7 @@ def project_of_hugin(result: StitchResult) -> str:
             ]
             control += [
                 f"c n{number[ends[0]]} N{number[ends[1]]} x{x:.4f} y{y:.4f} X{X:.4f} Y{Y:.4f} t0"
-                for (x, y), (X, Y) in zip(*(found.tolist() for found in points), strict=True)
+                for (x, y), (X, Y) in zip(*(ends.tolist() for ends in points), strict=True)
             ]
     parts = [f"{HEAD}{_panorama(alignment, used)}", "m i0", *lines, *variables, "v", *control]
     return "\n".join(parts) + "\n"

@@ -74,8 +74,8 @@ def tiles(
         dry_run=options.dry_run,
         workers=options.workers,
     )
-    with found_images(as_inputs(inputs), output=output, topic=options.topic) as found:
-        registration, tiled = _registered(found, output, positions_file, options, progress)
+    with found_images(as_inputs(inputs), output=output, topic=options.topic) as listed:
+        registration, tiled = _registered(listed, output, positions_file, options, progress)
         with Outputs(options.overwrite) as outputs, stitch.executor(len(registration.sources)) as executor:
             _write_beside(outputs, positions_file, options, registration, tiled)
             local = no_local_alignment("tiles on a stage")
@@ -99,25 +99,25 @@ def place_tiles(
         As for :func:`tiles`.
     """
     options = options or TileOptions()
-    with found_images(as_inputs(inputs), topic=options.topic) as found:
-        registration, tiled = _registered(found, None, positions_file, options, progress)
+    with found_images(as_inputs(inputs), topic=options.topic) as listed:
+        registration, tiled = _registered(listed, None, positions_file, options, progress)
     with Outputs(options.overwrite) as outputs:
         _write_beside(outputs, positions_file, options, registration, tiled)
     return tiled, registration
 
 
 def _registered(
-    found: FoundImages,
+    listed: FoundImages,
     output: str | Path | None,
     positions_file: str | Path | None,
     options: TileOptions,
     progress: Progress,
 ) -> tuple[Registration, TileRegistration]:
     """The places of all tiles, once it is clear that everything can be written."""
-    _check_outputs(output, positions_file, options, found.files)
+    _check_outputs(output, positions_file, options, listed.files)
     guard = InputGuard(options.strict)
     limit = options.composite.max_memory
-    sources, unread = read_sources(found.frames, skip_bad=not options.strict, guard=guard, max_memory=limit)
+    sources, unread = read_sources(listed.frames, skip_bad=not options.strict, guard=guard, max_memory=limit)
     if len(sources) < 2:
         raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
     check_size(sources)
@@ -127,7 +127,7 @@ def _registered(
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
     tiled = register_tiles(grid, read, search=options.search, distortion=options.distortion, progress=progress)
-    return _registration(sources, tiled).with_messages([*unread, *found.messages, *illumination]), tiled
+    return _registration(sources, tiled).with_messages([*unread, *listed.messages, *illumination]), tiled
 
 
 def _write_beside(
@@ -203,18 +203,18 @@ def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registr
     homographies[:, :2, 2] = places / half
     pairs, fits = [], []
     for number, (first, second) in enumerate(links.tiles.tolist()):
-        own = links.pair == number
+        of_pair = links.pair == number
         relation = np.eye(3)
         relation[:2, 2] = (fitted.places[first] - fitted.places[second]) / half
-        agreeing = fitted.squared[own] / fitted.noise < 16.0
-        errors = np.linalg.norm(fitted.residuals[own], axis=1)
+        agreeing = fitted.squared[of_pair] / fitted.noise < 16.0
+        errors = np.linalg.norm(fitted.residuals[of_pair], axis=1)
         used = bool(fitted.weights[number] > 0.25)
         rms = math.sqrt(float((errors[agreeing] ** 2).mean())) if agreeing.any() else math.nan
         matches = Correspondences(
-            np.tile(np.arange(int(own.sum()), dtype=np.intp)[:, None], 2),
-            links.points1[own],
-            links.points2[own],
-            np.zeros(int(own.sum())),
+            np.tile(np.arange(int(of_pair.sum()), dtype=np.intp)[:, None], 2),
+            links.points1[of_pair],
+            links.points2[of_pair],
+            np.zeros(int(of_pair.sum())),
         )
         pair = RadialHomography(
             relation, cameras[first], cameras[second], agreeing, model="rigid", rms=rms, reason="correlation"

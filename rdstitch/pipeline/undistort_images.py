@@ -101,10 +101,10 @@ def undistort(
     if image_format is not None and image_format not in get_args(ImageFormat):
         raise ArgumentError(f"unknown format {image_format!r}; choose {', '.join(get_args(ImageFormat))}")
     given = as_inputs(inputs, channel_order)
-    with found_images(given, every=1, topic=topic) as found:
+    with found_images(given, every=1, topic=topic) as listed:
         guard = InputGuard()
-        sources, _ = read_sources(found.frames, camera=camera, distortion=distortion, skip_bad=False, guard=guard)
-        for message in found.messages:
+        sources, _ = read_sources(listed.frames, camera=camera, distortion=distortion, skip_bad=False, guard=guard)
+        for message in listed.messages:
             warn(message)
         if folder is None:
             images = [in_order(_undistorted(source, view).pixels, channel_order) for source in sources]
@@ -113,7 +113,7 @@ def undistort(
             return images
         outputs = _outputs(sources, Path(folder), image_format)
         with _existing(Path(folder)):
-            check_outputs(outputs, overwrite, found.files)
+            check_outputs(outputs, overwrite, listed.files)
             for done, (source, output) in enumerate(zip(sources, outputs, strict=True), start=1):
                 image = _undistorted(source, view)
                 metadata = source.metadata if view == "same" else source.metadata.in_another_size()

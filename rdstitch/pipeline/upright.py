@@ -81,11 +81,11 @@ def _upright(placed: PlacedImages, options: UprightOptions) -> tuple[FloatArray 
         text += f", with a focal length of {upright.focal.value / pixel:.0f} pixels ({camera.focal_source or 'guess'})"
         said = [Message(text, severity="warning" if error > _SURE else "note")]
     elif options.straighten == "auto":
-        found = of_scene(_edges(placed), start, focal, depth=placed.turned)
-        if found is None:
+        axes = of_scene(_edges(placed), start, focal, depth=placed.turned)
+        if axes is None:
             text = "no straight edges were found: the output is not turned"
             return None, [Message(text, code="not-straightened")]
-        upright, across, down = found
+        upright, across, down = axes
         said = [Message(f"straightened by {across} horizontal and {down} vertical edges", severity="note")]
     elif not isinstance(options.straighten, str):
         ends = _in_reference(placed, np.reshape(options.straighten, (-1, 2))).reshape(-1, 2, 2)
@@ -127,7 +127,7 @@ def _edges(placed: PlacedImages) -> Edges:
     assert placed.reference is not None
     to_reference = np.linalg.inv(placed.homographies[placed.reference]) @ placed.homographies
     detector = cv2.createLineSegmentDetector()
-    found, error = [], 0.0
+    segments, error = [], 0.0
     count = len(placed.sources)
     for k in np.unique(np.linspace(0, count - 1, min(count, _MAX_IMAGES)).astype(np.intp)).tolist():
         camera, image = placed.cameras[k], prepare(placed.sources[k].view(_MEGAPIXELS), _MEGAPIXELS)
@@ -136,9 +136,9 @@ def _edges(placed: PlacedImages) -> Edges:
         clear = image.covers(ends, np.full(len(ends), _CLEARANCE)).reshape(-1, 2).all(axis=1)
         flat = camera.normalize(camera.undistort(image.to_full_size(ends))).reshape(-1, 2, 2)[clear]
         flat = flat[np.linalg.norm(flat[:, 1] - flat[:, 0], axis=1) > _MIN_LENGTH]
-        found.append(np.concatenate([flat, np.ones((len(flat), 2, 1))], axis=2) @ to_reference[k].T)
+        segments.append(np.concatenate([flat, np.ones((len(flat), 2, 1))], axis=2) @ to_reference[k].T)
         error = max(error, _DETECTION * float(image.factor.max()) / camera.scale)
-    return _between(placed, np.concatenate(found), error)
+    return _between(placed, np.concatenate(segments), error)
 
 
 def _between(placed: PlacedImages, ends: FloatArray, error: float) -> Edges:

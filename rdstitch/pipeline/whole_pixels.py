@@ -41,11 +41,11 @@ def on_whole_pixels(registration: Registration) -> Registration:
         replace(c, distortion=0.0, distortion2=0.0, distortion3=0.0, center=(math.nan, math.nan))
         for c in alignment.cameras
     )
-    own, homographies = cameras[alignment.reference], np.full_like(alignment.homographies, np.nan)
+    reference, homographies = cameras[alignment.reference], np.full_like(alignment.homographies, np.nan)
     for index, shift in zip(np.flatnonzero(alignment.used), whole, strict=True):
         camera = cameras[index]
-        middle = (shift + camera.center - own.center) / own.scale
-        homographies[index] = np.diag([unit * camera.scale / own.scale] * 2 + [1.0])
+        middle = (shift + camera.center - reference.center) / reference.scale
+        homographies[index] = np.diag([unit * camera.scale / reference.scale] * 2 + [1.0])
         homographies[index][:2, 2] = frame[:2, 2] + unit * middle
     return replace(
         registration, alignment=replace(alignment, cameras=cameras, homographies=homographies, distortion=0.0)

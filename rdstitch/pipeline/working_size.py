@@ -27,7 +27,7 @@ def at_full_size(registration: Registration) -> Registration:
     working = registration.alignment.cameras
     if all(a.image_size == b.image_size for a, b in zip(full, working, strict=True)):
         return registration
-    cameras = tuple(camera.resized(own.image_size) for camera, own in zip(working, full, strict=True))
+    cameras = tuple(camera.resized(original.image_size) for camera, original in zip(working, full, strict=True))
     pairs = tuple(_pair_at_full_size(pair, working, full) for pair in registration.pairs)
     return replace(registration, pairs=pairs, alignment=replace(registration.alignment, cameras=cameras))
 

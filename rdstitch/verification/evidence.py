@@ -97,6 +97,6 @@ class Evidence:
     @property
     def depth(self) -> bool:
         """Whether the scene has depth: relief, a second motion as small as tree tops have, or any of a turn."""
-        moved = [own for own in self.motions if own.area]
-        near = bool(moved) and (self.alignment.on_sphere or not any(own.is_far for own in moved))
+        moved = [motion for motion in self.motions if motion.area]
+        near = bool(moved) and (self.alignment.on_sphere or not any(motion.is_far for motion in moved))
         return self.alignment.relief.found or near

@@ -10,8 +10,8 @@ from rdstitch.verification.findings import Finding
 TEXTS = {
     "lenses mixed": (
         "",
-        "two lenses or zooms are mixed: {own} (λ about {here:.3f}) and {others} ({there:.3f}); stitch those of each on "
-        "their own",
+        "two lenses or zooms are mixed: {images2} (λ about {lens2:.3f}) and {images1} ({lens1:.3f}); stitch those of "
+        "each on their own",
     ),
     "matches disagree": ("", "only {inliers} of {count} matches of the pairs agree with the whole"),
     "image misfits": ("", "only {inliers} of {count} of its matches agree with the whole; {reason}"),
@@ -108,14 +108,14 @@ def _message(finding: Finding, paths: Sequence[str]) -> Message:
         return Message(_outvoted(finding.kind, values["pairs"], paths), images, finding.severity, "doubtful-seam")
     if len(names) == 2:
         values |= {"first": names[0], "second": names[1], "both": " and ".join(names)}
-    for key in ("own", "others", "without"):
+    for key in ("images1", "images2", "without"):
         if key in values:
             values[f"{key}_count"] = len(values[key])
             values[key] = shortened(names_of(paths[k] for k in values[key]))
     values |= {key: names_of([paths[values[key]]])[0] for key in ("near", "far") if key in values}
     if "bodies" in values:
         bodies = sorted(values["bodies"].items(), key=lambda body: -len(body[1]))
-        listed = (f"{body} ({len(own)}: {shortened(names_of(paths[k] for k in own))})" for body, own in bodies)
+        listed = (f"{body} ({len(shown)}: {shortened(names_of(paths[k] for k in shown))})" for body, shown in bodies)
         values |= {"number": len(bodies), "bodies": "; ".join([*listed][:MAX_NAMED])}
     if "shown" in values:
         values["moving"] = _MOVING.format(**{**values, "shown": names_of(paths[k] for k in values["shown"])})

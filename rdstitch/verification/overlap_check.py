@@ -120,8 +120,8 @@ def _by_what_is_unique(placed: Mapping[int, ComparedImage], checked: Sequence[Ch
     shifts = unique_shifts(placed, [link.pair for link in checked if link.ambiguity.ambiguous])
 
     def lies_here(link: CheckedLink) -> bool:
-        there = placed[link.fit.image2]
-        off = np.hypot(*shifts[link.pair].shift) * drawing_scale(there.camera, there.homography)
+        second = placed[link.fit.image2]
+        off = np.hypot(*shifts[link.pair].shift) * drawing_scale(second.camera, second.homography)
         return bool(off <= SLACK)
 
     return [replace(link, unique=link.pair in shifts and lies_here(link)) for link in checked]

@@ -70,10 +70,10 @@ class ComparedImage:
             return from_plane(self.camera, self.homography, plane(grid.reshape(-1, 2))).reshape(grid.shape)
 
         x, y = Lattice.over(box, _LATTICE, places).maps(box)
-        found = cv2.remap(
+        sampled = cv2.remap(
             self.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(float("nan"),)
         )
-        return np.asarray(found, dtype=np.float32)
+        return np.asarray(sampled, dtype=np.float32)
 
 
 def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> Grey:

@@ -22,26 +22,26 @@ MAX_WARNINGS = 3
 """Lines of one run."""
 
 
-def disagreeing_pairs(found: Evidence) -> Iterator[Finding]:
+def disagreeing_pairs(evidence: Evidence) -> Iterator[Finding]:
     """Pairs of whose matches most do not fit into the whole."""
-    for fit in found.used:
+    for fit in evidence.used:
         if fit.inliers < limit("inliers of a pair") * fit.count:
-            reason = _reason(found, (fit.image1, fit.image2), [fit], "stitch them on their own")
+            reason = _reason(evidence, (fit.image1, fit.image2), [fit], "stitch them on their own")
             yield _of_matches("pair misfits", (fit.image1, fit.image2), [fit], reason)
 
 
-def _misfitting_images(found: Evidence) -> Iterator[Finding]:
+def _misfitting_images(evidence: Evidence) -> Iterator[Finding]:
     """Images of whose matches too many do not fit into the whole, over all pairs that do."""
-    agreeing = [fit for fit in found.used if fit.inliers >= limit("inliers of a pair") * fit.count]
-    for k in range(len(found.registration.sources)):
-        own = [fit for fit in agreeing if k in (fit.image1, fit.image2)]
-        if sum(fit.inliers for fit in own) < limit("inliers of an image") * sum(fit.count for fit in own):
-            yield _of_matches("image misfits", (k,), own, _reason(found, (k,), own))
+    agreeing = [fit for fit in evidence.used if fit.inliers >= limit("inliers of a pair") * fit.count]
+    for k in range(len(evidence.registration.sources)):
+        fits = [fit for fit in agreeing if k in (fit.image1, fit.image2)]
+        if sum(fit.inliers for fit in fits) < limit("inliers of an image") * sum(fit.count for fit in fits):
+            yield _of_matches("image misfits", (k,), fits, _reason(evidence, (k,), fits))
 
 
-def _matches_disagree(found: Evidence) -> Iterator[Finding]:
-    if sum(fit.inliers for fit in found.used) < limit("inliers of a pair") * sum(fit.count for fit in found.used):
-        yield _of_matches("matches disagree", (), found.used)
+def _matches_disagree(evidence: Evidence) -> Iterator[Finding]:
+    if sum(fit.inliers for fit in evidence.used) < limit("inliers of a pair") * sum(fit.count for fit in evidence.used):
+        yield _of_matches("matches disagree", (), evidence.used)
 
 
 def _of_matches(kind: str, images: tuple[int, ...], fits: Sequence[LinkFit], reason: str = "") -> Finding:
@@ -49,9 +49,9 @@ def _of_matches(kind: str, images: tuple[int, ...], fits: Sequence[LinkFit], rea
     return Finding(kind, images, values={"inliers": inliers, "count": count, "reason": reason})
 
 
-def _reason(found: Evidence, images: Sequence[int], fits: Sequence[LinkFit], remedy: str = "") -> str:
+def _reason(evidence: Evidence, images: Sequence[int], fits: Sequence[LinkFit], remedy: str = "") -> str:
     """Why matches agree with each other only."""
-    few = [(found.registration.sources[k].name, few_features(found.registration.keypoints, k)) for k in images]
+    few = [(evidence.registration.sources[k].name, few_features(evidence.registration.keypoints, k)) for k in images]
     if any(why for _, why in few):
         return ", ".join(f"{name} has {why}" for name, why in few if why)
     why = "they agree with each other: another plane, camera or zoom, or none (trees, walls)?"
@@ -60,18 +60,19 @@ def _reason(found: Evidence, images: Sequence[int], fits: Sequence[LinkFit], rem
     return f"{why} {remedy}".strip()
 
 
-def _mixed_lenses(found: Evidence) -> Iterator[Finding]:
+def _mixed_lenses(evidence: Evidence) -> Iterator[Finding]:
     """Two lenses whose images were not separated: it is not clear which are whose, or each has one image only."""
-    mixed = found.registration.mixed
+    mixed = evidence.registration.mixed
     if mixed is not None and not mixed.certain:
-        own, others = ([k for k, second in enumerate(mixed.second) if second == which] for which in (True, False))
-        there, here = mixed.distortion
-        yield Finding("lenses mixed", values={"own": own, "others": others, "here": here, "there": there})
+        images1, images2 = ([k for k, other in enumerate(mixed.second) if other == which] for which in (False, True))
+        lens1, lens2 = mixed.distortion
+        values = {"images1": images1, "images2": images2, "lens1": lens1, "lens2": lens2}
+        yield Finding("lenses mixed", values=values)
 
 
-def _errors(found: Evidence) -> Iterator[Finding]:
+def _errors(evidence: Evidence) -> Iterator[Finding]:
     """Errors of all pairs together; those of rough ground are a warning where the pixels agree."""
-    alignment, threshold = found.alignment, found.threshold
+    alignment, threshold = evidence.alignment, evidence.threshold
     rms, relief = alignment.rms, alignment.relief
     if rms <= limit("error") * threshold:
         return
@@ -79,123 +80,128 @@ def _errors(found: Evidence) -> Iterator[Finding]:
     # Without what neighbours have in common, errors are those of a plane.
     explained = rms <= largest and rms**2 - relief.size**2 <= (limit("error") * threshold) ** 2
     # Where the pixels agree, depth that one surface does not explain has been found a place all the same.
-    rough = (rms <= limit("error of rough ground") * threshold and found.alike >= limit("alike")) or (
-        relief.found and explained and found.alike >= limit("clearly alike")
+    rough = (rms <= limit("error of rough ground") * threshold and evidence.alike >= limit("alike")) or (
+        relief.found and explained and evidence.alike >= limit("clearly alike")
     )
     values = {"rms": rms, "threshold": threshold}
     yield Finding("rough", (), "warning", values) if rough else Finding("errors", values=values)
 
 
-def _depth(found: Evidence) -> Iterator[Finding]:
+def _depth(evidence: Evidence) -> Iterator[Finding]:
     """Errors that neighbouring matches have in common, and where they are largest."""
-    if found.alignment.relief.found:
-        fit = max(found.used, key=lambda fit: fit.rms)
-        what = found.alignment.relief.explanation
-        kind = "depth of a turn" if found.alignment.on_sphere else "relief"
+    if evidence.alignment.relief.found:
+        fit = max(evidence.used, key=lambda fit: fit.rms)
+        what = evidence.alignment.relief.explanation
+        kind = "depth of a turn" if evidence.alignment.on_sphere else "relief"
         yield Finding(kind, (fit.image1, fit.image2), "warning", {"what": what, "rms": fit.rms})
 
 
-def _shape(found: Evidence) -> Iterator[Finding]:
+def _shape(evidence: Evidence) -> Iterator[Finding]:
     """A shape of the whole that the overlaps do not hold, and the image that may be off the most."""
-    alignment, shape = found.alignment, found.alignment.shape
-    if shape is None or found.lens_only:
+    alignment, shape = evidence.alignment, evidence.alignment.shape
+    if shape is None or evidence.lens_only:
         return
     if alignment.focal is None:
         # Chains of free homographies bend with whatever is not modelled, a curved wall for one.
         yield Finding(
-            "shape unknown", (shape.image,), "warning" if shape.doubtful else "detail", {"size": _size_of_shape(found)}
+            "shape unknown",
+            (shape.image,),
+            "warning" if shape.doubtful else "detail",
+            {"size": _size_of_shape(evidence)},
         )
     elif shape.doubtful:
         remedy = "more rows of images" if alignment.distortion_std == 0.0 else "the lens, or more rows of images"
-        values = {"size": _size_of_shape(found), "cause": shape.cause, "remedy": remedy}
+        values = {"size": _size_of_shape(evidence), "cause": shape.cause, "remedy": remedy}
         yield Finding("shape bent" if shape.shown else "shape free", (shape.image,), "warning", values)
 
 
-def _size_of_shape(found: Evidence) -> float:
-    shape = found.alignment.shape
+def _size_of_shape(evidence: Evidence) -> float:
+    shape = evidence.alignment.shape
     return math.inf if shape is None else math.hypot(shape.shift, shape.shift_std)
 
 
-def _unlike(found: Evidence) -> Iterator[Finding]:
+def _unlike(evidence: Evidence) -> Iterator[Finding]:
     """Images that were put together and do not look alike there.
 
     What two images share of a plane looks alike; where something else moves, it may be that which holds them.
     """
-    least = limit("unlike, undecided" if _undecided(found) else "unlike")
-    return _less_alike(found, least, "unlike", "failure")
+    least = limit("unlike, undecided" if _undecided(evidence) else "unlike")
+    return _less_alike(evidence, least, "unlike", "failure")
 
 
-def _undecided(found: Evidence) -> bool:
+def _undecided(evidence: Evidence) -> bool:
     """Whether something moves differently, and the pixels do not say which of the two is the plane."""
-    compared = found.compared
-    return is_separate(found.motions) and not (compared is not None and (compared.won or compared.lost))
+    compared = evidence.compared
+    return is_separate(evidence.motions) and not (compared is not None and (compared.won or compared.lost))
 
 
-def _little_alike(found: Evidence) -> Iterator[Finding]:
+def _little_alike(evidence: Evidence) -> Iterator[Finding]:
     """Images that look less alike than most where they are put together."""
-    return _less_alike(found, limit("little alike"), "little alike", "warning")
+    return _less_alike(evidence, limit("little alike"), "little alike", "warning")
 
 
-def _less_alike(found: Evidence, least: float, kind: str, severity: Severity) -> Iterator[Finding]:
+def _less_alike(evidence: Evidence, least: float, kind: str, severity: Severity) -> Iterator[Finding]:
     """Pairs of whose cells fewer than a share agree."""
-    for link in found.seen:
+    for link in evidence.seen:
         if link.agreement.cells >= limit("cells") and link.agreement.share < least:
             values = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
             yield Finding(kind, link.pair, severity, values)
 
 
-def _ambiguous(found: Evidence) -> Iterator[Finding]:
-    for pair, link in found.ambiguous.items():
+def _ambiguous(evidence: Evidence) -> Iterator[Finding]:
+    for pair, link in evidence.ambiguous.items():
         yield Finding("ambiguous", pair, values={"shift": link.ambiguity.shift})
 
 
-def _pattern(found: Evidence) -> Iterator[Finding]:
+def _pattern(evidence: Evidence) -> Iterator[Finding]:
     """A pattern over so many pairs that leaving some of them out proves nothing; or one in which the unique decided."""
-    if len(found.ambiguous) > limit("pattern") * len(found.checked):
-        yield Finding("pattern", values={"count": len(found.ambiguous), "of": len(found.checked)})
-    settled = [link for link in found.seen if link.unique]
+    if len(evidence.ambiguous) > limit("pattern") * len(evidence.checked):
+        yield Finding("pattern", values={"count": len(evidence.ambiguous), "of": len(evidence.checked)})
+    settled = [link for link in evidence.seen if link.unique]
     if settled:
         yield Finding("settled pattern", min(settled, key=lambda link: link.agreement.share).pair, "warning")
 
 
-def _second_motion(found: Evidence) -> Iterator[Finding]:
+def _second_motion(evidence: Evidence) -> Iterator[Finding]:
     """What moves differently: a failure of all images where it may be the plane, as without the one that shows it best
     it would only be harder to see. Of a turn it is parallax, or what moved before the camera.
     """
-    motions = found.motions
-    if found.lens_only:  # the same a period of the pattern further on; what is static has a message of its own
-        motions = [] if found.static else [own for own in motions if own.images not in found.ambiguous]
-    share, compared = share_of(motions), found.compared
+    motions = evidence.motions
+    if evidence.lens_only:  # the same a period of the pattern further on; what is static has a message of its own
+        motions = [] if evidence.static else [motion for motion in motions if motion.images not in evidence.ambiguous]
+    share, compared = share_of(motions), evidence.compared
     if not motions or (share < limit("second motion") and compared is None):
         return
-    alike = share_alike(found.checked)
+    alike = share_alike(evidence.checked)
     clear = alike >= limit("filled by a plane") or (
         share < limit("filled by a plane") and not alike < limit("unlike, undecided")
     )
-    clear |= found.depth and alike >= limit("alike")  # nearer and farther things move differently
+    clear |= evidence.depth and alike >= limit("alike")  # nearer and farther things move differently
     if compared is not None:
         clear = compared.won or (clear and not compared.lost)
-    worst = max(motions, key=lambda own: own.area)
-    off = min(worst.disagreement, 2.0 * found.alignment.cameras[worst.images[0]].scale)
+    worst = max(motions, key=lambda motion: motion.area)
+    off = min(worst.disagreement, 2.0 * evidence.alignment.cameras[worst.images[0]].scale)
     values = {"share": share, "place": worst.center, "shown": worst.images, "off": off}
-    if found.alignment.on_sphere:
+    if evidence.alignment.on_sphere:
         yield Finding("parallax", worst.images, "warning", {"size": off, "share": share})
-    elif found.lens_only or (clear and worst.is_far):
+    elif evidence.lens_only or (clear and worst.is_far):
         yield Finding("second motion", worst.images, "warning", values)
     elif worst.is_far:  # nearer, it is depth
-        yield Finding("undecided motion", tuple(sorted({k for own in motions for k in own.images})), "failure", values)
+        yield Finding(
+            "undecided motion", tuple(sorted({k for motion in motions for k in motion.images})), "failure", values
+        )
 
 
-def _two_left(found: Evidence) -> Iterator[Finding]:
+def _two_left(evidence: Evidence) -> Iterator[Finding]:
     """Two images without a third, taken for one of another lens, which is all that tells a curved wall from a plane."""
-    used = found.alignment.used
-    if found.registration.mixed is not None and used.sum() == 2:
+    used = evidence.alignment.used
+    if evidence.registration.mixed is not None and used.sum() == 2:
         yield Finding("two of one lens", tuple(used.nonzero()[0].tolist()), "warning")
 
 
-def _inputs(found: Evidence) -> Iterator[Finding]:
+def _inputs(evidence: Evidence) -> Iterator[Finding]:
     """Images of several cameras or zoom settings, and images without a mask among others, by headers and files."""
-    sources = found.registration.sources
+    sources = evidence.registration.sources
     bodies: dict[str, list[int]] = {}
     for k, source in enumerate(sources):
         m = source.metadata
@@ -234,27 +240,27 @@ OF_PLACES = {
 as before."""
 
 
-def _bent(found: Evidence) -> bool:
-    return found.flat and _size_of_shape(found) < min(2.0 * camera.scale for camera in found.alignment.cameras)
+def _bent(evidence: Evidence) -> bool:
+    return evidence.flat and _size_of_shape(evidence) < min(2.0 * camera.scale for camera in evidence.alignment.cameras)
 
 
-def _seen(found: Evidence) -> bool:
+def _seen(evidence: Evidence) -> bool:
     """Whether depth leaves breaks that are seen."""
-    return found.alike < limit("alike")
+    return evidence.alike < limit("alike")
 
 
 class Aloud(NamedTuple):
     """When a warning of a kind is one, and not a detail; of one topic the first is."""
 
     topic: str
-    speaks: Callable[[Evidence], bool] = lambda found: True
+    speaks: Callable[[Evidence], bool] = lambda evidence: True
 
 
 ALOUD = {
     **dict.fromkeys(("shape unknown", "shape bent", "shape free"), Aloud("flatness", _bent)),
-    **dict.fromkeys(("rough", "relief"), Aloud("flatness", lambda found: found.flat or _seen(found))),
+    **dict.fromkeys(("rough", "relief"), Aloud("flatness", lambda evidence: evidence.flat or _seen(evidence))),
     **dict.fromkeys(("parallax", "depth of a turn"), Aloud("flatness", _seen)),
-    "second motion": Aloud("second motion", lambda found: found.flat or not found.depth),
-    "little alike": Aloud("little alike", lambda found: not found.depth or _seen(found)),
+    "second motion": Aloud("second motion", lambda evidence: evidence.flat or not evidence.depth),
+    "little alike": Aloud("little alike", lambda evidence: not evidence.depth or _seen(evidence)),
 }
 """The gravest first; other kinds are always said, and before these."""

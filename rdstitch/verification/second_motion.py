@@ -77,24 +77,24 @@ def find_second_motions(
         pair.images: np.flatnonzero(~(errors[pair.images] < limit("off the plane") * threshold)) for pair in compared
     }
     lens = alignment.cameras[compared[0].image1].nearest_distortion if compared else None  # all images have one
-    found = _strongest_motions(alignment, compared, rests, lens, threshold)
+    strongest = _strongest_motions(alignment, compared, rests, lens, threshold)
     return [
-        _second_motion(alignment, pair, errors[pair.images], threshold, found.get(pair.images)) for pair in compared
+        _second_motion(alignment, pair, errors[pair.images], threshold, strongest.get(pair.images)) for pair in compared
     ]
 
 
 def _second_motion(
-    alignment: Alignment, pair: PairRegistration, errors: FloatArray, threshold: float, found: RadialHomography | None
+    alignment: Alignment, pair: PairRegistration, errors: FloatArray, threshold: float, motion: RadialHomography | None
 ) -> SecondMotion:
     """What the motion of the matches that are left comes to."""
     camera, points = alignment.cameras[pair.image1], pair.correspondences.points1
     plane = _cells(points[errors < threshold], camera)
-    disagreement = 0.0 if found is None else float(np.median(errors[found.inliers]))
-    if found is None or disagreement < limit("motion") * 2.0 * camera.scale:
+    disagreement = 0.0 if motion is None else float(np.median(errors[motion.inliers]))
+    if motion is None or disagreement < limit("motion") * 2.0 * camera.scale:
         return SecondMotion(pair.images, 0, len(plane))
-    u, v = np.median(points[found.inliers], axis=0).tolist()
-    area = _cells(points[found.inliers], camera) - plane
-    return SecondMotion(pair.images, len(area), len(plane), (u, v), disagreement, found)
+    u, v = np.median(points[motion.inliers], axis=0).tolist()
+    area = _cells(points[motion.inliers], camera) - plane
+    return SecondMotion(pair.images, len(area), len(plane), (u, v), disagreement, motion)
 
 
 def _cells(points: FloatArray, camera: Camera) -> set[tuple[int, int]]:
@@ -119,8 +119,8 @@ def _strongest_motions(
         for pair in batch:
             first, second = (alignment.cameras[k] for k in pair.images)
             camera = first.without_lens().with_focal()
-            own, other = pair.correspondences.take(rests[pair.images]), camera.resized(second.image_size)
-            given.append(PairMatches(own.points1, own.points2, camera, other, -own.ratio))
+            matches, other = pair.correspondences.take(rests[pair.images]), camera.resized(second.image_size)
+            given.append(PairMatches(matches.points1, matches.points2, camera, other, -matches.ratio))
         for pair, motion in zip(batch, estimate_radial_homographies(given, how), strict=True):
             if motion and int(motion.inliers.sum()) >= limit("inliers of a motion"):
                 inliers = np.zeros(len(pair.matches), dtype=np.bool_)
@@ -131,19 +131,19 @@ def _strongest_motions(
 
 def share_of(motions: Sequence[SecondMotion]) -> float:
     """Share of the area of all pairs together that moves differently, in [0, 1]."""
-    return sum(own.area for own in motions) / max(sum(own.area + own.plane_area for own in motions), 1)
+    return sum(motion.area for motion in motions) / max(sum(motion.area + motion.plane_area for motion in motions), 1)
 
 
 def is_separate(motions: Sequence[SecondMotion]) -> bool:
     """Whether what moves differently covers a good part of the images, and moves by more than tree tops do."""
-    return share_of(motions) >= limit("second motion") and max(motions, key=lambda own: own.area).is_far
+    return share_of(motions) >= limit("second motion") and max(motions, key=lambda motion: motion.area).is_far
 
 
 def fills_at_most(compared: Iterable[Agreement]) -> float:
     """Share of the images of some pairs that is not seen to contradict a motion, in [0, 1]."""
     agreements = list(compared)
-    contradicting = sum(own.cells - own.confirming for own in agreements)
-    return 1.0 - contradicting / max(sum(own.in_all for own in agreements), 1)
+    contradicting = sum(agreement.cells - agreement.confirming for agreement in agreements)
+    return 1.0 - contradicting / max(sum(agreement.in_all for agreement in agreements), 1)
 
 
 def _may_be_a_plane(agreement: Agreement) -> bool:
@@ -178,14 +178,14 @@ def compare_motions(
     Only where the latter is a motion of its own and covers a good part; or where what was aligned fills less than half
     of the images, and something else moves in any of them. None otherwise.
     """
-    second = {own.images: own.relation for own in motions if own.relation is not None}
-    separate, far = is_separate(motions), any(own.relation is not None and own.is_far for own in motions)
+    second = {motion.images: motion.relation for motion in motions if motion.relation is not None}
+    separate, far = is_separate(motions), any(motion.relation is not None and motion.is_far for motion in motions)
     if not checked or not (separate or (far and share_alike(checked) < limit("filled by a plane"))):
         return None
     fills = fills_at_most(link.agreement for link in checked)
     moved = (_moved(images, link.pair, second[link.pair]) for link in checked if link.pair in second)
-    found = MotionComparison(fills, fills_at_most(moved))
-    return found if separate or found.lost else None
+    comparison = MotionComparison(fills, fills_at_most(moved))
+    return comparison if separate or comparison.lost else None
 
 
 def _moved(images: ComparedImages, pair: Pair, motion: RadialHomography) -> Agreement:
@@ -205,9 +205,9 @@ def unexplained(
     if compared is None or not compared.won:
         return checked
     shifts = {
-        own.images: own.disagreement / max(own.relation.camera.image_size)
-        for own in motions
-        if own.relation is not None
+        motion.images: motion.disagreement / max(motion.relation.camera.image_size)
+        for motion in motions
+        if motion.relation is not None
     }
     return [
         replace(
@@ -255,5 +255,5 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
 
 
 def _no_plane(pair: PairRegistration) -> RadialHomography:
-    own, reason = pair.relation, "what the two share fills less than half of them (a vehicle?)"
-    return RadialHomography.failed(reason, own.camera, own.camera2, len(own.inliers))
+    relation, reason = pair.relation, "what the two share fills less than half of them (a vehicle?)"
+    return RadialHomography.failed(reason, relation.camera, relation.camera2, len(relation.inliers))

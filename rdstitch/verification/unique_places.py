@@ -75,16 +75,16 @@ def unique_shifts(
         (first, unique1), (second, unique2) = prepared[pair[0]], prepared[pair[1]]
         if unique1 is None or unique2 is None:
             return None
-        found = unique_shift(first, second, unique1, unique2)
-        if found is None or not found.decides:
+        unique = unique_shift(first, second, unique1, unique2)
+        if unique is None or not unique.decides:
             return None
-        shift = found.shift / scale
-        return replace(found, shift=shift) if _moves(placed[pair[0]], placed[pair[1]], shift) else None
+        shift = unique.shift / scale
+        return replace(unique, shift=shift) if _moves(placed[pair[0]], placed[pair[1]], shift) else None
 
     with ThreadPoolExecutor(workers) as pool:
         prepared = dict(zip(images, pool.map(prepare, images), strict=True))
         compared = zip(pairs, pool.map(compare, pairs), strict=True)
-        return {pair: found for pair, found in compared if found is not None}
+        return {pair: unique for pair, unique in compared if unique is not None}
 
 
 def departures(pixels: Grey) -> Grey | None:
@@ -95,8 +95,8 @@ def departures(pixels: Grey) -> Grey | None:
     ndarray of shape (h, w), float32, or None
         0 where it does not; NaN where nothing is known. None for an image that shows too few periods.
     """
-    found = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
-    periods = found.shift[np.hypot(*found.shift.T) > _MIN_SHIFT]
+    peaks = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
+    periods = peaks.shift[np.hypot(*peaks.shift.T) > _MIN_SHIFT]
     periods = periods[np.argsort(np.hypot(*periods.T), kind="stable")][:_MAX_PERIODS]
     if len(periods) < limit("periods"):
         return None
@@ -123,19 +123,19 @@ def unique_shift(first: Drawing, second: Drawing, unique1: Grey, unique2: Grey) 
     None where the pattern of both fits nowhere.
     """
     offset = np.rint(first.origin - second.origin)
-    found = _peaks(Overlaps.of(first.pixels, second.pixels), first.pixels, offset, _OVERLAP)
-    if not len(found.shift):
+    peaks = _peaks(Overlaps.of(first.pixels, second.pixels), first.pixels, offset, _OVERLAP)
+    if not len(peaks.shift):
         return None
     overlaps = Overlaps.of(unique1, unique2)
-    matched, share = np.zeros(len(found.shift)), np.zeros(len(found.shift))
-    for k, (row, column) in enumerate(found.place.tolist()):
+    matched, share = np.zeros(len(peaks.shift)), np.zeros(len(peaks.shift))
+    for k, (row, column) in enumerate(peaks.place.tolist()):
         box = slice(row - 1, row + 2), slice(column - 1, column + 2)
         share[k] = overlaps.correlation(box).max(initial=0.0)
         matched[k] = share[k] * overlaps.products[box].max(initial=0.0)
     best = int(matched.argmax())
-    elsewhere = np.hypot(*(found.shift - found.shift[best]).T) > _MIN_SHIFT
+    elsewhere = np.hypot(*(peaks.shift - peaks.shift[best]).T) > _MIN_SHIFT
     rival = float(matched[elsewhere].max(initial=0.0))
-    return UniqueShift(found.shift[best], float(matched[best]), float(share[best]), rival)
+    return UniqueShift(peaks.shift[best], float(matched[best]), float(share[best]), rival)
 
 
 @dataclass(frozen=True)

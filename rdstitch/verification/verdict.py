@@ -36,7 +36,7 @@ class RefusedError(RegistrationError):
         self.registration = registration
 
 
-def judge(found: Evidence) -> tuple[Finding, ...]:
+def judge(evidence: Evidence) -> tuple[Finding, ...]:
     """Check an alignment against the pairs that it was made from, and against the pixels.
 
     Returns
@@ -44,23 +44,23 @@ def judge(found: Evidence) -> tuple[Finding, ...]:
     tuple of Finding
         Failures, with the images that they concern where that is clear, and warnings; none for a good result.
     """
-    lens_only = found.lens_only
-    count = len(found.registration.sources)
-    of_matches = [finding for find in rules.OF_MATCHES for finding in find(found)]
-    if found.static:
+    lens_only = evidence.lens_only
+    count = len(evidence.registration.sources)
+    of_matches = [finding for find in rules.OF_MATCHES for finding in find(evidence)]
+    if evidence.static:
         of_matches = [finding for finding in of_matches if not finding.images]
     else:
-        disagreeing = {(f.images[0], f.images[1]): f for f in rules.disagreeing_pairs(found)}
-        of_matches += [disagreeing[pair] for pair in decisive_pairs(disagreeing, found.used, count)]
+        disagreeing = {(f.images[0], f.images[1]): f for f in rules.disagreeing_pairs(evidence)}
+        of_matches += [disagreeing[pair] for pair in decisive_pairs(disagreeing, evidence.used, count)]
     if of_matches:
         return tuple(of_matches)
-    suspicions = {(f.images[0], f.images[1]): f for find in rules.OF_PAIRS for f in find(found)}
-    hanging = [] if lens_only or found.static else decisive_pairs(suspicions, found.used, count)
-    whole = [finding for find in rules.OF_THE_WHOLE for finding in find(found)]
+    suspicions = {(f.images[0], f.images[1]): f for find in rules.OF_PAIRS for f in find(evidence)}
+    hanging = [] if lens_only or evidence.static else decisive_pairs(suspicions, evidence.used, count)
+    whole = [finding for find in rules.OF_THE_WHOLE for finding in find(evidence)]
     whole = [f for f in whole if not (f.kind == "little alike" and f.images in suspicions)]
     every = [*(suspicions[pair] for pair in hanging), *whole]
     every += _outvoted([f for pair, f in suspicions.items() if pair not in hanging])
-    return _aloud([f for f in every if not (lens_only and f.kind in rules.OF_PLACES)], found)
+    return _aloud([f for f in every if not (lens_only and f.kind in rules.OF_PLACES)], evidence)
 
 
 def decisive_pairs(suspicious: Collection[Pair], used: Sequence[LinkFit], count: int) -> list[Pair]:
@@ -82,13 +82,13 @@ def _outvoted(suspicions: Iterable[Finding]) -> list[Finding]:
     ]
 
 
-def _aloud(findings: Sequence[Finding], found: Evidence) -> tuple[Finding, ...]:
+def _aloud(findings: Sequence[Finding], evidence: Evidence) -> tuple[Finding, ...]:
     """Make details of warnings that their rule silences, of all but the first of a kind, and of more than a few."""
     rank = {kind: number for number, kind in enumerate(rules.ALOUD)}
     topics, aloud = set[str](), set[int]()
     for k in sorted(range(len(findings)), key=lambda k: rank.get(findings[k].kind, -1)):
         rule = rules.ALOUD.get(findings[k].kind, rules.Aloud(findings[k].kind))
-        speaks = findings[k].severity == "warning" and rule.topic not in topics and rule.speaks(found)
+        speaks = findings[k].severity == "warning" and rule.topic not in topics and rule.speaks(evidence)
         if speaks and len(aloud) < rules.MAX_WARNINGS:
             aloud.add(k)
             topics.add(rule.topic)

@@ -88,5 +88,5 @@ def test_two_images_left_of_one_lens(used: int, mixed: bool, said: int) -> None:
 def test_images_of_two_lenses_that_were_not_separated(certain: bool) -> None:
     mixed = SimpleNamespace(certain=certain, second=[False, True, False], distortion=(-0.1, -0.4))
     findings = list(rules._mixed_lenses(SimpleNamespace(registration=SimpleNamespace(mixed=mixed))))  # type: ignore[arg-type]
-    values = {"own": [1], "others": [0, 2], "here": -0.4, "there": -0.1}
+    values = {"images2": [1], "images1": [0, 2], "lens2": -0.4, "lens1": -0.1}
     assert [finding.values for finding in findings] == ([] if certain else [values])
