@@ -15,7 +15,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, PlacedImage, plan_canvas
 from rdstitch.compositing.placed_image import Displacement, ImageLoader
 from rdstitch.io import DecodedImage, Metadata
-from rdstitch.synthetic.layouts import grid_poses
+from rdstitch.synthetic.poses import grid_poses
 from rdstitch.synthetic.rendering import Photometry, sequence_over
 from rdstitch.synthetic.rendering import Sequence as Rendering
 from rdstitch.synthetic.textures import ground

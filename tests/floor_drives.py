@@ -9,15 +9,20 @@ import numpy as np
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera import Camera
-from rdstitch.synthetic import Photometry, Sequence, ground, line_poses, parking_poses, sequence_over, turn_poses
+from rdstitch.synthetic import Photometry, Sequence, drive_poses, ground, sequence_over
 
 DISTORTION = -0.25
 
-PATHS = {"line": line_poses, "turn": turn_poses, "parking": parking_poses}
+PATHS = ("line", "turn", "parking")
 
 
 def floor_drive(
-    path: str, count: int, *, seed: int, size: tuple[int, int] = (640, 480), overlap: float = 0.8
+    path: str,
+    count: int,
+    *,
+    seed: int,
+    size: tuple[int, int] = (640, 480),
+    overlap: float = 0.8,
 ) -> Sequence:
     """Frames of one of :data:`PATHS`, through a lens of λ = :data:`DISTORTION` that is tilted by 3 and -2 degrees.
 
@@ -25,7 +30,7 @@ def floor_drive(
     of consecutive frames.
     """
     lens = Camera(size, DISTORTION, focal=0.8 * size[0])
-    poses = PATHS[path](lens, count, overlap=overlap, heading=0.3, tilt=(np.radians(3.0), np.radians(-2.0)))
+    poses = drive_poses(lens, path, count, overlap=overlap, heading=0.3, tilt=(np.radians(3.0), np.radians(-2.0)))
     floor = partial(ground, seed=seed)
     return sequence_over(floor, lens, poses, photometry=Photometry(noise=0.01), seed=seed)
 

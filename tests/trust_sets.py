@@ -30,7 +30,6 @@ from rdstitch.synthetic import (
     ground,
     pair_poses,
     repeated,
-    rotation_poses,
     sequence_over,
 )
 from tests.adverse_sets import ADVERSE, AlteredSequence, adverse_set
@@ -161,7 +160,8 @@ def _poses(kind: str, lens: Lens, tilt: tuple[float, float], rng: np.random.Gene
     if kind == "turning":
         # About the optical axis nothing can be seen of λ; about the plane's normal something can.
         about_axis = rng.random() < 0.5
-        return rotation_poses(lens, 3, yaw_step=float(rng.uniform(0.05, 0.5)), tilt=(0.0, 0.0) if about_axis else tilt)
+        yaw = float(rng.uniform(0.05, 0.5)) * np.arange(3)
+        return Poses.of(np.zeros((3, 2)), lens.focal, yaw, (0.0, 0.0) if about_axis else tilt)
     columns, rows = (4, 1) if kind == "chain" else (2, 2) if kind == "grid" else (3, 1)
     if kind == "mixed lenses":
         columns, rows = 5, 1

@@ -4,9 +4,11 @@ from examples.paper.common.matched import rendered_pair
 from examples.paper.common.report import Pixels, Report, Table
 from examples.paper.common.settings import Effort, Settings
 from examples.paper.common.stitched import registration_error, stitch_files, stitch_rendered
+from rdstitch.camera import Camera
+from rdstitch.camera_files.lens_fit import fit_lens
 from rdstitch.errors import RegistrationError
 from rdstitch.options import StitchOptions
-from rdstitch.synthetic import FisheyeLens, best_division_model
+from rdstitch.synthetic import FisheyeLens
 from rdstitch.synthetic.lenses import Lens
 
 REAL_PAIRS = {"garfield_red": -0.234, "garfield_gre": -0.231}
@@ -62,11 +64,12 @@ def _rendered(lens: Lens, seed: int) -> tuple[tuple[object, ...], Pixels]:
     sequence = rendered_pair(lens, seed=seed, tilt=_TILT, overlap=0.5)
     registration, image = stitch_rendered(sequence, StitchOptions())
     error = registration_error(registration.alignment, sequence)
-    nearest, misfit = best_division_model(lens)
+    exact, _ = fit_lens(lens.distort, Camera(lens.image_size, center=lens.center, focal=lens.focal))
+    nearest, misfit, _ = exact.one_parameter_fit()
     return (
         lens.focal,
         registration.alignment.distortion,
-        nearest.distortion,
+        nearest,
         misfit,
         registration.alignment.model,
         error.median,

@@ -9,17 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera, border_of
-from rdstitch.camera_files.lens_fit import fit_lens
+from rdstitch.camera import border_of
 from rdstitch.camera_files.lens_models import LensModel
 from rdstitch.errors import ArgumentError
 
 _FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]] = {
     "equidistant": (lambda angle: angle, lambda r: r),
-    "equisolid": (
-        lambda angle: 2.0 * np.sin(angle / 2.0),
-        lambda radius: 2.0 * np.arcsin(np.minimum(radius / 2.0, 1.0)),
-    ),
+    "equisolid": (lambda angle: 2.0 * np.sin(angle / 2.0), lambda r: 2.0 * np.arcsin(np.minimum(r / 2.0, 1.0))),
     "stereographic": (lambda angle: 2.0 * np.tan(angle / 2.0), lambda r: 2.0 * np.arctan(r / 2.0)),
 }
 """Measured radius of the angle to the axis, in focal lengths, and the inverse, of each kind of fisheye."""
@@ -162,14 +158,3 @@ def focal_length(lens: Lens) -> float:
     if lens.focal is None:
         raise ArgumentError("a camera needs a focal length before anything can be rendered with it")
     return lens.focal
-
-
-def best_division_model(lens: Lens) -> tuple[Camera, float]:
-    """The one-parameter division model nearest to a lens, and how far it is from it, rms in pixels of the image.
-
-    As :meth:`rdstitch.camera.Camera.one_parameter_fit` has it, of the division model with as many coefficients as
-    describe the lens.
-    """
-    exact, _ = fit_lens(lens.distort, Camera(lens.image_size, center=lens.center, focal=focal_length(lens)))
-    distortion, rms, _ = exact.one_parameter_fit()
-    return exact.with_coefficients(distortion), rms

@@ -131,8 +131,6 @@ def turning_sequence(
     *,
     seed: int,
     photometry: Photometry | None = None,
-    texels_per_pixel: float = 1.0,
-    channels: int = 3,
     position: ArrayLike | None = None,
     near: ArrayLike = (),
 ) -> TurningSequence:
@@ -144,13 +142,11 @@ def turning_sequence(
         From the scene to each camera, as :func:`camera_rotations` gives them.
     seed : int
         Of the texture and the noise.
-    texels_per_pixel : float
-        Texels at the horizon for each pixel at the image's centre.
     position : array_like of shape (N, 3), optional
         Of each camera's centre, in radii of the sphere; all at its centre if not given.
     """
-    circumference = round(2 * np.pi * focal_length(lens) * texels_per_pixel)
-    texture = ground((circumference, circumference // 2), seed=seed, channels=channels)
+    circumference = round(2 * np.pi * focal_length(lens))
+    texture = ground((circumference, circumference // 2), seed=seed)
     count = len(rotations)
     where = np.zeros((count, 3)) if position is None else np.asarray(position, dtype=np.float64)
     unused = Poses.of(np.zeros((count, 2)), 1.0)

@@ -1,21 +1,28 @@
-"""Poses of the camera of a sequence, one an image.
+"""Poses of the camera of a sequence, one an image; ready-made ones: pairs, grids, a robot's paths, a survey.
 
 The plane's coordinates are the pixels of its texture ("texels"): X to the right, Y down, the centre of the top-left
 texel at (0, 0), as in an image. The camera looks down on it: with the tilt ``R``, the yaw φ, the foot of the camera
 ``(cx, cy)`` and its height ``h`` in texels, the ray of a plane point is ``p ~ R Rz(φ) (X - cx, Y - cy, h)``.
+
+Ready-made poses lie anywhere on the plane, which :func:`rdstitch.synthetic.sequence_over` makes large enough; a pixel
+at the image's centre shows one texel. Overlaps are fractions of what the lens sees of the plane along its middle row or
+column, so that a barrel lens takes longer steps.
 """
 
 from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 from rdstitch.radial_homography import project
 from rdstitch.synthetic.lenses import Lens, focal_length
+
+Tilt = tuple[float, float]
+_PARKING_ANGLE = 0.7  # radians: how far a robot is turned in the middle of the S
 
 
 @dataclass(frozen=True)
@@ -40,14 +47,6 @@ class Poses:
     tilt: FloatArray
 
     def __post_init__(self) -> None:
-        """Check the shapes and that the camera is above the plane."""
-        n = len(self.position)
-        if self.position.shape != (n, 2) or self.tilt.shape != (n, 2):
-            raise ArgumentError(
-                f"position and tilt must have shape (N, 2), not {self.position.shape}, {self.tilt.shape}"
-            )
-        if self.height.shape != (n,) or self.yaw.shape != (n,):
-            raise ArgumentError(f"height and yaw must have shape ({n},), not {self.height.shape}, {self.yaw.shape}")
         if not (self.height > 0.0).all():
             raise ArgumentError("the camera must stay above the plane")
 
@@ -58,13 +57,8 @@ class Poses:
     def of(cls, position: ArrayLike, height: ArrayLike, yaw: ArrayLike = 0.0, tilt: ArrayLike = (0.0, 0.0)) -> Self:
         """Poses at positions (N, 2); height, yaw and tilt may be shared by all images."""
         where = np.array(position, dtype=np.float64).reshape(-1, 2)
-        n = len(where)
-        return cls(
-            where,
-            np.broadcast_to(np.asarray(height, dtype=np.float64), (n,)).copy(),
-            np.broadcast_to(np.asarray(yaw, dtype=np.float64), (n,)).copy(),
-            np.broadcast_to(np.asarray(tilt, dtype=np.float64), (n, 2)).copy(),
-        )
+        shapes = ((height, where.shape[:1]), (yaw, where.shape[:1]), (tilt, where.shape))
+        return cls(where, *(np.broadcast_to(np.asarray(value, np.float64), shape).copy() for value, shape in shapes))
 
     def from_plane(self) -> FloatArray:
         """``R Rz(φ) [X - cx, Y - cy, h]``: texels to focal-normalized undistorted points, shape (N, 3, 3)."""
@@ -140,3 +134,151 @@ def fit_to_plane(lens: Lens, poses: Poses, margin: int = 16) -> tuple[Poses, tup
     low = np.floor(outlines.min(axis=(0, 1))) - margin
     width, height = np.ceil(outlines.max(axis=(0, 1))) + margin - low + 1
     return poses.moved(-low), (int(width), int(height))
+
+
+def pair_poses(
+    lens: Lens,
+    overlap: float = 0.3,
+    *,
+    yaw: float = 0.0,
+    direction: float = 0.0,
+    scale: float = 1.0,
+    tilt: Tilt = (0.0, 0.0),
+) -> Poses:
+    """Two images.
+
+    Parameters
+    ----------
+    overlap : float
+        Share of the extent along ``direction`` that both images show.
+    yaw : float
+        Of the second image, radians.
+    direction : float
+        Where the camera goes, radians from the plane's X axis.
+    scale : float
+        Height of the second image in units of the first's.
+    """
+    along = np.array([np.cos(direction), np.sin(direction)])
+    extent = np.min(_extent(lens, tilt) / np.maximum(np.abs(along), 1e-12))
+    height = focal_length(lens) * np.array([1.0, scale])
+    return Poses.of([(0.0, 0.0), (1.0 - overlap) * extent * along], height, [0.0, yaw], tilt)
+
+
+def grid_poses(
+    lens: Lens,
+    columns: int,
+    rows: int,
+    *,
+    overlap: float = 0.4,
+    yaw: float = 0.0,
+    shift: float = 0.0,
+    tilt: Tilt = (0.0, 0.0),
+    seed: int = 0,
+) -> Poses:
+    """Views side by side, row after row, each second row backwards.
+
+    Parameters
+    ----------
+    overlap : float
+        Of neighbours, along both axes.
+    yaw : float
+        Each image is turned by a random angle within ± this, radians.
+    shift : float
+        Each image is moved by a random share, within ± this, of the step to its neighbours.
+    """
+    step = (1.0 - overlap) * _extent(lens, tilt)
+    j, i = np.meshgrid(np.arange(columns), np.arange(rows))
+    j[1::2] = j[1::2, ::-1]
+    places = np.column_stack([j.ravel(), i.ravel()]).astype(np.float64)
+    places += shift * np.random.default_rng((seed, 1)).uniform(-1.0, 1.0, places.shape)
+    poses = Poses.of(places * step, focal_length(lens), 0.0, tilt)
+    return poses.shaken(seed=seed, yaw=yaw)
+
+
+def drive_poses(
+    lens: Lens,
+    path: str,
+    count: int,
+    *,
+    overlap: float = 0.8,
+    heading: float = 0.0,
+    tilt: Tilt = (0.0, 0.0),
+) -> Poses:
+    """A robot, to which the camera is fixed, drives a path of the paper (§5.5).
+
+    Parameters
+    ----------
+    path : str
+        "line"; "turn": on, through a right angle, and on; "parking": past the gap, back into it in an S, and up.
+    overlap : float
+        Of consecutive images, along the image's shorter side.
+    heading : float
+        At the start, radians from the plane's X axis; the robot drives along its image's u axis.
+    """
+    turning, forward = np.zeros(count - 1), np.ones(count - 1)
+    if path == "turn":
+        bend = _phases(count - 1, (0.0, 0.35), (1.0, 0.3), (0.0, 0.35))
+        turning = np.pi / 2 * bend / bend.sum()
+    elif path == "parking":
+        bend = _phases(count - 1, (0.0, 0.4), (1.0, 0.25), (-1.0, 0.25), (0.0, 0.1))
+        forward = _phases(count - 1, (1.0, 0.4), (-1.0, 0.5), (1.0, 0.1))
+        left, right = bend > 0.0, bend < 0.0
+        turning[left], turning[right] = _PARKING_ANGLE / max(1, left.sum()), -_PARKING_ANGLE / max(1, right.sum())
+    headings = heading + np.r_[0.0, np.cumsum(turning)]
+    # On an arc, the chord points along the mean of the headings at its ends.
+    chord = (headings[:-1] + headings[1:]) / 2.0
+    length = (1.0 - overlap) * _extent(lens, tilt).min()
+    moves = length * forward[:, None] * np.column_stack([np.cos(chord), np.sin(chord)])
+    places = np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)])
+    return Poses.of(places, focal_length(lens), -headings, tilt)
+
+
+def survey_poses(
+    lens: Lens,
+    count: int,
+    *,
+    forward_overlap: float = 0.7,
+    side_overlap: float = 0.5,
+    height_jitter: float = 0.03,
+    attitude_jitter: float = 0.0,
+    tilt: Tilt = (0.0, 0.0),
+    seed: int = 0,
+) -> Poses:
+    """A drone mows a nearly square field (paper Fig. 10: 117 and 158 frames).
+
+    Parameters
+    ----------
+    count : int
+        Images; the last lane may be shorter.
+    forward_overlap, side_overlap : float
+        Within a lane and between lanes. The drone flies towards the top of its image, and turns round after each lane.
+    height_jitter : float
+        Each height is changed by a random share within ± this.
+    attitude_jitter : float
+        ψ and θ are changed by random angles within ± this, radians.
+    """
+    extent = _extent(lens, tilt)
+    side, ahead = (1.0 - side_overlap) * extent[0], (1.0 - forward_overlap) * extent[1]
+    lanes = max(1, round(np.sqrt(count * ahead / side)))
+    per_lane = -(-count // lanes)
+    lane, place = np.divmod(np.arange(count), per_lane)
+    back = lane % 2 == 1
+    places = np.column_stack([side * lane, -ahead * np.where(back, per_lane - 1 - place, place)])
+    poses = Poses.of(places, focal_length(lens), np.where(back, np.pi, 0.0), tilt)
+    return poses.shaken(seed=seed, position=0.05 * float(ahead), height=height_jitter, yaw=0.05, tilt=attitude_jitter)
+
+
+def _extent(lens: Lens, tilt: Tilt) -> FloatArray:
+    """Width and height in texels that an image shows of the plane along its middle row and column."""
+    pose = Poses.of((0.0, 0.0), focal_length(lens), 0.0, tilt)
+    top, right, bottom, left = plane_outline(lens, pose.from_plane()[0], 2)[1::2]
+    extent = np.array([np.linalg.norm(right - left), np.linalg.norm(bottom - top)])
+    if not np.isfinite(extent).all():
+        raise ArgumentError("the image sees beyond the horizon or beyond its lens")
+    return extent
+
+
+def _phases(count: int, *phases: tuple[float, float]) -> NDArray[np.float64]:
+    """``count`` values in phases (value, share of the count)."""
+    ends = np.rint(count * np.cumsum([share for _, share in phases])).astype(int)
+    return np.repeat([value for value, _ in phases], np.diff(np.r_[0, ends]))

@@ -162,9 +162,7 @@ class Sequence:
             path = Path(folder) / name.format(index)
             image = self.frame(index)
             bgr = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
-            done, encoded = cv2.imencode(path.suffix, bgr)
-            if not done:
-                raise OutputError(f"{path}: cannot be encoded")
+            _, encoded = cv2.imencode(path.suffix, bgr)
             try:
                 path.write_bytes(encoded.tobytes())
             except OSError as error:

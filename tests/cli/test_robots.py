@@ -15,7 +15,7 @@ import rdstitch
 from examples.judging.trajectories import compare_trajectories
 from rdstitch.camera import Camera
 from rdstitch.io import read_image
-from rdstitch.synthetic import Photometry, ground, parking_poses, sequence_over
+from rdstitch.synthetic import Photometry, drive_poses, ground, sequence_over
 from tests.cli.running import CACHED, DISTORTION, Run
 from tests.floor_drives import read_path, true_path
 from tests.videos import write_video
@@ -160,7 +160,7 @@ def test_what_is_no_bag_is_named(rdstitch: Run, tmp_path: Path, monkeypatch: pyt
 
 def test_a_calibrated_focal_length_is_as_sure_as_it_was(rdstitch: Run, tmp_path: Path) -> None:
     lens = Camera((400, 300), DISTORTION, focal=320.0)
-    poses = parking_poses(lens, 8, overlap=0.6, heading=0.3, tilt=(np.radians(1.5), np.radians(-1.0)))
+    poses = drive_poses(lens, "parking", 8, overlap=0.6, heading=0.3, tilt=(np.radians(1.5), np.radians(-1.0)))
     drive = sequence_over(partial(ground, seed=1), lens, poses, photometry=Photometry(noise=0.01), seed=1)
     (folder := tmp_path / "drive").mkdir()
     drive.write(folder)

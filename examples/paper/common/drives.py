@@ -11,10 +11,10 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.robust import SolverName, estimate_radial_homography
-from rdstitch.synthetic import Poses, line_poses, parking_poses, turn_poses
+from rdstitch.synthetic import Poses, drive_poses
 from rdstitch.synthetic.poses import pixels_of_texels, texels_of_pixels
 
-PATHS = {"line": line_poses, "turn": turn_poses, "parallel parking": parking_poses}
+PATHS = {"line": "line", "turn": "turn", "parallel parking": "parking"}
 
 _STEPS = (1, 2, 4)
 _MIN_MATCHES = 30
@@ -62,7 +62,7 @@ def drive(path: str, frames: int, *, seed: int, noise: float = 0.5) -> Drive:
     """
     camera = Camera((640, 480), -0.3, focal=520.0, focal_source="option")
     tilt = (np.radians(4.0), np.radians(-3.0))
-    poses = PATHS[path](camera, frames, tilt=tilt)
+    poses = drive_poses(camera, PATHS[path], frames, tilt=tilt)
     rng = np.random.default_rng(seed)
     pairs = []
     for first in range(frames):

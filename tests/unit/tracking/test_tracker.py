@@ -14,7 +14,7 @@ from rdstitch.features import FeatureOptions, Features, detect, match
 from rdstitch.features.prepared_image import View, prepare
 from rdstitch.inputs.corner_flow import CornerFlow, fitted_affine
 from rdstitch.robust import EstimationOptions
-from rdstitch.synthetic import Sequence, blank, line_poses, sequence_over, turn_poses
+from rdstitch.synthetic import Sequence, blank, drive_poses, sequence_over
 from rdstitch.tracking import Tracked, Tracker, TrackingOptions
 from rdstitch.tracking import tracker as module
 from tests.floor_drives import floor_drive, true_path
@@ -26,8 +26,7 @@ MASK = np.arange(240)[:, None].repeat(320, axis=1) < 190
 
 def _drive(count: int, overlap: float = 0.7, path: str = "turn") -> Sequence:
     lens = Camera(SIZE, DISTORTION, focal=256.0)
-    make = {"turn": turn_poses, "line": line_poses}[path]
-    return sequence_over(blank, lens, make(lens, count, overlap=overlap, tilt=(0.05, -0.03)))
+    return sequence_over(blank, lens, drive_poses(lens, path, count, overlap=overlap, tilt=(0.05, -0.03)))
 
 
 def _features(sequence: Sequence, world: int = 0) -> list[Features]:
