@@ -7,7 +7,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.registration import Registration
-from rdstitch.report.geometry import residuals
+from rdstitch.report.pairs import residuals
 from rdstitch.report.svg import BLUE, RED, Markup, counted, drawing, element, label, line, path, section
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 720.0, 280.0, 60.0, 40.0, 24.0

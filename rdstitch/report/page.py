@@ -1,21 +1,44 @@
-"""The page: all sections in one self-contained HTML file."""
+"""The page: all sections in one self-contained HTML file; those of pairs and of the lens are files of their own."""
 
+import math
 from collections.abc import Sequence
+from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+
+from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.errors import InputError
+from rdstitch.io.preview import read_preview
+from rdstitch.messages import of_severity
 from rdstitch.outputs import Outputs
 from rdstitch.registration import Registration
 from rdstitch.report.lens import lens_curve, votes
-from rdstitch.report.output import local_alignment, mosaic, place, trajectory
 from rdstitch.report.pairs import match_graph, matched, residual_map
-from rdstitch.report.stage import stage
-from rdstitch.report.summary import notices, run, summary, timings
-from rdstitch.report.svg import Content, Markup, element, joined
+from rdstitch.report.svg import (
+    YELLOW,
+    Content,
+    Markup,
+    counted,
+    data_address,
+    drawing,
+    element,
+    joined,
+    label,
+    of_source,
+    section,
+    table,
+)
+from rdstitch.report.svg import path as outline
+from rdstitch.stage.register import TileRegistration
 from rdstitch.stitch_result import StitchResult
+from rdstitch.viewer import viewer_path
 
 REPORT_SUFFIXES = (".html", ".htm")
 
+_THUMBNAIL, _MOSAIC_SIDE = 200, 1200  # pixels of the longer side
+_MAX_NAMES, _MAX_ROWS = 12, 20
 _VIEWPORT = "width=device-width, initial-scale=1"
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 960px; margin: 2em auto; padding: 0 1em; }
@@ -77,33 +100,223 @@ def report_page(
     staged: Path | None = None,
 ) -> str:
     """The report as HTML; see :func:`write_report`. ``staged`` is the image's file until it is published."""
-    stitched = result if isinstance(result, StitchResult) else None
     registration = result.registration if isinstance(result, StitchResult) else result
-    title = "rdstitch report" if stitched is None or stitched.output is None else stitched.output.name
+    title, output = "rdstitch report", list[str]()
+    if isinstance(result, StitchResult):
+        title = title if result.output is None else result.output.name
+        output = [mosaic(result, staged), place(result), local_alignment(result)]
     body: list[Content] = [
-        summary(registration, stitched),
+        summary(result),
         notices(registration),
         stage(registration),
-        "" if stitched is None else mosaic(stitched, staged),
-        "" if stitched is None else place(stitched),
+        *output,
         match_graph(registration),
         votes(registration),
         lens_curve(registration),
         matched(registration),
         residual_map(registration),
-        "" if stitched is None or stitched.plan is not None else local_alignment(stitched),
-        trajectory(registration),
-        timings(stages),
-        run(None if stitched is None else stitched.options, command),
+        run(stages, command),
     ]
     head = Markup(f'<meta charset="utf-8"><meta name="viewport" content="{_VIEWPORT}"><style>{_STYLE}</style>')
-    footer = element("footer", element("p", f"rdstitch {version('rdstitch')}"))
     return joined(
         Markup("<!DOCTYPE html>\n"),
         element(
             "html",
             element("head", head, element("title", title)),
-            element("body", element("h1", title), body, footer),
+            element("body", element("h1", title), body),
             lang="en",
         ),
     )
+
+
+def summary(result: StitchResult | Registration) -> str:
+    """λ and everything else of which there is one number, with the verdict."""
+    registration = result.registration if isinstance(result, StitchResult) else result
+    alignment, camera, reason = registration.alignment, registration.camera, registration.alignment.model_reason
+    known = {str(source.path) for source in registration.sources}
+    unread = sum(message.images[0] not in known for message in registration.left_out)
+    verdict = element("p", "The result passed its own checks.", class_="good")
+    if not registration.ok:
+        failures = "; ".join(message.clause for message in registration.failures)
+        verdict = element("p", f"Not to be relied on: {failures}", class_="bad")
+    rows = [
+        ("λ (half diagonal)", _lambda(registration)),
+        ("λ per px²", f"{camera.distortion_px:.4e}"),
+        ("images", f"{int(alignment.used.sum())} of {len(alignment.used) + unread}"),
+        ("pairs", f"{sum(fit.used for fit in alignment.links)} used of {len(registration.pairs)} compared"),
+        ("error", f"{alignment.rms:.3f} pixels rms of all inliers"),
+        ("motion", reason if reason.startswith(f"{alignment.model}:") else f"{alignment.model}: {reason}"),
+        ("scene", alignment.relief.explanation),
+        ("reference", registration.sources[alignment.reference].name),
+    ]
+    if alignment.tilt is not None:
+        rows.append(("tilt ψ, θ", "{:.2f}°, {:.2f}°".format(*np.degrees(alignment.tilt))))
+    if camera.focal is not None:
+        std = "" if camera.focal_std is None else f" ± {camera.focal_std:.1f}"
+        rows.append(("focal length", f"{camera.focal:.1f}{std} pixels ({camera.focal_source})"))
+    if isinstance(result, StitchResult):
+        rows.append(("output", "{} x {} pixels".format(*result.canvas.size)))
+    return section("Summary", "", verdict, table(rows))
+
+
+def notices(registration: Registration) -> str:
+    """Warnings, and images that were left out, each with the reason."""
+    told = [
+        message.clause for severity in ("warning", "note") for message in of_severity(registration.messages, severity)
+    ]
+    listed = element("p", "No warnings.")
+    if told:
+        listed = joined(element("h3", "What to look at"), element("ul", (element("li", item) for item in told)))
+    return section("Warnings and left-out images", "", listed, _left_out(registration))
+
+
+def _left_out(registration: Registration) -> str:
+    """Small versions of the images that are not in the result, each with the reason."""
+    if not registration.left_out:
+        return element("p", "Every image is in the result.")
+    sources = {str(source.path): source for source in registration.sources}
+    shown = []
+    for message in registration.left_out:
+        source = sources.get(message.images[0])
+        image = None if source is None else of_source(source, _THUMBNAIL)
+        drawn = "" if image is None else element("img", src=image, alt="")
+        shown.append(element("figure", drawn, element("figcaption", f"{message.images[0]}: {message.text}")))
+    return joined(element("h3", "Left out"), element("div", shown, class_="thumbnails"))
+
+
+def _lambda(registration: Registration) -> str:
+    alignment = registration.alignment
+    if not math.isfinite(alignment.distortion_std):
+        return "not observable"
+    given = alignment.distortion_std == 0.0
+    return f"{alignment.distortion:.6f} " + ("(given)" if given else f"± {alignment.distortion_std:.6f}")
+
+
+def run(stages: Sequence[tuple[str, float]], command: str) -> str:
+    """Date, version and command line, and the seconds of each stage in their order."""
+    rows = [("date", datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")), ("rdstitch", version("rdstitch"))]
+    rows += [("command", command)] if command else []
+    rows += [(name, f"{seconds:.2f} s") for name, seconds in stages]
+    return section("Run", f"{sum(seconds for _, seconds in stages):.1f} s on the clock." if stages else "", table(rows))
+
+
+def mosaic(result: StitchResult, staged: Path | None = None) -> str:
+    """The output, small; every outline has its image's name as title, and a few images have it written."""
+    image = _thumbnail(result, staged)
+    if image is None:
+        large = result.plan is None and result.output is not None
+        return section("Mosaic", "It is too large to be shown here." if large else "No image was written.")
+    name = "" if result.output is None else f"{result.output.name}, "
+    width, height = result.canvas.size
+    scale = _MOSAIC_SIDE / max(width, height)
+    names = result.registration.used_names
+    parts = [element("image", href=image, width=width * scale, height=height * scale)]
+    for text, borders in zip(names, result.canvas.outlines, strict=True):
+        places = [(border + 0.5) * scale for border in borders]
+        shapes = (
+            outline(place, closed=True, stroke=YELLOW, stroke_opacity=0.7, pointer_events="all") for place in places
+        )
+        parts.append(element("g", element("title", text), shapes))
+        if len(names) <= _MAX_NAMES:
+            x, y = min((place.mean(axis=0) for place in places), key=lambda middle: abs(middle[0] - width * scale / 2))
+            style = {"fill": "white", "stroke": "black", "stroke_width": 3.0, "paint_order": "stroke"}
+            parts.append(label(float(x), float(y), text, text_anchor="middle", font_size=14, **style))
+    shown = drawing(width * scale, height * scale, parts, "the mosaic")
+    page = None if result.output is None else viewer_path(result.output)
+    more = "" if page is None else f" {page.name} beside it shows it with zoom."
+    return section("Mosaic", f"{name}{width} x {height} pixels; outlines are those of the images in it.{more}", shown)
+
+
+def place(result: StitchResult) -> str:
+    """Where the output lies on the Earth, and the largest residuals of the positions that say so."""
+    if (placed := result.georeference) is None:
+        return ""
+    residuals = sorted(placed.residuals, key=lambda residual: -residual.off)[:_MAX_ROWS]
+    rows = [(r.name, f"{r.east:+.3f}", f"{r.north:+.3f}", "" if r.used else "not used") for r in residuals]
+    explanation = f"{placed.summary}. Where the output has them less where they were measured to be, the largest first:"
+    return section("Place on the Earth", explanation, table([("", "east, m", "north, m", ""), *rows]))
+
+
+def local_alignment(result: StitchResult) -> str:
+    """How much local alignment mended, and the image that it moved farthest."""
+    local = result.local_alignment
+    if result.plan is not None:
+        return ""
+    if not local.fields:
+        return section("Local alignment", f"Images are where the alignment puts them: {local.reason}.")
+    spread = ""
+    if local.before is not None and local.after is not None:
+        spread = f" (95 %: {local.before.percentile95:.2f} and {local.after.percentile95:.2f} pixels)"
+    moved = zip(local.fields, result.registration.used_names, strict=True)
+    field, name = max(moved, key=lambda image: image[0].largest)
+    return section(
+        "Local alignment",
+        f"The ground is not quite a plane, so that each image's content is moved a little, that of {name} by up to "
+        f"{field.largest:.1f} pixels; {local.reason}{spread}.",
+    )
+
+
+def _thumbnail(result: StitchResult, staged: Path | None = None) -> str | None:
+    """The output, or its staged file, small; None where there is none, as after a dry run, or it is huge."""
+    if result.composite is not None:
+        return data_address(result.composite.pixels, _MOSAIC_SIDE)
+    file = staged or result.output
+    if file is None or not file.exists():
+        return None
+    try:
+        return data_address(read_preview(file, result.canvas.size, _MOSAIC_SIDE)[0], _MOSAIC_SIDE)
+    except InputError:
+        return None
+
+
+def stage(registration: Registration) -> str:
+    """Backlash, and a table for rows and one for columns; nothing where the images are no tiles."""
+    tiled = registration.tiles
+    if tiled is None:
+        return ""
+    model, grid = tiled.adjustment.stage, tiled.grid
+    turn = math.degrees(math.atan2(model.matrix[1, 0] - model.matrix[0, 1], np.trace(model.matrix)))
+    x, y = backlash(model.rows)
+    rows = [
+        ("places", grid.source),
+        ("tiles placed by overlaps", f"{int(tiled.linked.sum())} of {len(grid)}"),
+        ("groups of tiles", str(len(tiled.groups))),
+        ("camera against the stage", f"{turn:.3f}°, scale {math.sqrt(abs(np.linalg.det(model.matrix))):.5f}"),
+        ("backlash of rows", f"{x:.2f}, {y:.2f} pixels, every other row against the rest"),
+        ("scatter", f"rows {model.row_std:.2f}, columns {model.column_std:.2f}, tiles {model.std:.2f} pixels"),
+    ]
+    if grid.pixel_size is not None:
+        rows.append(("pixel", f"{grid.pixel_size:g} µm"))
+    header = ("number", "tiles by overlap", "off in x, y (pixels)", "error of its links, median (pixels)")
+    return section(
+        "Stage",
+        f"{counted(len(grid), 'tile')}; the error of links is what overlaps disagree by after all places are adjusted.",
+        table(rows),
+        element("h3", "Rows"),
+        table([header, *_lines(tiled, grid.rows, model.rows)]),
+        element("h3", "Columns"),
+        table([header, *_lines(tiled, grid.columns, model.columns)]),
+    )
+
+
+def backlash(rows: FloatArray) -> tuple[float, float]:
+    """What every other row is off against the rows between, (x, y), pixels: rows (R, 2) are taken to and fro."""
+    if len(rows) < 2:
+        return 0.0, 0.0
+    x, y = (np.median(rows[1::2], axis=0) - np.median(rows[::2], axis=0)).tolist()
+    return x, y
+
+
+def _lines(tiled: TileRegistration, number: IntArray, off: FloatArray) -> list[tuple[str, ...]]:
+    """Cells of a table, a line for each row or column of the grid."""
+    links, squared = tiled.links, (tiled.adjustment.residuals**2).sum(axis=1)
+    agreeing = tiled.adjustment.weights[links.pair] > 0.25 if len(links.pair) else np.zeros(0, dtype=np.bool_)
+    first, second = (number[links.tiles[links.pair, k]] for k in (0, 1))
+    lines: list[tuple[str, ...]] = []
+    for line in range(len(off)):
+        links_of_line = agreeing & ((first == line) | (second == line))
+        rms = f"{math.sqrt(float(np.median(squared[links_of_line]))):.3f}" if links_of_line.any() else "none"
+        here = number == line
+        x, y = off[line].tolist()
+        lines.append((str(line), f"{int(tiled.linked[here].sum())} of {int(here.sum())}", f"{x:.2f}, {y:.2f}", rms))
+    return lines

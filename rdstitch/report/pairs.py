@@ -6,8 +6,10 @@ import numpy as np
 
 from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray
+from rdstitch.compositing.projection import PROJECTIONS
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.radial_homography import to_directions, to_plane
 from rdstitch.registration import Registration
-from rdstitch.report.geometry import footprint, middle, of_source, pairs_of, residuals
 from rdstitch.report.svg import (
     BLUE,
     GREEN,
@@ -21,10 +23,12 @@ from rdstitch.report.svg import (
     joined,
     label,
     line,
+    of_source,
     path,
     section,
 )
 
+_POINTS_PER_SIDE = 16
 _GRAPH_SIDE, _GRAPH_MARGIN = 900.0, 20.0
 _MAX_NAMES = 12  # images whose names are written
 _IMAGE_WIDTH, _IMAGE_GAP = 440.0, 10.0
@@ -177,3 +181,45 @@ def residual_map(registration: Registration) -> str:
         "that the model does not describe: relief, a rolling shutter, a lens that one λ is not enough for.",
         drawing(_MAP_WIDTH, tall + 22, parts, "residuals over the image"),
     )
+
+
+def footprint(registration: Registration, index: int) -> FloatArray:
+    """Outline (K, 2) of an image on the plane; where the camera only turned, longitude and latitude, radians."""
+    camera = registration.alignment.cameras[index]
+    return _on_plane(registration, index, camera.outline(_POINTS_PER_SIDE))
+
+
+def middle(registration: Registration, index: int) -> FloatArray:
+    """Centre (2,) of an image, as :func:`footprint`."""
+    width, height = registration.alignment.cameras[index].image_size
+    return _on_plane(registration, index, np.array([[(width - 1) / 2, (height - 1) / 2]])).reshape(2)
+
+
+def pairs_of(registration: Registration) -> dict[tuple[int, int], PairRegistration]:
+    """The pairs by their images."""
+    return {(pair.image1, pair.image2): pair for pair in registration.pairs}
+
+
+def residuals(registration: Registration, fit: LinkFit) -> tuple[FloatArray, FloatArray]:
+    """Where the matches of a link are in the second image, and how far from there the alignment puts them, pixels.
+
+    Matches that the pair itself takes for wrong are left out, and those that miss by more than four times the link's
+    error.
+    """
+    pair = pairs_of(registration)[fit.image1, fit.image2]
+    inliers = pair.relation.inliers
+    given, measured = pair.correspondences.points1[inliers], pair.correspondences.points2[inliers]
+    off = registration.alignment.transfer(fit.image1, fit.image2, given) - measured
+    kept = np.linalg.norm(off, axis=1) <= 4.0 * fit.rms
+    return measured[kept], off[kept]
+
+
+def _on_plane(registration: Registration, index: int, points: FloatArray) -> FloatArray:
+    camera, matrix = registration.alignment.cameras[index], registration.alignment.homographies[index]
+    if not registration.alignment.on_sphere:
+        return to_plane(camera, matrix, points)
+    places = PROJECTIONS["sphere"].project(to_directions(camera, matrix, points))
+    # Longitudes of one image have no jump.
+    middle_longitude = np.arctan2(matrix[0, 2], matrix[2, 2])
+    places[:, 0] = middle_longitude + np.mod(places[:, 0] - middle_longitude + np.pi, 2.0 * np.pi) - np.pi
+    return places

@@ -1,5 +1,6 @@
-"""Small pieces of SVG and HTML, as text."""
+"""Small pieces of SVG and HTML as text, and small images as data addresses."""
 
+import base64
 from collections.abc import Iterable
 from html import escape
 from typing import Any
@@ -8,6 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.errors import InputError
+from rdstitch.inputs.source import Source
+from rdstitch.io.preview import encode_preview
+from rdstitch.io.reduction import fitting_reduction
 
 _VOID = ("img",)
 
@@ -102,3 +107,17 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.2f}"
     return escape(str(value))
+
+
+def of_source(source: Source, side: int) -> str | None:
+    """A thumbnail of an input image; None where it is gone, as frames of videos are."""
+    try:
+        reduction = fitting_reduction(max(source.camera.image_size) / (2 * side))
+        return data_address(source.read(reduction).pixels, side)
+    except InputError:
+        return None
+
+
+def data_address(pixels: NDArray[Any], side: int) -> str:
+    """An image of any sample type as JPEG inside a ``data:`` address, its longer side at most ``side`` pixels."""
+    return "data:image/jpeg;base64," + base64.b64encode(encode_preview(pixels, side)).decode("ascii")

@@ -9,7 +9,7 @@ import pytest
 import tifffile
 
 from rdstitch.io.flat_field import FlatField
-from rdstitch.report.stage import backlash
+from rdstitch.report.page import backlash
 from tests.cli.running import SIDECAR_SCHEMA, Run
 from tests.stage_grid import StageGrid
 
