@@ -1,34 +1,71 @@
-"""Results of earlier runs, so that an interrupted run continues and a changed option repeats only what depends on it.
+"""Results on disk: of earlier runs, to continue from, and of this one, so that thousands need not fit into memory.
 
 Every result is a file named by everything that it depends on: the content of the images, the options that matter to
 it, the sources of this package, and the versions of the packages that it computes with. So nothing is ever out of date,
 whether or not a version number was raised; what is damaged is computed again.
 """
 
+import dataclasses
 import hashlib
+import io
 import os
+import pickle
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
-from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from threading import Lock
+from typing import Any, Generic, Self, TypeVar, cast
 
-from rdstitch.errors import InputError, OutputError
-from rdstitch.file_access import is_url, open_regular, remote_status
-from rdstitch.io.packing import digest, pack
-from rdstitch.stored import Stored, TemporaryFolder, entry_name, read_entry
+import numpy as np
+
+from rdstitch.errors import ArgumentError, InputError, OutputError
+from rdstitch.file_access import is_url, open_regular, read_limited, remote_status
+from rdstitch.outputs import TemporaryFolder
 
 Value = TypeVar("Value")
 
 _FORMAT = 2
+_MAGIC = b"rdstitch pack 2\n"
+_HEAD = len(_MAGIC) + hashlib.sha256().digest_size
 _ABANDONED_SECONDS = 3600.0  # since a process last wrote into an unfinished entry; it was killed
+_MAX_ENTRY = 2**31  # bytes
+_CAPACITY = 16 * 2**20  # bytes of files whose content is kept in memory
+_PACKAGE = Path(__file__).parent
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
 _PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
+_NUMPY = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
+# What reading damaged bytes raises.
+_DAMAGED = (pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, ImportError, EOFError)
+_ARRAY_KINDS = "biuf"
+
+
+@dataclass(frozen=True)
+class Stored(Generic[Value]):
+    """A result that is read when it is needed; one that could not be kept on disk stays in memory."""
+
+    file: Path | None = None  # entry of a cache
+    value: Value | None = None  # the result itself, without a file
+    folder: TemporaryFolder | None = field(default=None, compare=False, repr=False)  # what must not be removed before
+
+    def load(self) -> Value:
+        """The result; those used recently are still in memory."""
+        return cast(Value, self.value if self.file is None else _recent.recall(self.file))
+
+    @property
+    def name(self) -> str:
+        """What stands for the result in the inputs of later ones; empty without a file."""
+        return "" if self.file is None else _entry_name(self.file)
+
+    def remove(self) -> None:
+        """Remove its file; it can not be loaded any more then."""
+        if self.file is not None:
+            with suppress(OSError):
+                self.file.unlink()
 
 
 @dataclass(frozen=True)
@@ -51,7 +88,7 @@ class Cache:
         in memory.
         """
         try:
-            owner = TemporaryFolder(parent=None if parent is None else Path(parent).absolute())
+            owner = TemporaryFolder(None if parent is None else Path(parent).absolute())
         except OSError:
             return cls()
         return cls(owner.path, owner)
@@ -76,7 +113,7 @@ class Cache:
         if self.folder is None:
             return Stored(value=compute())
         file = self._file(stage, inputs)
-        if _read(file):
+        if _kept(file):
             return Stored(file, folder=self.temporary)
         value = compute()
         return Stored(file, folder=self.temporary) if self._keep(file, value) else Stored(value=value)
@@ -87,13 +124,13 @@ class Cache:
         """As :meth:`recall`, of several; ``compute`` is called with the places of the inputs without a result."""
         if self.folder is None:
             return compute(list(range(len(inputs))))
-        files = [self._file(stage, own) for own in inputs]
-        found: list[list[Value]] = [_read(file) for file in files]
-        missing = [index for index, kept in enumerate(found) if not kept]
+        files = [self._file(stage, of_one) for of_one in inputs]
+        results: list[list[Value]] = [_kept(file) for file in files]
+        missing = [index for index, kept in enumerate(results) if not kept]
         for index, value in zip(missing, compute(missing) if missing else [], strict=True):
-            found[index] = [value]
+            results[index] = [value]
             self._keep(files[index], value)
-        return [kept[0] for kept in found]
+        return [kept[0] for kept in results]
 
     def _file(self, stage: str, inputs: tuple[Any, ...]) -> Path:
         """Where the result of a stage is kept: its name is the digest of everything that it depends on."""
@@ -108,7 +145,7 @@ class Cache:
         What is of this run alone nobody reads before it is written.
         """
         with suppress(OSError):
-            data = pack((entry_name(file), value))
+            data = pack((_entry_name(file), value))
             if self.temporary is None:
                 _write_at_once(file, data)
             else:
@@ -139,43 +176,72 @@ class Cache:
         return "" if self.folder is None else digest(value)
 
 
+NO_CACHE = Cache()
+"""Keeps nothing."""
+
+
 @cache
 def software() -> dict[str, str]:
     """Everything but its inputs that a result may depend on: our sources, and versions of what they compute with."""
     from importlib.metadata import PackageNotFoundError, version
 
-    found = {"rdstitch": sources_digest(files("rdstitch"))}
+    content = hashlib.sha256()
+    for source in sorted(_PACKAGE.rglob("*.py")):
+        content.update(f"{source.relative_to(_PACKAGE)} {hashlib.sha256(source.read_bytes()).hexdigest()}\n".encode())
+    versions = {"rdstitch": content.hexdigest()}
     for package in _PACKAGES:
         with suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
+            versions[package] = version(package)
+    return versions
 
 
-def sources_digest(folder: Traversable) -> str:
-    """What stands for the names and contents of all Python files in a folder and those below it."""
-    content = hashlib.sha256()
-    for name, source in sorted(_sources(folder, "")):
-        content.update(f"{name} {hashlib.sha256(source).hexdigest()}\n".encode())
-    return content.hexdigest()
+class _RecentlyUsed:
+    """Values of files, of which the least recently used are dropped when there are too many."""
+
+    def __init__(self, room: int) -> None:
+        self._room = room
+        self._held: OrderedDict[Path, tuple[Any, int]] = OrderedDict()
+        self._lock = Lock()
+
+    def recall(self, file: Path) -> Any:
+        with self._lock, suppress(KeyError):
+            self._held.move_to_end(file)
+            return self._held[file][0]
+        value, size = _read(file)
+        with self._lock:
+            if file not in self._held:
+                self._held[file] = value, size
+                self._room -= size
+            while self._room < 0 and self._held:
+                self._room += self._held.popitem(last=False)[1][1]
+        return value
 
 
-def _sources(folder: Traversable, prefix: str) -> Iterator[tuple[str, bytes]]:
-    for entry in folder.iterdir():
-        if entry.is_dir():
-            yield from _sources(entry, f"{prefix}{entry.name}/")
-        elif entry.name.endswith(".py"):
-            yield prefix + entry.name, entry.read_bytes()
+_recent = _RecentlyUsed(_CAPACITY)
 
 
-def _read(file: Path) -> list[Any]:
+def _entry_name(file: Path) -> str:
+    """The name of a result, as it is also written into its file: what is mistaken for it is no better than damaged."""
+    return file.parent.name + file.name
+
+
+def _read(file: Path) -> tuple[Any, int]:
+    """The result that a file holds, and the file's size, bytes."""
+    try:
+        data = read_limited(file, _MAX_ENTRY)
+        name, value = unpack(data)
+    except (InputError, OSError, TypeError, ValueError) as error:
+        raise InputError(f"{file}: this entry of the cache vanished or was damaged; run again") from error
+    if name != _entry_name(file):
+        raise InputError(f"{file}: this entry of the cache was replaced by another; run again")
+    return value, len(data)
+
+
+def _kept(file: Path) -> list[Any]:
     """The result that a file holds; none where it is missing, damaged, or that of another name."""
-    with suppress(InputError, OSError):
-        return [read_entry(file)[0]]
+    with suppress(InputError):
+        return [_read(file)[0]]
     return []
-
-
-NO_CACHE = Cache()
-"""Keeps nothing."""
 
 
 def _write_at_once(file: Path, data: bytes) -> None:
@@ -203,3 +269,67 @@ def _write_at_once(file: Path, data: bytes) -> None:
         with suppress(OSError):
             temporary.unlink()
         raise
+
+
+def pack(value: Any) -> bytes:
+    """A value as bytes: plain values, paths, arrays, and dataclasses of rdstitch."""
+    body = pickle.dumps(value, protocol=5)
+    return _MAGIC + hashlib.sha256(body).digest() + body
+
+
+def unpack(data: bytes) -> Any:
+    """The value that :func:`pack` made bytes of; nothing in them can name other code to be run."""
+    body = memoryview(data)[_HEAD:]
+    if data[:_HEAD] != _MAGIC + hashlib.sha256(body).digest():
+        raise InputError("damaged: it is not what was written")
+    try:
+        return _Unpickler(io.BytesIO(body)).load()
+    except _DAMAGED as error:
+        raise InputError(f"not what was expected: {error}") from error
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        known = module.split(".")[0] in ("rdstitch", "numpy", "pathlib")
+        named = super().find_class(module, name) if known else None
+        if isinstance(named, type) and (dataclasses.is_dataclass(named) or issubclass(named, Path)):
+            return named
+        if module.split(".")[0] == "numpy" and name in _NUMPY:
+            return named
+        raise pickle.UnpicklingError(f"{module}.{name} is no result")
+
+
+def digest(value: Any) -> str:
+    """A short text that stands for a value: equal for equal values only."""
+    content = hashlib.sha256()
+    _add(content, value)
+    return content.hexdigest()
+
+
+def _add(content: Any, value: Any) -> None:
+    parts: list[Any] = []
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, (bool, int, str, Path)):
+        text = str(value)
+    elif isinstance(value, float):
+        text = value.hex()
+    elif isinstance(value, np.ndarray) and value.dtype.kind in _ARRAY_KINDS:
+        # Sums depend on the order in memory in their last bits: it counts.
+        turned = value.flags.f_contiguous and not value.flags.c_contiguous
+        text = f"{value.dtype.str} {value.shape} {turned}"
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        parts = [getattr(value, item.name) for item in dataclasses.fields(value)]
+        text = type(value).__name__
+    elif isinstance(value, (tuple, list)):
+        parts, text = list(value), ""
+    elif isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        parts, text = [part for item in sorted(value.items()) for part in item], ""
+    else:
+        raise ArgumentError(f"a {type(value).__name__} cannot stand in the name of a result")
+    data = text.encode("utf-8", "surrogatepass")
+    content.update(f"{type(value).__name__} {len(data)} {len(parts)} ".encode() + data)
+    if isinstance(value, np.ndarray):
+        content.update(np.ascontiguousarray(value.T if turned else value).data.cast("B") if value.size else b"")
+    for part in parts:
+        _add(content, part)

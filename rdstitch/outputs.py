@@ -13,12 +13,13 @@ import re
 import shutil
 import sys
 import tempfile
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from rdstitch.errors import OutputError, RdstitchError
 from rdstitch.file_access import local_file
@@ -100,11 +101,10 @@ def check_distinct(paths: Iterable[str | Path]) -> None:
 
 def _identity(file: Path) -> tuple[int, int] | None:
     """The same for all names that lead to one file; None for a missing one."""
-    try:
+    with suppress(OSError, ValueError):
         status = file.stat()
-    except (OSError, ValueError):
-        return None
-    return status.st_dev, status.st_ino
+        return status.st_dev, status.st_ino
+    return None
 
 
 def write_bytes_atomic(path: str | Path, data: bytes, overwrite: bool = True) -> None:
@@ -180,35 +180,53 @@ def _sha256(file: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-class StagingFolder:
-    """A hidden folder that exists until it is closed, or until a later one in its place finds its process dead."""
+class TemporaryFolder:
+    """A folder that is removed when it is closed, or nobody refers to it any more, or the process ends.
 
-    def __init__(self, parent: Path, prefix: str = ".rdstitch-") -> None:
-        _remove_dead(parent, prefix)
-        self.path = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
-        self._lock = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)
-        _lock(self._lock)
+    That of a process that was killed is removed when the next one is made in its place. Copies in other processes name
+    it, but do not own it; back in the process that made it, they are the folder itself.
+    """
+
+    def __init__(self, parent: Path | None = None, prefix: str = "rdstitch-") -> None:
+        place = Path(parent or tempfile.gettempdir())
+        _remove_dead(place, prefix)
+        made = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
+        descriptor = os.open(made / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)
+        _lock(descriptor)
         try:
             # Only a folder of this ending is looked at by others, and it has its lock by then.
-            self.path = self.path.rename(f"{self.path}.part")
+            self.path = made.rename(f"{made}.part")
         except OSError:
-            self.close()
+            _remove(made, descriptor)
             raise
+        self.close = weakref.finalize(self, _remove, self.path, descriptor)
+        _folders[self.path] = self
 
-    def close(self) -> None:
+    def __reduce__(self) -> tuple[Callable[[Path], "TemporaryFolder"], tuple[Path]]:
+        """See the class."""
+        return _folder_at, (self.path,)
+
+    def __enter__(self) -> Path:
+        return self.path
+
+    def __exit__(self, *failure: object) -> None:
         """Remove the folder with everything in it."""
-        os.close(self._lock)
-        shutil.rmtree(self.path, ignore_errors=True)
+        self.close()
 
 
-@contextmanager
-def temporary_folder() -> Iterator[Path]:
-    """A folder among the system's temporary files that goes with the block, or with the next run after a crash."""
-    staging = StagingFolder(Path(tempfile.gettempdir()), prefix="rdstitch-")
-    try:
-        yield staging.path
-    finally:
-        staging.close()
+_folders: weakref.WeakValueDictionary[Path, TemporaryFolder] = weakref.WeakValueDictionary()
+
+
+def _folder_at(path: Path) -> TemporaryFolder:
+    if (folder := _folders.get(path)) is None:
+        folder = TemporaryFolder.__new__(TemporaryFolder)
+        folder.path = path
+    return folder
+
+
+def _remove(folder: Path, descriptor: int) -> None:
+    os.close(descriptor)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _lock(descriptor: int) -> bool:
@@ -231,8 +249,7 @@ def _remove_dead(parent: Path, prefix: str) -> None:
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-@dataclass(frozen=True)
-class _Item:
+class _Item(NamedTuple):
     """One output: its name as given, its place, and where it is staged."""
 
     name: Path
@@ -249,7 +266,7 @@ class Outputs:
 
     def __init__(self, overwrite: bool) -> None:
         self._overwrite = overwrite
-        self._folders: dict[Path, StagingFolder] = {}
+        self._folders: dict[Path, TemporaryFolder] = {}
         self._items: list[_Item] = []
 
     def __enter__(self) -> Self:
@@ -270,27 +287,21 @@ class Outputs:
                 folder.close()
 
     @contextmanager
-    def writing(self, path: str | Path) -> Iterator[Path]:
-        """Stage a file: yields where to write it; a failure of the file system is one of ``path``."""
-        name = Path(path)
-        with naming(name):
-            staged = self._stage(name, is_folder=False)
-            yield staged
-            # A full disk must be noticed before anything is replaced.
-            descriptor = os.open(staged, os.O_RDWR)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+    def writing(self, path: str | Path, *, is_folder: bool = False) -> Iterator[Path]:
+        """Stage a file, or a folder of Deep Zoom tiles; a failure of the file system is one of ``path``.
 
-    @contextmanager
-    def writing_folder(self, path: str | Path) -> Iterator[Path]:
-        """Stage a folder of Deep Zoom tiles: yields an empty folder."""
+        Yields where to write the file, or the empty folder.
+        """
         name = Path(path)
         with naming(name):
-            staged = self._stage(name, is_folder=True)
-            staged.mkdir()
+            staged = self._stage(name, is_folder=is_folder)
+            if is_folder:
+                staged.mkdir()
             yield staged
+            if not is_folder:
+                # A full disk must be noticed before anything is replaced.
+                with staged.open("rb+") as stream:
+                    os.fsync(stream.fileno())
 
     def write(self, path: str | Path, data: bytes) -> None:
         """Stage a file with this content."""
@@ -318,7 +329,7 @@ class Outputs:
         if place.is_symlink():
             place = Path(os.path.realpath(place))
         if place.parent not in self._folders:
-            self._folders[place.parent] = StagingFolder(place.parent)
+            self._folders[place.parent] = TemporaryFolder(place.parent, ".rdstitch-")
         # Tiles are staged just before their description, and are found beside it by its name.
         number = sum(not item.is_folder for item in self._items)
         staged = self._folders[place.parent].path / f"new{number}{'_files' if is_folder else name.suffix}"
@@ -339,14 +350,15 @@ class Outputs:
     def _place(self, item: _Item) -> None:
         if item.is_folder:
             self._place_folder(item)
-            return
-        if not self._overwrite:
+        elif self._overwrite:
+            item.staged.replace(item.place)
+        else:
             # A link replaces nothing; where a file system has none, the check a moment ago must do.
-            with suppress(OSError):
+            try:
                 os.link(item.staged, item.place)
-                return
-            self._check(item)
-        item.staged.replace(item.place)
+            except OSError:
+                self._check(item)
+                item.staged.replace(item.place)
 
     def _place_folder(self, item: _Item) -> None:
         """No system call replaces a folder that is not empty: the old one goes aside, and back if this fails."""

@@ -40,7 +40,7 @@ def followed(
     from rdstitch.camera_files import CAMERA_SUFFIXES
     from rdstitch.file_access import file_state
     from rdstitch.inputs.arrivals import Arrivals
-    from rdstitch.outputs import check_output, temporary_folder
+    from rdstitch.outputs import TemporaryFolder, check_output
     from rdstitch.pipeline.follow import follow as follow_frames
 
     if len(inputs) != 1:
@@ -62,7 +62,7 @@ def followed(
     if stitch.save_camera is not None:
         check_output(stitch.save_camera, stitch.overwrite, suffixes=CAMERA_SUFFIXES)
     before = file_state(preview) if preview else None
-    with temporary_folder() as folder:
+    with TemporaryFolder() as folder:
         arrivals = Arrivals(str(inputs[0]), frames_folder=lambda: folder, names=sys.stdin, every=every or 1, idle=idle)
         try:
             again = arrivals.comes_again

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.cache import Cache
+from rdstitch.cache import Cache, Stored
 from rdstitch.compositing.tiles import OutputStrip, TiledOutput
 from rdstitch.opencv_state import one_opencv_thread
 from rdstitch.progress import ShareProgress, unheard
-from rdstitch.stored import Stored
 
 
 @dataclass(frozen=True, eq=False)

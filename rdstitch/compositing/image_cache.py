@@ -7,7 +7,7 @@ from contextlib import suppress
 from threading import Lock
 
 from rdstitch.compositing.source_images import ImageOnDisk, ImageReader, LoadedImage
-from rdstitch.stored import TemporaryFolder
+from rdstitch.outputs import TemporaryFolder
 
 
 class ImageCache:

@@ -18,7 +18,7 @@ from rdstitch.inputs.rosbag import extract_images, is_bag
 from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.messages import Message, names_of, shortened
-from rdstitch.outputs import temporary_folder
+from rdstitch.outputs import TemporaryFolder
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
 IMAGE_SUFFIXES = frozenset(
@@ -68,7 +68,7 @@ def found_images(
 
         @cache
         def frames_folder() -> Path:
-            return stack.enter_context(temporary_folder())
+            return stack.enter_context(TemporaryFolder())
 
         exclude = [] if output is None else [output]
         yield find_images(arguments, exclude=exclude, frames_folder=frames_folder, every=every, topic=topic)

@@ -82,7 +82,7 @@ def write_strips(
     if suffix == ".dzi":
         folder = tiles_folder(Path(os.path.realpath(file)))
         check_tiles_folder(folder, overwrite=True)
-        with outputs.writing_folder(folder) as tiles, outputs.writing(file) as staged:
+        with outputs.writing(folder, is_folder=True) as tiles, outputs.writing(file) as staged:
             write_deep_zoom(staged, tiles, layout, checked)
     else:
         with outputs.writing(file) as staged:

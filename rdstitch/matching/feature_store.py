@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.cache import Cache
+from rdstitch.cache import Cache, Stored
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, PackedFeatures
-from rdstitch.stored import Stored
 
 Size = tuple[int, int]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rdstitch.cache import Cache
+from rdstitch.cache import Cache, Stored
 from rdstitch.compositing import (
     Canvas,
     CompositeOptions,
@@ -37,7 +37,6 @@ from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.process_memory import return_freed_memory
 from rdstitch.progress import Progress
 from rdstitch.stitch_result import OutputImage, StitchResult
-from rdstitch.stored import Stored
 from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
 
 # Reduction of an image of which only the kind of its samples is wanted.

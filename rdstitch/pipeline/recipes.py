@@ -20,7 +20,7 @@ from rdstitch.local_alignment import LocalAlignment
 from rdstitch.messages import Message, told_once
 from rdstitch.options import StitchOptions
 from rdstitch.orientation import quarter_turn
-from rdstitch.outputs import Outputs, check_distinct, check_output, json_bytes, temporary_folder, text_bytes
+from rdstitch.outputs import Outputs, TemporaryFolder, check_distinct, check_output, json_bytes, text_bytes
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.aligner import Purpose
 from rdstitch.pipeline.compose import blocks_on, compose_images, viewed_images, write_page
@@ -168,7 +168,7 @@ def mosaic_blocks(
         _check_outputs(output, options, listed.files)
         if options.cache is None:
             # What was found of images and pairs serves the next block.
-            options = replace(options, cache=stack.enter_context(temporary_folder()))
+            options = replace(options, cache=stack.enter_context(TemporaryFolder()))
         frames = list(listed.frames)
         while len(frames) > 1 or not results:
             name = file.with_name(f"{file.stem}-{len(results) + 1}{file.suffix}") if results else file

@@ -28,7 +28,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "package"
     (folder / "robust").mkdir(parents=True)
     (folder / "robust" / "ransac.py").write_text("LIMIT = 1\n", encoding="utf-8")
-    monkeypatch.setattr(cache, "files", lambda name: folder)
+    monkeypatch.setattr(cache, "_PACKAGE", folder)
     return folder
 
 
@@ -135,7 +135,7 @@ def test_the_digest_of_many_values_takes_the_memory_of_one(tmp_path: Path) -> No
 
 
 def test_the_cache_of_one_run_reads_no_sources(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cache, "sources_digest", lambda _: pytest.fail("read"))
+    monkeypatch.setattr(cache, "software", lambda: pytest.fail("read"))
     kept = Cache.for_this_run()
     assert kept.recall("stage", ("input",), lambda: 1) == 1
     assert kept.recall("stage", ("input",), lambda: 2) == 1

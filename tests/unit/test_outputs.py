@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rdstitch.errors import OutputError
-from rdstitch.outputs import Outputs, StagingFolder, check_output, temporary_folder, write_bytes_atomic
+from rdstitch.outputs import Outputs, TemporaryFolder, check_output, write_bytes_atomic
 from tests.faults import OPERATIONS, Operation, failing_disk
 
 _NAMES = ("a.dzi", "a.dzw", "a.dzi.json")
@@ -19,7 +19,10 @@ _NAMES = ("a.dzi", "a.dzw", "a.dzi.json")
 
 def _write_all(folder: Path, content: bytes, overwrite: bool) -> None:
     with Outputs(overwrite) as outputs:
-        with outputs.writing_folder(folder / "a_files") as tiles, outputs.writing(folder / "a.dzi") as description:
+        with (
+            outputs.writing(folder / "a_files", is_folder=True) as tiles,
+            outputs.writing(folder / "a.dzi") as description,
+        ):
             (tiles / "0").mkdir()
             for name in ("0_0.jpg", "1_0.jpg"):
                 (tiles / "0" / name).write_bytes(content)
@@ -76,7 +79,7 @@ def test_after_any_failure_every_file_is_whole(
 def test_a_file_that_appears_during_the_run_is_kept(tmp_path: Path, appearing: str) -> None:
     def write() -> None:
         with Outputs(overwrite=False) as outputs:
-            with outputs.writing_folder(tmp_path / "a_files") as tiles:
+            with outputs.writing(tmp_path / "a_files", is_folder=True) as tiles:
                 (tiles / "0").mkdir()
             for name in _NAMES:
                 outputs.write(tmp_path / name, b"ours")
@@ -131,7 +134,7 @@ def test_a_folder_of_the_user_is_no_folder_of_tiles(tmp_path: Path) -> None:
 
     def write() -> None:
         with Outputs(overwrite=True) as outputs:
-            with outputs.writing_folder(tmp_path / "photos_files"):
+            with outputs.writing(tmp_path / "photos_files", is_folder=True):
                 pass
             outputs.write(tmp_path / "photos.dzi", b"new")
 
@@ -157,8 +160,8 @@ _KILLED = """
 import os, signal, sys
 from pathlib import Path
 from rdstitch.outputs import Outputs
-from rdstitch.outputs import temporary_folder
-with temporary_folder() as folder, Outputs(False) as outputs:
+from rdstitch.outputs import TemporaryFolder
+with TemporaryFolder() as folder, Outputs(False) as outputs:
     (folder / "frame.png").write_bytes(b"half")
     with outputs.writing(sys.argv[1]) as staged:
         staged.write_bytes(b"half")
@@ -181,8 +184,8 @@ def test_leftovers_of_dead_processes_go_and_those_of_living_ones_stay(
     assert done.returncode == -signal.SIGKILL
     assert len(_leftovers(out, temporary)) == 2
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    living = StagingFolder(out)
-    with temporary_folder() as frames:
+    living = TemporaryFolder(out, ".rdstitch-")
+    with TemporaryFolder() as frames:
         write_bytes_atomic(out / "a.txt", b"whole")
         assert set(_leftovers(out, temporary)) == {living.path, frames}
     living.close()

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rdstitch import stored
-from rdstitch.cache import Cache
+from rdstitch import cache
+from rdstitch.cache import Cache, Stored
 from rdstitch.errors import InputError
-from rdstitch.stored import Stored, TemporaryFolder
+from rdstitch.outputs import TemporaryFolder
 
 
 @pytest.fixture(autouse=True)
 def _nothing_recent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stored, "_recent", stored._RecentlyUsed(0))
+    monkeypatch.setattr(cache, "_recent", cache._RecentlyUsed(0))
 
 
 def _kept(folder: Path, name: str, value: float) -> Stored[tuple[float]]:
@@ -45,7 +45,7 @@ def test_an_entry_that_is_gone_is_named(tmp_path: Path, damage: str) -> None:
 
 def test_what_was_used_recently_stays_in_memory_within_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     entries = [Cache(tmp_path).stored("stage", (k,), lambda k=k: np.full(1000, k)) for k in range(4)]  # type: ignore[misc]
-    monkeypatch.setattr(stored, "_recent", stored._RecentlyUsed(20_000))
+    monkeypatch.setattr(cache, "_recent", cache._RecentlyUsed(20_000))
     loaded = [entry.load() for entry in entries[:2]]
     assert all(entry.load() is value for entry, value in zip(entries[:2], loaded, strict=True))
     entries[0].load()
@@ -56,10 +56,10 @@ def test_what_was_used_recently_stays_in_memory_within_limits(tmp_path: Path, mo
 
 
 def test_a_folder_of_a_run_lives_as_long_as_what_lies_in_it() -> None:
-    cache = Cache.for_this_run()
-    found = cache.stored("stage", ("a",), lambda: 5)
-    folder = cache.folder
-    del cache
+    store = Cache.for_this_run()
+    found = store.stored("stage", ("a",), lambda: 5)
+    folder = store.folder
+    del store
     gc.collect()
     # As it comes back from a worker.
     found = pickle.loads(pickle.dumps(found))

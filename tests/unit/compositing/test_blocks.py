@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rdstitch.cache import Cache
+from rdstitch.cache import Cache, Stored
 from rdstitch.compositing import CompositeOptions, PlacedImage
 from rdstitch.compositing.blocks import Block
 from rdstitch.compositing.compositor import compose
 from rdstitch.compositing.tiles import OutputStrip
 from rdstitch.io import DecodedImage
-from rdstitch.stored import Stored
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import Scene, render
 

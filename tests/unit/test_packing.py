@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from rdstitch.cache import Cache
+from rdstitch.cache import Cache, digest, pack, unpack
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.io.packing import digest, pack, unpack
 from rdstitch.options import StitchOptions
 
 _ARRAYS = hnp.arrays(
