@@ -5,7 +5,7 @@ from examples.paper.common.report import Pixels, Report, Table
 from examples.paper.common.settings import Effort, Settings
 from examples.paper.common.stitched import registration_error, stitch_files, stitch_rendered
 from rdstitch.camera import Camera
-from rdstitch.camera_files.lens_fit import fit_lens
+from rdstitch.camera_files.lens_models import fit_lens
 from rdstitch.errors import RegistrationError
 from rdstitch.options import StitchOptions
 from rdstitch.synthetic import FisheyeLens

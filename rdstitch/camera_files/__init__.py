@@ -23,20 +23,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rdstitch.camera import Camera, CameraRecord
-from rdstitch.camera_files import writing
-from rdstitch.camera_files.hugin import hugin_project, is_hugin, read_hugin
-from rdstitch.camera_files.lens_fit import CameraFile
-from rdstitch.camera_files.lens_models import LensFit
-from rdstitch.camera_files.lensfun import lensfun_xml, read_lensfun
-from rdstitch.camera_files.reading import (
-    ImageSize,
-    colmap_cameras,
-    is_opencv,
-    read_colmap,
-    read_kalibr,
-    read_opencv,
-    read_opendronemap,
-)
+from rdstitch.camera_files import formats
+from rdstitch.camera_files.lens_models import CameraFile, LensFit
+from rdstitch.camera_files.polynomials import hugin_project, is_hugin, lensfun_xml, read_hugin, read_lensfun
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.file_access import read_text
 from rdstitch.outputs import json_bytes, text_bytes, write_bytes_atomic
@@ -74,7 +63,7 @@ def load_camera(path: str | Path, image_size: tuple[int, int] | None = None) -> 
     return read_camera_file(path, None if image_size is None else lambda: image_size).camera
 
 
-def read_camera_file(path: str | Path, image_size: ImageSize | None = None) -> CameraFile:
+def read_camera_file(path: str | Path, image_size: formats.ImageSize | None = None) -> CameraFile:
     """Read a camera file of any known format.
 
     A file that rdstitch wrote gives back λ exactly; to the lens model of any other, λ is fitted.
@@ -83,32 +72,32 @@ def read_camera_file(path: str | Path, image_size: ImageSize | None = None) -> C
     try:
         if text.lstrip().startswith("{"):
             return _of_content(parse_json(text, file), file, image_size)
-        own = next((line for line in text.splitlines() if line.startswith(writing.OWN_COMMENT)), None)
+        own = next((line for line in text.splitlines() if line.startswith(formats.OWN_COMMENT)), None)
         if own is not None:
-            return _own(parse_json(own.removeprefix(writing.OWN_COMMENT), file), file)
+            return _own(parse_json(own.removeprefix(formats.OWN_COMMENT), file), file)
         if text.lstrip().startswith("<"):
             return read_lensfun(text, file, image_size)
         if is_hugin(text):
             return read_hugin(text, file)
-        if cameras := colmap_cameras(text):
-            return read_colmap(_only(cameras), file)
+        if cameras := formats.colmap_cameras(text):
+            return formats.read_colmap(_only(cameras), file)
         return _of_content(parse_yaml(text, file), file, image_size)
     except ArgumentError as error:
         raise InputError(f"{file}: {error}") from error
 
 
-def _of_content(content: Any, file: str, image_size: ImageSize | None) -> CameraFile:
+def _of_content(content: Any, file: str, image_size: formats.ImageSize | None) -> CameraFile:
     """The camera of plain values, whosever they are."""
-    if is_opencv(content):
-        if (own := content.get(writing.OWN)) is not None:
-            return _own(own, file, writing.OWN)
-        return read_opencv(content, file, image_size)
+    if formats.is_opencv(content):
+        if (own := content.get(formats.OWN)) is not None:
+            return _own(own, file, formats.OWN)
+        return formats.read_opencv(content, file, image_size)
     entries = content.items() if isinstance(content, dict) else ()
-    for key, read in (("projection_type", read_opendronemap), ("camera_model", read_kalibr)):
+    for key, read in (("projection_type", formats.read_opendronemap), ("camera_model", formats.read_kalibr)):
         if found := [(name, entry) for name, entry in entries if isinstance(entry, dict) and key in entry]:
             name, entry = _only(found)
-            if (own := entry.get(writing.OWN)) is not None:
-                return _own(own, file, f"{name}.{writing.OWN}")
+            if (own := entry.get(formats.OWN)) is not None:
+                return _own(own, file, f"{name}.{formats.OWN}")
             return read(entry, file, str(name))
     return _own(content, file)
 
@@ -159,16 +148,16 @@ def export_note(camera: Camera, path: str | Path) -> tuple[str, ...]:
 
 
 _WRITERS: dict[str, Callable[[Camera], str]] = {
-    "cameras.json": writing.opendronemap_json,
-    "opencv.json": writing.opencv_json,
-    "*.opencv.json": writing.opencv_json,
+    "cameras.json": formats.opendronemap_json,
+    "opencv.json": formats.opencv_json,
+    "*.opencv.json": formats.opencv_json,
     "?*.json": lambda camera: json_bytes(camera.as_dict()).decode(),
-    "camera_info.yaml": writing.camera_info_yaml,
-    "camchain.yaml": writing.camera_chain_yaml,
-    "fisheye.yaml": writing.opencv_fisheye_yaml,
-    "*.fisheye.yaml": writing.opencv_fisheye_yaml,
-    "?*.yaml": writing.opencv_yaml,
-    "cameras.txt": writing.colmap_text,
+    "camera_info.yaml": formats.camera_info_yaml,
+    "camchain.yaml": formats.camera_chain_yaml,
+    "fisheye.yaml": formats.opencv_fisheye_yaml,
+    "*.fisheye.yaml": formats.opencv_fisheye_yaml,
+    "?*.yaml": formats.opencv_yaml,
+    "cameras.txt": formats.colmap_text,
     "?*.pto": hugin_project,
     "?*.xml": lensfun_xml,
 }

@@ -1,7 +1,8 @@
-"""Lens models of others: Brown's polynomial and Kannala and Brandt's fisheye, and the one nearest to a camera.
+"""Lens models of others, Brown's polynomial and Kannala and Brandt's fisheye: the nearest to a camera, and back.
 
-Every model is a *forward* map: pixels of a lens without distortion to measured pixels. It is fitted to a camera by
-least squares over the image, and what that costs in pixels is stated.
+Every model is a *forward* map: pixels of a lens without distortion to measured pixels. It is fitted to a camera, and
+the division model to it, by least squares over the image, and what that costs in pixels is stated. The division model
+has λ alone where that is enough, else μ too, else ν too.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,13 +13,21 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera, points_over
+from rdstitch.errors import ArgumentError
 
 _GRID = 65  # points along each side of the image that models are fitted at
 _RATIONAL_STEPS = 12
 _NEWTON_STEPS, _NEWTON_TOLERANCE = 20, 1e-10
 
+Forward = Callable[[FloatArray], FloatArray]
+
+_STEPS = 8
+_MAX_ERROR = 0.1  # half diagonals: then the file is no lens of these images
+_RAYS, _SAMPLES, _REACH = 64, 1200, 8.0  # where other models are looked at: directions, steps, half diagonals
+_SQUARE = 0.005  # calibrations give focal lengths along x and y that differ by less
+
 CLOSE = 0.1
-"""Pixels: a model that is nowhere farther from the lens needs no better one in its place."""
+"""Pixels: a model that is nowhere farther from a lens needs no better one in its place."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +101,7 @@ def _series(coefficients: Sequence[float], squares: FloatArray) -> FloatArray:
     return 1.0 + total
 
 
-def least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
+def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
     """Solve ``terms x = values`` by least squares, with columns of one size."""
     size = np.maximum(np.abs(terms).max(axis=0), 1e-300)
     solution: FloatArray = np.linalg.lstsq(terms / size, values, rcond=None)[0] / size
@@ -120,7 +129,7 @@ class LensSamples:
 
     def fit(self, start: FloatArray, terms: FloatArray) -> tuple[FloatArray, LensFit]:
         """Find coefficients (K,) for which ``start + terms k`` are the measured radii; ``terms`` of shape (N, K)."""
-        coefficients = least_squares(terms, self.bent - start)
+        coefficients = _least_squares(terms, self.bent - start)
         return coefficients, self._compare(start + terms @ coefficients)
 
     def fit_rational(self) -> tuple[FloatArray, LensFit]:
@@ -135,12 +144,12 @@ class LensSamples:
         terms = np.hstack([self.straight[:, None] * powers, -self.bent[:, None] * powers])
         denominator, fits = np.ones_like(self.bent), [(np.zeros(6), self._compare(self.straight))]
         for _ in range(_RATIONAL_STEPS):
-            k = least_squares(terms / denominator[:, None], (self.bent - self.straight) / denominator)
+            k = _least_squares(terms / denominator[:, None], (self.bent - self.straight) / denominator)
             denominator = 1.0 + powers @ k[3:]
             if not (denominator > 1e-3).all():
                 break
             fits.append((k, self._compare(self.straight * (1.0 + powers @ k[:3]) / denominator)))
-        coefficients, fit = min(fits, key=lambda found: found[1].largest)
+        coefficients, fit = min(fits, key=lambda one: one[1].largest)
         return coefficients / np.tile(size ** np.array([2.0, 4.0, 6.0]), 2), fit
 
     def _compare(self, bent: FloatArray) -> LensFit:
@@ -148,29 +157,124 @@ class LensSamples:
         error = np.abs(bent - self.bent) * self.focal
         return LensFit(float(np.sqrt(np.mean(error**2))), float(error.max()))
 
-    def fit_powers(self, powers: Sequence[int], *, fisheye: bool = False) -> tuple[FloatArray, LensFit]:
-        """Find coefficients of powers of the undistorted radius, or of its angle, beside that itself."""
-        start = np.arctan(self.straight) if fisheye else self.straight
-        return self.fit(start, start[:, None] ** np.array(powers))
 
-
-_FITS: dict[str, tuple[Callable[[LensSamples], tuple[FloatArray, LensFit]], tuple[int | None, ...]]] = {
-    "two terms": (lambda samples: samples.fit_powers((3, 5)), (0, 1, None, None)),
-    "polynomial": (lambda samples: samples.fit_powers((3, 5, 7)), (0, 1, None, None, 2)),
-    "rational": (LensSamples.fit_rational, (0, 1, None, None, 2, 3, 4, 5)),
-    "fisheye": (lambda samples: samples.fit_powers((3, 5, 7, 9), fisheye=True), (0, 1, 2, 3)),
+_MODELS: dict[str, tuple[tuple[int, ...], tuple[int | None, ...]]] = {
+    "two terms": ((3, 5), (0, 1, None, None)),
+    "polynomial": ((3, 5, 7), (0, 1, None, None, 2)),
+    "rational": ((), (0, 1, None, None, 2, 3, 4, 5)),
+    "fisheye": ((3, 5, 7, 9), (0, 1, 2, 3)),
 }
-"""How a model is fitted, and which of the numbers found each of OpenCV's coefficients is; None for 0."""
+"""Powers of the undistorted radius, or of a fisheye's angle, beside that itself; which of their coefficients each of
+OpenCV's is, None for 0."""
 
 
 def nearest_model(camera: Camera, *models: str, close: float = CLOSE) -> tuple[LensModel, LensFit]:
-    """Fit lens models of :data:`_FITS` to a camera: the first that is so close, pixels, or else the nearest."""
-    samples, found = LensSamples.of(camera), []
+    """Fit lens models of :data:`_MODELS` to a camera: the first that is so close, pixels, or else the nearest."""
+    samples, fits = LensSamples.of(camera), []
     for model in models:
-        fit, places = _FITS[model]
-        numbers, error = fit(samples)
+        powers, places = _MODELS[model]
+        start = np.arctan(samples.straight) if model == "fisheye" else samples.straight
+        numbers, error = samples.fit(start, start[:, None] ** np.array(powers)) if powers else samples.fit_rational()
         coefficients = tuple(0.0 if place is None else float(numbers[place]) for place in places)
-        found.append((LensModel((samples.focal,) * 2, camera.center, coefficients, model == "fisheye"), error))
+        fits.append((LensModel((samples.focal,) * 2, camera.center, coefficients, model == "fisheye"), error))
         if error.largest <= close:
             break
-    return min(found, key=lambda one: one[1].largest)
+    return min(fits, key=lambda one: one[1].largest)
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """A camera as a file tells it."""
+
+    camera: Camera
+    kind: str  # whose format it is: "rdstitch", "OpenCV", "COLMAP", "Kalibr", "OpenDroneMap", "Hugin" or "lensfun"
+    fit: LensFit | None = None  # how well λ agrees with the file's own lens model; None where the file gives λ itself
+    cause: str = ""  # what of the file's model λ cannot describe; empty where it is only the curve of the lens
+
+
+def fitted_camera(
+    forward: Forward,
+    kind: str,
+    size: tuple[int, int],
+    center: tuple[float, float],
+    focal: float,
+    field: str = "",
+    cause: str = "",
+) -> CameraFile:
+    """Fit λ to the lens model of a file."""
+    camera = Camera(size, center=center, focal=focal, focal_source="file")
+    try:
+        lens, fit = fit_lens(forward, camera)
+    except ArgumentError as error:
+        raise ArgumentError(f"{field}{error}{cause and f'; {cause}'}") from error
+    return CameraFile(lens, kind, fit, cause)
+
+
+def fitted_lens(lens: LensModel, kind: str, size: tuple[int, int], field: str = "") -> CameraFile:
+    """Fit λ to a lens model that several formats share, and say what of it λ cannot describe."""
+    if not min(lens.focal) > 0.0:
+        raise ArgumentError(f"expected positive focal lengths, not {lens.focal[0]:g} and {lens.focal[1]:g}")
+    stretch = lens.focal[0] / lens.focal[1] - 1.0
+    cause = ""
+    if abs(stretch) > _SQUARE:
+        cause = f"its focal lengths along x and y differ by {abs(stretch):.1%}, but only square pixels are known here"
+    return fitted_camera(lens.distort, kind, size, lens.center, lens.mean_focal, field, cause)
+
+
+def fit_lens(forward: Forward, camera: Camera) -> tuple[Camera, LensFit]:
+    """Fit the division model to another lens model: with λ alone where that is enough, else with μ, else with ν too."""
+    straight, measured, weights = _rays(forward, camera)
+    flat, bent = camera.normalize(straight), camera.normalize(measured)
+    radius = np.linalg.norm(bent, axis=1)
+    # A lens without distortion is what a model that is off centre or tangential would otherwise be fitted to.
+    ratio = np.einsum("ij,ij->i", flat, bent) / np.maximum(radius**2, 1e-300)
+    best: tuple[Camera, LensFit] | None = None
+    for count in (1, 2, 3):
+        coefficients = _fit_divisor(radius**2, 1.0 / ratio, weights, count)
+        try:
+            lens = camera.with_coefficients(*coefficients)
+        except ArgumentError:
+            continue
+        error = np.linalg.norm(lens.distort(straight) - measured, axis=1)
+        if not np.isfinite(error).all():
+            continue
+        fit = LensFit(float(np.sqrt(weights @ error**2 / weights.sum())), float(error.max()))
+        if best is None or fit.largest < 0.5 * best[1].largest:
+            best = lens, fit
+        if best[1].largest <= CLOSE:
+            break
+    if best is None or best[1].largest > _MAX_ERROR * camera.scale:
+        raise ArgumentError("the lens is far from every lens that the division model can describe")
+    return best
+
+
+def _fit_divisor(radius2: FloatArray, divisor: FloatArray, weights: FloatArray, count: int) -> list[float]:
+    """``count`` coefficients of ``g`` for which undistorted radii give the measured ones, by weighted least squares."""
+    terms = radius2[:, None] ** np.arange(1, count + 1)
+    solution = np.zeros(count)
+    for _ in range(_STEPS):
+        # An error of g moves the measured radius by r / (g - 2 q g').
+        slope = divisor - 2.0 * terms @ (np.arange(1, count + 1) * solution)
+        weight = np.sqrt(weights * radius2) / np.maximum(slope, 1e-2)
+        solution = _least_squares(weight[:, None] * terms, weight * (divisor - 1.0))
+    return solution.tolist()
+
+
+def _rays(forward: Forward, camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Points along rays from the centre to the border of the measured image: straight, measured, and their areas."""
+    angles = np.arange(_RAYS) * (2.0 * np.pi / _RAYS)
+    radii = np.linspace(0.0, _REACH * camera.scale, _SAMPLES + 1)[1:]
+    rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None] * radii[None, :, None] + camera.center
+    with np.errstate(all="ignore"):
+        measured = forward(rays.reshape(-1, 2)).reshape(rays.shape)
+        distance = np.linalg.norm(measured - camera.center, axis=2)
+        steps = np.diff(distance, axis=1, prepend=0.0)
+    within = (measured > -0.5) & (measured < np.array(camera.image_size) - 0.5)
+    inside = within[..., 0] & within[..., 1]
+    # Along each ray, what comes before it leaves the image for the first time; with a fisheye of 180 degrees and
+    # more it never does, and of what is near the horizon there is no need to know.
+    leaves = np.where(inside.all(axis=1), _SAMPLES, np.argmin(inside, axis=1))
+    seen = np.arange(_SAMPLES) < leaves[:, None]
+    if not inside[:, 0].all() or not (steps[seen] > 0.0).all():
+        raise ArgumentError("the lens model folds the image; it does not belong to images of this size")
+    return rays[seen], measured[seen], (distance * steps)[seen]

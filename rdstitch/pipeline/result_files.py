@@ -141,7 +141,7 @@ def project_of_hugin(result: StitchResult) -> str:
 
     Its panorama is equirectangular, or the plane seen from one height of the reference image.
     """
-    from rdstitch.camera_files.hugin import HEAD, hugin_lens
+    from rdstitch.camera_files.polynomials import HEAD, hugin_lens
 
     registration, sources = result.registration, result.registration.sources
     if any(source.frame is not None and source.frame.number is not None for source in sources):

@@ -1,13 +1,17 @@
-"""Hugin's project files: the lens of an image line, panotools' polynomial with a, b, c and the field of view v.
+"""Polynomials of the undistorted radius r in halves of the shorter side: Hugin's project files, lensfun's profiles.
 
-``r_d = a r⁴ + b r³ + c r² + (1 - a - b - c) r`` with r the undistorted radius in halves of the shorter side: the scale
-is kept there and not at the centre, so that the focal length that v implies is not the one at the centre. For fisheyes
-the undistorted radius is that of an equidistant one.
+Hugin has ``r_d = a r⁴ + b r³ + c r² + (1 - a - b - c) r`` and the field of view v. The scale is kept at r = 1, not at
+the centre, so that the focal length that v implies is not the one at the centre. For fisheyes the undistorted radius is
+that of an equidistant one.
+
+lensfun, the database that darktable, RawTherapee and others read, has ``poly3``, ``r_d = r (1 - k + k r²)``; ``poly5``,
+``r_d = r (1 + k1 r² + k2 r⁴)``; and Hugin's as ``ptlens``. Focal lengths are millimetres; the crop factor says on what
+film.
 """
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -16,13 +20,14 @@ from msgspec import Meta, Struct
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.camera_files.lens_fit import CameraFile, fitted_camera
-from rdstitch.camera_files.lens_models import CLOSE, LensFit, LensSamples
-from rdstitch.camera_files.writing import comments
+from rdstitch.camera_files.formats import comments
+from rdstitch.camera_files.lens_models import CLOSE, CameraFile, LensFit, LensSamples, fitted_camera
 from rdstitch.errors import ArgumentError
-from rdstitch.records import Side, convert
+from rdstitch.records import Side, convert, parse_xml
 
 _RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE = 0, 2, 3
+_FILM = math.hypot(36.0, 24.0)  # mm, at crop factor 1
+_TERMS = {"poly3": {"k1": 3}, "poly5": {"k1": 3, "k2": 5}, "ptlens": {"a": 4, "b": 3, "c": 2}}  # powers by their names
 _PARAMETER = re.compile(r"([A-Za-z]+)(\"[^\"]*\"|\S*)")
 HEAD = """# hugin project file
 #hugin_ptoversion 2
@@ -144,8 +149,70 @@ class Polynomial:
 def fitted_polynomial(camera: Camera, unit: float, powers: tuple[int, ...]) -> Polynomial:
     """The polynomial of a camera by least squares; a fisheye's where that is nearer and the other one is not close."""
     samples = LensSamples.of(camera)
-    size, found = samples.focal / unit, []
+    size, lenses = samples.focal / unit, []
     for fisheye, straight in ((False, samples.straight), (True, np.arctan(samples.straight))):
         values, fit = samples.fit(straight, (straight[:, None] * size) ** np.array(powers) / size)
-        found.append(Polynomial(powers, tuple(values.tolist()), samples.focal, fisheye, fit))
-    return found[0] if found[0].fit.largest <= CLOSE else min(found, key=lambda lens: lens.fit.largest)
+        lenses.append(Polynomial(powers, tuple(values.tolist()), samples.focal, fisheye, fit))
+    return lenses[0] if lenses[0].fit.largest <= CLOSE else min(lenses, key=lambda lens: lens.fit.largest)
+
+
+def read_lensfun(text: str, file: str, image_size: Callable[[], tuple[int, int]] | None) -> CameraFile:
+    """Fit λ to the only lens of a file at its only focal length; the crop factor is that of the images."""
+    lenses = list(parse_xml(text, file).iter("lens"))
+    profiles = [(lens, item) for lens in lenses for item in lens.iter("distortion")]
+    if len(profiles) != 1:
+        what = f"{len(lenses)} lenses with {len(profiles)} distortions"
+        raise ArgumentError(f"holds {what}; keep the one lens, and of it the one focal length, of the images")
+    if image_size is None:
+        raise ArgumentError("has no image size")
+    (lens, values), size = profiles[0], image_size()
+    model, kind = values.get("model", ""), (lens.findtext("type") or "rectilinear").strip().lower()
+    if model not in _TERMS or kind not in ("rectilinear", "fisheye"):
+        known = ", ".join(_TERMS)
+        raise ArgumentError(f"only rectilinear lenses and fisheyes by {known} are known here, not {kind} {model}")
+    try:
+        terms = {power: float(values.get(name, "0")) for name, power in _TERMS[model].items()}
+        nominal = values.get("focal", "")
+        length = float(values.get("real-focal", nominal)) * float(lens.findtext("cropfactor") or "1")
+        center_at = lens.find("center")
+        shift = [0.0 if center_at is None else float(center_at.get(name, "0")) for name in "xy"]
+    except ValueError as error:
+        raise ArgumentError(f"{model}: {error}") from error
+    unit, focal = (min(size) - 1) / 2, length / _FILM * math.hypot(*size)
+    if not (math.isfinite(focal) and focal > 0.0 and all(map(math.isfinite, (*terms.values(), *shift)))):
+        raise ArgumentError(f"{model}: expected a positive focal length, and finite numbers")
+    linear = 1.0 if model == "poly5" else 1.0 - sum(terms.values())
+    center = (size[0] - 1) / 2 + shift[0] * unit, (size[1] - 1) / 2 + shift[1] * unit
+    return read_polynomial("lensfun", terms, linear, size, center, unit, focal, fisheye=kind == "fisheye")
+
+
+def lensfun_xml(camera: Camera) -> str:
+    """A database of one lens, by the simplest of the three models that is close to it, else the nearest.
+
+    Maker, model, mount and crop factor are for the user to fill in: a camera file does not know them.
+    """
+    (width, height), unit = camera.image_size, (min(camera.image_size) - 1) / 2
+    fits = [(name, fitted_polynomial(camera, unit, tuple(terms.values()))) for name, terms in _TERMS.items()]
+    close = (fit for fit in fits if fit[1].fit.largest <= CLOSE)
+    model, lens = next(close, None) or min(fits, key=lambda fit: fit[1].fit.largest)
+    scale, moved = (1.0, lens.coefficients) if model == "poly5" else lens.moved()
+    values = " ".join(f'{name}="{value:.9g}"' for name, value in zip(_TERMS[model], moved, strict=True))
+    x, y = ((c - (n - 1) / 2) / unit for c, n in zip(camera.center, (width, height), strict=True))
+    focal = lens.focal * scale / math.hypot(width, height) * _FILM
+    return f"""<!--
+{comments(camera, lens.fit, model)}-->
+<lensdatabase version="1">
+  <lens>
+    <maker>Unknown</maker>
+    <model>Unknown lens</model>
+    <mount>Generic</mount>
+    <cropfactor>1</cropfactor>
+    <aspect-ratio>{max(width, height) / min(width, height):.6g}</aspect-ratio>
+    <type>{"fisheye" if lens.fisheye else "rectilinear"}</type>
+    <center x="{x:.9g}" y="{y:.9g}"/>
+    <calibration>
+      <distortion model="{model}" focal="{focal:.6g}" {values}/>
+    </calibration>
+  </lens>
+</lensdatabase>
+"""
