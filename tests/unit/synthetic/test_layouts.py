@@ -7,23 +7,16 @@ from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 from rdstitch.synthetic import (
     EndlessTexture,
-    FisheyeLens,
     ImageTexture,
     Poses,
-    best_division_model,
     blank,
     fit_to_plane,
     gradient,
     grid_poses,
-    joined,
-    line_poses,
     pair_poses,
     parking_poses,
     repeated,
-    rotation_poses,
     sequence_over,
-    survey_poses,
-    turn_poses,
 )
 
 LENS = Camera((320, 240), -0.25, focal=260.0)
@@ -68,15 +61,6 @@ def test_motion_between_poses_is_the_homography_between_images() -> None:
         poses.shaken(seed=1, tilt=0.1).motion(0, 1)
 
 
-def test_a_turn_ends_at_its_angle_and_a_line_is_straight() -> None:
-    line, turn = line_poses(LENS, 40, heading=0.3), turn_poses(LENS, 41, angle=1.2, heading=0.3)
-    steps = np.diff(line.position, axis=0)
-    np.testing.assert_allclose(np.arctan2(steps[:, 1], steps[:, 0]), 0.3, atol=1e-12)
-    assert turn.yaw[0] - turn.yaw[-1] == pytest.approx(1.2)
-    end = np.diff(turn.position[-2:], axis=0)[0]
-    assert np.arctan2(end[1], end[0]) == pytest.approx(1.5)
-
-
 def test_parking_ends_parallel_and_aside() -> None:
     poses = parking_poses(LENS, 101)
     assert poses.yaw[-1] == pytest.approx(poses.yaw[0])
@@ -84,35 +68,6 @@ def test_parking_ends_parallel_and_aside() -> None:
     step = np.linalg.norm(np.diff(poses.position[:2], axis=0))
     assert abs(poses.position[-1, 1]) > 5.0 * step
     assert (np.diff(poses.position[:, 0]) < 0.0).sum() == 50
-
-
-def test_joined_paths_go_on_where_the_last_ended() -> None:
-    path = joined(line_poses(LENS, 10), turn_poses(LENS, 21, heading=0.9), parking_poses(LENS, 31, heading=-2.0))
-    assert len(path) == 10 + 20 + 30
-    step = np.linalg.norm(np.diff(path.position, axis=0), axis=1)
-    np.testing.assert_allclose(step, step[0], rtol=1e-9)
-    assert path.yaw[29] == pytest.approx(-np.pi / 2)
-    move = np.diff(path.position, axis=0)
-    # At the joints (9, 29) the robot drives where it looks.
-    for joint, heading in ((9, 0.0), (29, np.pi / 2)):
-        np.testing.assert_allclose(move[joint] / step[joint], (np.cos(heading), np.sin(heading)), atol=1e-9)
-
-
-@pytest.mark.parametrize("count", [117, 158])
-def test_a_survey_covers_a_field_with_neighbours(count: int) -> None:
-    poses = survey_poses(LENS, count, attitude_jitter=0.02, seed=3)
-    assert len(poses) == count
-    extent = np.ptp(poses.position, axis=0)
-    assert 0.5 < extent[0] / extent[1] < 2.0
-    assert (np.abs(poses.height / poses.height.mean() - 1.0) < 0.07).all()
-    assert np.ptp(poses.tilt, axis=0).max() <= 0.04
-
-
-def test_a_camera_that_turns_about_its_axis_does_not_move() -> None:
-    poses = rotation_poses(LENS, 5, yaw_step=0.3)
-    assert np.ptp(poses.position) == 0.0
-    assert poses.motion(0, 1).translation == (0.0, 0.0)
-    assert poses.motion(0, 1).yaw == pytest.approx(0.3)
 
 
 def test_endless_ground_is_the_same_wherever_it_is_cut() -> None:
@@ -132,12 +87,3 @@ def test_hopeless_textures_are_hopeless() -> None:
     assert np.abs(np.diff(gradient((500, 400)).region(0, 0, 500, 400), n=2, axis=0)).max() < 1e-6
     tiles = repeated((500, 400), 1, period=96).region(0, 0, 500, 400)
     np.testing.assert_array_equal(tiles[:, 96:192], tiles[:, :96])
-
-
-def test_a_fisheye_is_no_division_model() -> None:
-    camera, rms = best_division_model(FisheyeLens((640, 480), 400.0))
-    assert camera.distortion < -0.2
-    assert 0.1 < rms < 1.0
-    own, exact = best_division_model(LENS)
-    assert own.distortion == pytest.approx(-0.25, abs=1e-4)
-    assert exact < 1e-3
