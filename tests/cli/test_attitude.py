@@ -112,14 +112,6 @@ def test_cameras_that_look_at_the_horizon_are_refused(rdstitch: Run, frames: lis
     assert "86 degrees away from straight down" in done.line
 
 
-def test_a_file_may_be_named_like_the_word(
-    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("xmp").write_text("name,psi\n")
-    rdstitch("calibrate", *frames, "--attitude", "./xmp", "-o", "camera.json", status=3, told="no column 'theta'")
-
-
 def test_pairs_get_one_tilt_an_image(windy: Sequence, tmp_path: Path) -> None:
     paths = windy.write(tmp_path)[:2]
     (tmp_path / "imu.csv").write_text(_table(windy, paths, 0.0))
@@ -131,10 +123,3 @@ def test_pairs_get_one_tilt_an_image(windy: Sequence, tmp_path: Path) -> None:
     registration = rdstitch.calibrate(paths, options)
     assert [pair.relation.solver for pair in registration.pairs] == ["two_point"]
     assert abs(registration.alignment.distortion - lens.distortion) < 0.01
-
-
-def test_the_command_takes_degrees(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    rows = [f"{frame.name},0,0" for frame in frames]
-    (tmp_path / "imu.csv").write_text("\n".join(["name,psi,theta", *rows]))
-    arguments = ("calibrate", *frames, "--attitude", tmp_path / "imu.csv", "-o", tmp_path / "camera.json", *CACHED)
-    rdstitch(*arguments, "--attitude-std", "10")

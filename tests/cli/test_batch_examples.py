@@ -94,13 +94,6 @@ def test_mosaics_and_their_summary(environment: dict[str, str], floors: Path, tm
     assert (again.returncode, f"{made_band}: is not the image" in again.stderr) == (1, True)
 
 
-def test_mosaics_by_parallel(environment: dict[str, str], floors: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    done = _run(environment, "mosaics_parallel.sh", floors, out, *FAST, needs=("find", "parallel"))
-    assert done.returncode == 1
-    assert sorted(path.name for path in out.glob("*.tif")) == ["hall one.tif", "it's two.tif"]
-
-
 @pytest.mark.parametrize("place", sampled(["floors/straight", "straight"]))
 def test_undistorting_a_tree(environment: dict[str, str], floors: Path, tmp_path: Path, place: str) -> None:
     Camera((400, 300), -0.2).save(tmp_path / "camera.json")
@@ -112,14 +105,3 @@ def test_undistorting_a_tree(environment: dict[str, str], floors: Path, tmp_path
         assert all("2 images undistorted" in line for line in done.stderr.splitlines())
         made = sorted(str(path.relative_to(tmp_path / place)) for path in (tmp_path / place).rglob("*.png"))
         assert made == originals
-
-
-@pytest.mark.slow
-def test_undistorting_a_tree_tells_of_failures(environment: dict[str, str], floors: Path, tmp_path: Path) -> None:
-    Camera((400, 300), -0.2).save(tmp_path / "camera.json")
-    arguments = (tmp_path / "camera.json", floors, tmp_path / "straight")
-    done = _run(environment, "undistort_all.sh", *arguments[:2], floors, needs=("find", "xargs", "realpath"))
-    assert (done.returncode, "choose another one" in done.stderr) == (1, True)
-    (floors / "empty" / "bad.png").write_bytes(b"no image")
-    done = _run(environment, "undistort_all.sh", *arguments, needs=("find", "xargs", "realpath"))
-    assert (done.returncode, "bad.png" in done.stderr) == (1, True)

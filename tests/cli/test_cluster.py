@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import rdstitch
@@ -125,15 +124,3 @@ def test_what_a_cluster_lacks_is_said(rdstitch: Run, frames: list[Path], tmp_pat
     nobody = rdstitch(*arguments, "--cache", tmp_path / "cache", status=2, told="no Dask scheduler")
     assert "tcp://127.0.0.1:9" in nobody.line
     assert not (tmp_path / "out.png").exists()
-
-
-@pytest.mark.slow
-def test_arrays_travel_to_a_cluster() -> None:
-    sequence = flight(3, 3)
-    arrays = [sequence.frame(index) for index in range(3)]
-    features = rdstitch.FeatureOptions(max_features=600)
-    here, there = (
-        rdstitch.mosaic(arrays, options=rdstitch.StitchOptions(features=features, workers=1, scheduler=scheduler))
-        for scheduler in (None, "local")
-    )
-    assert np.array_equal(here.image, there.image)

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -181,19 +180,3 @@ def test_files_whose_writers_pause_are_read_when_they_are_whole(drive: list[Path
     expected = [(name, number, True) for number, name in enumerate(names)]
     assert found[:3] == expected[1:4]
     assert expected[4] in found
-
-
-def test_a_file_that_is_mended_after_it_was_reported_is_read(drive: list[Path], folder: Path) -> None:
-    for image in drive[:2]:
-        shutil.copy(image, folder)
-    (bad := folder / "z.png").write_bytes(drive[2].read_bytes()[:9000])
-    os.utime(bad, (0, 0))
-    arrivals = Arrivals(folder, frames_folder=Path, idle=2.0)
-    reasons = []
-    for frame in follow(arrivals, StitchOptions(workers=1), comes_again=arrivals.comes_again):
-        if frame.name == "z.png":
-            reasons.append(frame.reason)
-            shutil.copy(drive[2], bad)
-    assert len(reasons) == 2
-    assert reasons[0]
-    assert reasons[1] in ("", "the first frames wait for others")

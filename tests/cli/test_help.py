@@ -63,11 +63,6 @@ def test_the_bare_command_shows_all_of_its_help(rdstitch: Run) -> None:
     assert "..." not in rdstitch("-h").out.partition("Examples:")[0].partition("[ARGS]...")[2]
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_the_topic_of_a_bag_can_be_given_wherever_a_bag_is_read(name: str) -> None:
-    assert any(option.name == "topic" for option in _options(cli.commands[name]))
-
-
 @pytest.mark.parametrize("name", ["pano", "mosaic", "calibrate", "trajectory"])
 def test_defaults_are_the_librarys(name: str) -> None:
     context = cli.commands[name].make_context(name, ["a.png", "b.png", "-o", "out.png"])

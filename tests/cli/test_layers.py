@@ -8,7 +8,6 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.io.cropped_tiff import write_cropped_tiff
 from rdstitch.io.read import read_image
 from tests.cli.running import CACHED, Run
 
@@ -52,12 +51,3 @@ def test_what_is_there_is_kept(rdstitch: Run, frames: list[Path], tmp_path: Path
     (folder / f"{frames[0].stem}.tif").write_bytes(b"mine")
     rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "a.png", "--layers", folder, *CACHED, told="exists")
     assert [file.read_bytes() for file in folder.iterdir()] == [b"mine"]
-
-
-def test_sixteen_bits_of_four_bands_keep_them(tmp_path: Path) -> None:
-    pixels = np.random.default_rng(0).integers(0, 65535, (5, 7, 4), dtype=np.uint16)
-    alpha = np.full((5, 7), 255, np.uint8)
-    write_cropped_tiff(tmp_path / "a.tif", pixels, alpha, (3, 2), (20, 10))
-    found = tifffile.imread(tmp_path / "a.tif")
-    np.testing.assert_array_equal(found[..., :4], pixels)
-    assert (found[..., 4] == 65535).all()

@@ -69,14 +69,6 @@ def test_without_a_mask_the_leg_is_seen_and_apply_takes_masks_too(rdstitch: Run,
     np.testing.assert_array_equal(read_image(again).pixels, read_image(output).pixels)
 
 
-@pytest.mark.parametrize(("command", "suffix"), [("calibrate", "json"), ("trajectory", "csv")])
-def test_masks_help_where_nothing_is_composited(
-    rdstitch: Run, legs: Path, tmp_path: Path, command: str, suffix: str
-) -> None:
-    done = rdstitch(command, legs, "-o", tmp_path / f"out.{suffix}", "--mask", tmp_path / "mask.png", *CACHED)
-    assert abs(float(done.out) - DISTORTION) < 0.01
-
-
 def test_images_without_a_mask_are_reported(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     (tmp_path / "masks").mkdir()
     assert cv2.imwrite(str(tmp_path / "masks" / f"{frames[0].stem}.bmp"), np.full((30, 40), 255, np.uint8))

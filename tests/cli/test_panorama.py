@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rdstitch.alignment.motion_models import MODELS
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions
 from rdstitch.options import StitchOptions
@@ -23,7 +22,6 @@ from rdstitch.viewer import viewer_page
 from tests.cli.running import CACHE, Run
 from tests.drone_xmp import euler_angles, xmp_of
 
-_BUNDLED = Path(__file__).parents[2] / "examples" / "data" / "garfield_red"
 LENS = Camera((320, 240), -0.2, focal=260.0, focal_source="option")
 
 
@@ -93,14 +91,6 @@ def test_outlines_are_where_the_images_are_at_both_ends_of_a_full_turn(around: l
         own = cv2.imread(str(around[k]), cv2.IMREAD_GRAYSCALE)
         assert np.corrcoef(there[0], own[patch[:, 1], patch[:, 0]])[0, 1] > 0.97
     assert across > 0
-
-
-def test_the_projection_is_the_users(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
-    output = tmp_path / "few.tif"
-    rdstitch("pano", *around[:3], "-o", output, "--projection", "mercator", *CACHE)
-    record = json.loads((tmp_path / "few.tif.json").read_text(encoding="utf-8"))
-    assert record["output"]["projection"] == "mercator"
-    assert not record["output"]["wraps_around"]
 
 
 def test_the_view_is_turned_and_turned_again(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
@@ -200,17 +190,3 @@ def test_deep_zoom_of_a_full_turn_is_joined_at_the_edge(rdstitch: Run, around: l
     # The same image, but for the compression of the tiles.
     assert np.abs(ends[0][rows] - whole[rows, 0]).mean() < 6.0
     assert (width, height) == tuple(json.loads((tmp_path / "around.dzi.json").read_text("utf-8"))["output"]["size"])
-
-
-def test_images_of_a_plane_are_what_they_are_without_a_turn_to_compete(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pair, options = sorted(_BUNDLED.glob("*.jpg")), StitchOptions(features=FeatureOptions(max_features=1000))
-    for name in ("with", "without"):
-        (tmp_path / name).mkdir()
-        if name == "without":
-            monkeypatch.delitem(MODELS, "rotation")
-        pano(pair, tmp_path / name / "x.png", options)
-    assert (tmp_path / "with" / "x.png").read_bytes() == (tmp_path / "without" / "x.png").read_bytes()
-    one, other = (json.loads((tmp_path / k / "x.png.json").read_text(encoding="utf-8")) for k in ("with", "without"))
-    assert all(one[key] == other[key] for key in ("lambda", "model", "images", "pairs"))

@@ -79,39 +79,6 @@ def test_whatever_fails(
     assert _outputs(tmp_path) == after
 
 
-@pytest.mark.parametrize(("name", "overwrite"), sampled([("out.dzi", True), ("out.jpg", False)]))
-def test_the_report_is_published_with_the_image(
-    rdstitch: Run, located: Path, tmp_path: Path, overwrite: bool, name: str
-) -> None:
-    out, cache = tmp_path / "out", tmp_path / "cache"
-    arguments: tuple[str | Path, ...] = ("mosaic", located / "flight", "-o", out / name, "--report", out / "why.html")
-    arguments = (*arguments, "--scale", "0.3", "--blend", "none", "--seam", "none", "--cache", cache, *FAST)
-    out.mkdir()
-    # Also so that the cache has everything, whose own renames do not count.
-    rdstitch(*arguments, "--rotate", "90")
-    before = _outputs(out)
-    assert {name, f"{name}.json", "why.html"} <= set(before)
-    if overwrite:
-        arguments = (*arguments, "--overwrite")
-    else:
-        before = {}
-        _restore(out, before)
-    with failing_disk("rename") as disk:
-        rdstitch(*arguments)
-    assert disk.count >= 3
-    assert "<h2>Mosaic</h2>" in (out / "why.html").read_text(encoding="utf-8")
-    assert "No image was written" not in (out / "why.html").read_text(encoding="utf-8")
-    for failing in range(disk.count):
-        _restore(out, before)
-        with failing_disk("rename", failing):
-            done = rdstitch(*arguments, status=None)
-        assert done.status == 6 or not overwrite, (failing, done.err)
-        left = _outputs(out)
-        assert not overwrite or {name, f"{name}.json", "why.html"} <= set(left)
-        assert not [path for path in left if ".part" in path]
-    rdstitch(*arguments, "--overwrite")
-
-
 _KILLED_WHILE_PUBLISHING = """
 import os, signal
 from rdstitch.outputs import Outputs
@@ -195,16 +162,6 @@ def test_an_image_beside_any_sidecar_does_not_vanish(rdstitch: Run, located: Pat
         shutil.copy(located / name, only)
     told = "no images but those that rdstitch wrote"
     rdstitch("mosaic", only, "-o", tmp_path / "x.tif", status=3, told=told)
-
-
-def test_a_link_as_output(rdstitch: Run, located: Path, tmp_path: Path) -> None:
-    (tmp_path / "disk").mkdir()
-    (tmp_path / "out.jpg").symlink_to("disk/image.jpg")
-    arguments = ("apply", located / "field.tif.json", "--images", located / "flight", "--scale", "0.3", "-j", "1")
-    (tmp_path / "disk" / "image.jpg").write_bytes(b"old")
-    rdstitch(*arguments, "-o", tmp_path / "out.jpg", "--overwrite")
-    assert (tmp_path / "out.jpg").is_symlink()
-    assert read_image(tmp_path / "disk" / "image.jpg").pixels.size > 0
 
 
 @pytest.mark.parametrize("name", ["frame_0001.jpg", "../flight/frame_0001.jpg"])

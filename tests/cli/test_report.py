@@ -4,7 +4,6 @@ import base64
 import io
 import re
 import shutil
-import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,12 +14,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.compositing import CompositeOptions
-from rdstitch.io import preview, read_image
+from rdstitch.io import preview
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline import accept
 from rdstitch.pipeline.recipes import calibrate, pano
-from rdstitch.progress import StageTimer
 from rdstitch.report import page as report
 from rdstitch.report import report_page, write_report
 from rdstitch.report.pairs import matched
@@ -202,34 +200,6 @@ def test_of_a_large_tiff_an_overview_is_read(
 
 def _decoded(address: str | None) -> NDArray[np.uint8]:
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))))
-
-
-def test_stages_are_measured_and_passed_on() -> None:
-    seen: list[tuple[str, int, int]] = []
-    timer = StageTimer(lambda *step: seen.append(step))
-    steps = [("one", 0, 2), ("one", 2, 2), ("two", 1, 1), ("one", 1, 1)]
-    for step in steps:
-        timer(*step)
-    assert seen == steps
-    names, seconds = zip(*timer.stages, strict=True)
-    assert names == ("reading headers", "one", "two")
-    assert min(seconds) >= 0.0
-
-
-def test_a_browser_shows_it(reported: Path, tmp_path: Path) -> None:
-    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("there is no Chromium")
-    shot = tmp_path / "shot.png"
-    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
-    command += ["--window-size=1000,5000", f"--screenshot={shot}", reported.as_uri()]
-    subprocess.run(command, capture_output=True, check=True, timeout=120)
-    pixels = read_image(shot).pixels[..., :3].astype(int)
-    assert pixels.shape[:2] == (5000, 1000)
-    # The mosaic, the images of the lens and of the matches: coloured stretches all down the page.
-    colourful = np.ptp(pixels, axis=2).mean(axis=1) > 4.0
-    assert colourful[:2000].sum() > 200
-    assert colourful[2000:].sum() > 300
 
 
 def test_the_best_pair_has_many_matches(frames: list[Path]) -> None:

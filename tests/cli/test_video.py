@@ -26,17 +26,6 @@ def test_a_video_is_as_good_as_its_frames(
     assert (tmp_path / output).stat().st_size > 0
 
 
-def test_frames_that_show_nothing_new_are_passed_over_and_counted(
-    rdstitch: Run, frames: list[Path], tmp_path: Path
-) -> None:
-    slow = write_video(tmp_path / "slow.avi", (read_image(frame).pixels for frame in frames for _ in range(4)))
-    done = rdstitch("mosaic", slow, "-o", tmp_path / "out.png", "--focal", "380", *FAST)
-    assert f"of {4 * len(frames)} frames are used" in done.err
-    assert "--every 1 takes all" in done.err
-    assert "warning" not in done.err
-    assert abs(float(done.out) - DISTORTION) < 0.01
-
-
 @pytest.mark.parametrize("following", [(), ("--follow",)])
 def test_a_video_is_never_written_over(rdstitch: Run, video: Path, tmp_path: Path, following: tuple[str, ...]) -> None:
     before = video.read_bytes()

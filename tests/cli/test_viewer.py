@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from rdstitch.compositing.seam_finder import SeamMap
-from rdstitch.io import read_image
 from rdstitch.viewer.page import seam_image
 from tests.cli.running import CACHED, Run
 
@@ -108,9 +107,3 @@ def read_shown(data: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     from PIL import Image
 
     return np.asarray(np.asarray(Image.open(io.BytesIO(data)))[..., 3] > 0)
-
-
-def test_other_formats_have_no_page(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    rdstitch("pano", *frames[:2], "-o", tmp_path / "x.png", *CACHED)
-    assert not (tmp_path / "x.html").exists()
-    assert read_image(tmp_path / "x.png").pixels.size

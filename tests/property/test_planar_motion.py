@@ -5,7 +5,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt, tilt_from_normal
-from tests.planar_constraints import constraint_residuals
 
 tilts = st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
 translations = st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)).filter(lambda t: np.hypot(*t) > 0.05)
@@ -29,23 +28,6 @@ def test_decomposition_inverts_composition(
     np.testing.assert_allclose(
         [*found.tilt, found.yaw, *found.translation, found.height], [*tilt, yaw, *translation, height], atol=1e-5
     )
-
-
-@given(tilt=tilts, yaw=yaws, translation=translations, scale=scales)
-def test_constraints_hold_for_planar_motion_in_any_camera_frame(
-    tilt: tuple[float, float], yaw: float, translation: tuple[float, float], scale: float
-) -> None:
-    h = scale * PlanarMotion(tilt, yaw, translation).homography()
-    turn = rotation_from_tilt((0.4, -0.9))
-    for matrix in (h, turn @ h @ turn.T):
-        quartic, sextic = constraint_residuals(matrix)
-        assert abs(quartic) < 1e-12
-        assert abs(sextic) < 1e-12
-
-
-def test_constraints_fail_for_another_homography() -> None:
-    h = np.array([[1.2, 0.1, 0.3], [-0.2, 0.9, 0.1], [0.1, 0.3, 1.0]])
-    assert np.abs(constraint_residuals(h)).min() > 1e-3
 
 
 def test_a_hopeless_matrix_still_gives_finite_numbers() -> None:

@@ -5,9 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from scipy import sparse as real_sparse
 
-from rdstitch.late_imports import sparse, spatial
 from tests.cli.running import flight
 
 _UP_TO_THE_FIRST_IMAGE = """
@@ -53,9 +51,3 @@ def test_up_to_the_first_image_no_more_is_imported_than_it_takes(command: str, t
     assert [
         name for name in imported if name.split(".")[0] in _NOT_YET or ".".join(name.split(".")[:2]) in _NOT_YET
     ] == []
-
-
-def test_a_part_has_the_names_of_the_real_one() -> None:
-    assert sparse.csr_array is real_sparse.csr_array
-    with pytest.raises(AttributeError):
-        _ = spatial.no_such_name  # type: ignore[attr-defined]

@@ -100,24 +100,6 @@ def test_of_a_foreign_file_the_lens_is_fitted_and_the_residual_reported(
     assert found.fit.largest < 0.004 * camera.scale
 
 
-@pytest.mark.parametrize("name", ["c.yml", "opencv.json"])
-def test_opencv_reads_what_is_written_and_distorts_alike(tmp_path: Path, name: str) -> None:
-    camera = CAMERAS[0]
-    save_camera(camera, tmp_path / name)
-    storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_READ)
-    matrix = storage.getNode("camera_matrix").mat()
-    coefficients = storage.getNode("distortion_coefficients").mat()
-    assert storage.getNode("image_width").real() == 4000
-    own = storage.getNode("rdstitch")
-    assert own.getNode("lambda").real() == camera.distortion
-    straight = camera.undistort(_points(camera))
-    rays = np.column_stack([(straight - camera.center) / 3300.0, np.ones(len(straight))])
-    seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)
-    apart = np.linalg.norm(np.asarray(seen)[:, 0] - _points(camera), axis=1)
-    largest = own.getNode("fit_largest_px").real()
-    assert 0.5 * largest < apart.max() < 1.05 * largest < 5.0
-
-
 def _projected(matrix: FloatArray, values: list[float], rays: FloatArray, *, fisheye: bool) -> FloatArray:
     """Where OpenCV sees rays (N, 3)."""
     none, d = np.zeros(3), np.array(values)
@@ -468,13 +450,6 @@ def test_four_coefficients_of_usual_lenses_need_no_mark(tmp_path: Path, name: st
     found = load_camera(_opencv_file(tmp_path / "c.yml", (focal, focal), k, (1280, 960)))
     marked = _opencv_file(tmp_path / "m.yml", (focal, focal), k, (1280, 960), "distortion_model: plumb_bob\n")
     assert found == load_camera(marked)
-
-
-def test_pixels_that_are_no_squares_are_named_as_the_cause(tmp_path: Path) -> None:
-    found = read_camera_file(_opencv_file(tmp_path / "c.yml", (900.0, 955.0), [-0.2, 0.05, 0.0, 0.0, 0.0], (1280, 960)))
-    assert "focal lengths along x and y differ by 5.8%" in found.cause
-    usual = read_camera_file(_opencv_file(tmp_path / "d.yml", (900.0, 901.0), [-0.2, 0.05, 0.0, 0.0, 0.0], (1280, 960)))
-    assert usual.cause == ""
 
 
 def test_yaml_may_be_written_in_any_style(tmp_path: Path) -> None:

@@ -138,13 +138,6 @@ def test_a_clipped_sky_ends_in_no_step() -> None:
     assert steps["balanced"] < 0.4 * steps["gain"]
 
 
-def test_equal_images_are_not_touched() -> None:
-    scene = render(2, 1, seed=4)
-    exposure = _compose(scene).exposure
-    assert np.abs(exposure.log_gain).max() < 0.01
-    assert (exposure.vignetting == 0).all()
-
-
 @pytest.mark.parametrize("share", sampled([0.06, 0.2, 0.4, 0.11, 0.28], 3))
 @pytest.mark.parametrize("noise", [0.0, 2.0])
 def test_what_only_one_image_shows_colours_nothing(share: float, noise: float) -> None:

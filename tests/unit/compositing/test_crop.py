@@ -24,11 +24,6 @@ def test_a_covered_box_is_kept_but_for_its_border(y: slice, x: slice, box: tuple
     assert crop_box(_covered(20, 30, y, x), 3, (88, 58)) == (box, "")
 
 
-def test_the_box_ends_with_the_canvas() -> None:
-    """Reduced pixels reach beyond it."""
-    assert crop_box(_covered(20, 30), 3, (86, 56)) == ((3, 3, 86, 56), "")
-
-
 def test_large_coverage_is_looked_at_in_cells_that_are_covered_whole() -> None:
     covered = _covered(4, 3100)
     covered = np.repeat(covered, 30, axis=0)  # 120 x 3100: cells of 3 x 3

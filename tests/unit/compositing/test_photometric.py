@@ -12,7 +12,7 @@ from rdstitch.compositing.canvas import plan_canvas
 from rdstitch.compositing.overlap_cells import compare_overlaps
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
 from rdstitch.compositing.source_images import ImageReader
-from rdstitch.compositing.survey import Survey, SurveyTile, survey_images
+from rdstitch.compositing.survey import survey_images
 from rdstitch.compositing.warp import locate, plan_warp
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import place_images, render
@@ -73,15 +73,3 @@ def test_an_image_without_overlap_has_the_gain_that_its_camera_wrote_down() -> N
     gains = [gain_compensation._fit(differences, images)[0].log_gain for images in sets]
     assert np.abs(gains[0][2]).max() < 0.01
     np.testing.assert_allclose(gains[1][2] - gains[1][:2].mean(axis=0), np.log(2.0) / 2.4, atol=0.02)
-
-
-def test_the_median_is_that_of_the_whole_images_however_their_content_repeats() -> None:
-    cameras = [Camera((1000, 1000))] * 2
-    canvas = plan_canvas(cameras, np.stack([np.eye(3)] * 2))
-    images = [np.full((1000, 1000, 1), level, dtype=np.float32) for level in (0.3, 0.5)]
-    images[0][:, ::5] = 0.9
-    tiles = tuple(SurveyTile((0, 0, 1000, 1000), pixels, np.ones((1000, 1000), dtype=np.bool_)) for pixels in images)
-    survey = Survey(1, canvas, tuple(plan_warp(camera, np.eye(3), canvas, 0) for camera in cameras), tiles)
-    kept = gain_compensation._with_median_kept(Exposure(0.0, np.array([[0.2], [-0.2]])), survey, cameras)
-    # The second image, brightened, holds the median before and after.
-    np.testing.assert_allclose(kept.log_gain, [[0.4], [0.0]], atol=1e-6)

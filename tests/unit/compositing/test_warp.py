@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, plan_canvas
-from rdstitch.compositing.sampling import sample
-from rdstitch.compositing.source_images import prepare_image
 from rdstitch.compositing.warp import locate, plan_warp
 from tests.compositing_scenes import as_image, grey, inner, place_images, render
 
@@ -51,22 +49,6 @@ def test_coordinates_are_exact_to_what_resampling_rounds(distortion: float, scal
     assert np.nanmax(error) < max(1.0, warp.shrink) / 32.0
     if distortion <= 0.0:
         assert warp.step >= (8 if scale == 1.0 else 2)
-
-
-def test_a_box_anywhere_gives_the_same_coordinates() -> None:
-    lens = Camera((640, 480), distortion=-0.3)
-    canvas = plan_canvas([lens], np.eye(3)[None])
-    warp = plan_warp(lens, np.eye(3), canvas, 0)
-    whole = locate(warp, (-40, -40, 700, 600))
-    part = locate(warp, (33, 57, 201, 190))
-    cut = whole.on(part.box)
-    np.testing.assert_array_equal(part.maps, cut.maps)
-    np.testing.assert_array_equal(part.inside, whole.inside[97:230, 73:241])
-    np.testing.assert_array_equal(part.maps, [axis[97:230, 73:241] for axis in whole.maps])
-    np.testing.assert_array_equal(whole.on(part.box).maps, part.maps)
-    assert cut.lattice is whole.lattice
-    beyond = part.on((0, 0, 300, 200))
-    np.testing.assert_array_equal(beyond.maps, whole.on(beyond.box).maps)
 
 
 def test_coverage_ends_half_a_pixel_outside() -> None:
@@ -132,15 +114,3 @@ def test_transparent_parts_leave_no_trace() -> None:
     hole = plan_warp(lens, np.eye(3), canvas, 0)
     middle = hole.source_points(np.array([result.alpha.shape[1] / 2]), np.array([result.alpha.shape[0] / 2]))
     assert result.alpha[result.alpha.shape[0] // 2, result.alpha.shape[1] // 2] == 0, middle
-
-
-def test_sampling_a_reduced_image_is_centred() -> None:
-    ramp = np.tile(np.arange(360, dtype=np.float32), (60, 1))
-    lens = Camera((360, 60))
-    canvas = plan_canvas([lens], np.eye(3)[None], scale=1 / 6)
-    warp = plan_warp(lens, np.eye(3), canvas, 0)
-    image = prepare_image(as_image(ramp), warp.shrink)
-    assert image.reduction == 3
-    values = sample(image, locate(warp, (0, 0, *canvas.size)))
-    # The middle of six px; the Gaussian leaves a ramp alone, away from its ends.
-    np.testing.assert_allclose(values[5, 5:-5], 6 * np.arange(60)[5:-5] + 2.5, atol=0.05)

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rdstitch.errors import ArgumentError, InputError
+from rdstitch.errors import ArgumentError
 from rdstitch.features import FeatureOptions, Features, View, detect, detect_view, match
 from rdstitch.features.detect import spread, strongest
-from rdstitch.features.opencv import to_rootsift
 from rdstitch.features.prepared_image import halving
 from rdstitch.synthetic import ground
 
@@ -50,12 +49,6 @@ def test_a_turned_image_matches(kind: str, image: NDArray[np.uint8]) -> None:
     # Points have no bias: half a pixel would be a wrong convention.
     bias = (found.points1 @ motion[:, :2].T + motion[:, 2] - found.points2)[error < 2].mean(axis=0)
     assert np.abs(bias).max() < 0.12
-
-
-def test_images_are_halved_until_they_are_small_enough() -> None:
-    sizes = [(1280, 960), (2000, 1000), (2001, 1000), (3880, 2850), (8000, 6000)]
-    assert [halving(size, 2.0) for size in sizes] == [1, 1, 2, 4, 8]
-    assert halving((640, 480), 5e-324) == 1024
 
 
 @pytest.mark.parametrize("size", [(3265, 2449), (6532, 4898), (4001, 1999), (2001, 1000)])
@@ -161,16 +154,6 @@ def test_threads_change_nothing(kind: str, image: NDArray[np.uint8]) -> None:
     assert one[1].image_size == (HEIGHT, WIDTH)
 
 
-def test_what_a_source_raises_is_raised() -> None:
-    def broken(_: float | None) -> View:
-        raise InputError("cannot read")
-
-    before = cv2.getNumThreads()
-    with pytest.raises(InputError, match="cannot read"):
-        detect_view(broken, FeatureOptions())
-    assert cv2.getNumThreads() == before
-
-
 def raising(*_arguments: object, **_options: object) -> None:
     raise cv2.error("The function/feature is not implemented")
 
@@ -201,16 +184,6 @@ def test_bad_arguments_are_refused(image: NDArray[np.uint8]) -> None:
             detect(bad)
     with pytest.raises(ArgumentError, match="int32"):
         detect(np.zeros((50, 50), np.int32))
-
-
-def test_rootsift_compares_roots() -> None:
-    rng = np.random.default_rng(0)
-    values = np.rint(rng.gamma(0.6, 60, (40, 128))).astype(np.float32)
-    rooted = to_rootsift(values)
-    exact = np.sqrt(values / values.sum(axis=1, keepdims=True))
-    np.testing.assert_allclose(rooted / 512, exact, atol=0.5 / 512 + 1e-6)
-    np.testing.assert_array_equal(rooted, np.rint(rooted))
-    np.testing.assert_array_equal(to_rootsift(np.zeros((1, 128), np.float32)), 0)
 
 
 def test_spreading_serves_every_cell_before_any_twice() -> None:

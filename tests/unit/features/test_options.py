@@ -2,7 +2,6 @@
 
 import pytest
 
-from rdstitch.errors import ArgumentError
 from rdstitch.features import FeatureOptions
 
 
@@ -23,8 +22,3 @@ def test_numbers_stay_what_they_are() -> None:
     """A run on seven of two images' options is that on two."""
     two = FeatureOptions().for_images(2)
     assert two.for_images(7) == two
-
-
-def test_other_words_are_refused() -> None:
-    with pytest.raises(ArgumentError, match="'auto' or None"):
-        FeatureOptions(work_megapixels="full")  # type: ignore[arg-type]

@@ -1,7 +1,5 @@
 """Where images overlap: as a few matches tell, generously, and not at all where they do not tell."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -83,21 +81,3 @@ def test_few_tell_nothing(images: tuple[Features, Features]) -> None:
     assert overlapping(*images, _some(everything, 40)) is None
     found = match_overlap(match, *images, _some(everything, 40))
     np.testing.assert_array_equal(found.indices, everything.indices)
-
-
-def test_without_the_size_of_the_images_nothing_is_told(images: tuple[Features, Features]) -> None:
-    unknown = [replace(features, image_size=None) for features in images]
-    assert overlapping(unknown[0], unknown[1], _some(match(*images), 80)) is None
-
-
-def test_where_matches_are_sparse_it_reaches_farther(images: tuple[Features, Features]) -> None:
-    everything = match(*images)
-    low = everything.points1[:, 1] > 300
-    thinned = np.concatenate([np.flatnonzero(low)[:60], np.flatnonzero(~low)[:14]])
-    dense = np.flatnonzero(low)[:60]
-    told, untold = (
-        overlapping(*images, Correspondences.of(*images, everything.indices[kept], everything.ratio[kept]))
-        for kept in (thinned, dense)
-    )
-    assert np.isin(everything.indices[:, 0], told[0]).all()
-    assert not np.isin(everything.indices[:, 0], untold[0]).all()

@@ -6,7 +6,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from rdstitch.features import FeatureOptions, sift_tiles
+from rdstitch.features import FeatureOptions
 from rdstitch.features.opencv import OpenCVDetection
 from rdstitch.features.sift_tiles import SiftTilesDetection
 from rdstitch.synthetic import ground
@@ -44,18 +44,3 @@ def test_coarse_keypoints_are_as_many_and_as_strong(grey: NDArray[np.uint8]) -> 
         one, two = (found.response[(found.scale >= low) & (found.scale < high)] for found in (whole, tiles))
         assert len(two) == pytest.approx(len(one), rel=0.15)
         assert np.median(two) == pytest.approx(np.median(one), rel=0.1)
-
-
-def test_coarse_keypoints_of_odd_sizes_lie_where_they_do_in_the_whole(
-    grey: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also where an image is halved twice, and each time a row and a column are left over."""
-    monkeypatch.setattr(sift_tiles, "LARGE", 250_000)
-    odd = np.ascontiguousarray(grey[:799, :1279])
-    whole, tiles = OpenCVDetection.find(odd, OPTIONS), SiftTilesDetection.find(odd, OPTIONS)
-    assert {tuple(np.round(part.factor).astype(int)) for part in tiles.parts} == {(1, 1), (2, 2), (4, 4)}
-    coarse = whole.points[whole.scale > 16]
-    distance = np.asarray(cKDTree(tiles.points[tiles.scale > 12]).query(coarse)[0])
-    right = coarse[:, 0] > 900
-    assert np.median(distance[right]) < 0.35
-    assert np.median(distance[~right]) < 0.35

@@ -114,12 +114,3 @@ def test_images_for_which_there_is_no_room_are_not_kept() -> None:
     decoded_images.put("other", large)
     assert decoded_images.take("other") is large
     assert decoded_images.take("small") is small
-
-
-def test_a_shelf_that_was_cleared_has_room_again() -> None:
-    decoded_images, image = DecodedImageCache(room=250), _image(np.zeros((10, 20), np.uint8))
-    decoded_images.put("one", image)
-    decoded_images.clear()
-    assert decoded_images.take("one") is None
-    decoded_images.put("two", image)
-    assert decoded_images.take("two") is image

@@ -40,10 +40,6 @@ def test_frames_in_a_row_share_enough_and_no_more_are_taken_than_that_needs() ->
     assert places[-1] - places[found[-1]] <= 0.05 * _WIDTH
 
 
-def test_frames_too_far_apart_are_all_taken() -> None:
-    assert keyframes(tracked(_film([100.0 * k for k in range(8)]))) == list(range(8))
-
-
 def test_where_the_camera_turns_back_the_outermost_frame_is_taken() -> None:
     out = [4.0 * k for k in range(9)]
     places = [*out, *out[-2::-1], *(-x for x in out[1:])]
@@ -93,10 +89,6 @@ def test_what_was_passed_over_is_said() -> None:
     assert "2 of 5 frames" in str(message)
     assert message.severity == "note"
     assert Wanted(chosen=frozenset((0, 1)), total=2).messages(Path("a.mp4")) == []
-
-
-def test_no_frames() -> None:
-    assert keyframes(tracked([])) == []
 
 
 def test_of_a_video_these_frames_are_written_unless_the_user_says_which(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.errors import OutputError
 from rdstitch.io import Layout, Metadata, write_image, write_strips
 from rdstitch.io.deepzoom import read_deep_zoom
 
@@ -88,9 +87,3 @@ def test_profile_is_in_every_tile(tmp_path: Path) -> None:
     for tile in (tmp_path / "a_files").rglob("*.jpg"):
         with Image.open(tile) as image:
             assert image.info["icc_profile"] == profile
-
-
-def test_floats_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"write a \.tif"):
-        write_image(tmp_path / "a.dzi", np.zeros((4, 4), np.float32))
-    assert list(tmp_path.iterdir()) == []

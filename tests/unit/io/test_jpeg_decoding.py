@@ -45,13 +45,6 @@ def test_it_decodes_what_pillow_does(
     np.testing.assert_array_equal(read_image(file, factor).pixels, found)
 
 
-def test_tiny_images_are_left_to_pillow(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
-    for side, factor in ((3, 2), (5, 4), (7, 1)):
-        Image.fromarray(pixels[:side, :side]).save(tmp_path / "a.jpg")
-        assert decoded_jpeg(tmp_path / "a.jpg", (side, side), factor, grey=False) == (None, "")
-        assert read_image(tmp_path / "a.jpg", factor).pixels.shape[1::-1] == reduced_size((side, side), factor)
-
-
 def test_complaints_are_left_to_pillow(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
     file, cut, padded = (tmp_path / name for name in ("a.jpg", "cut.jpg", "padded.jpg"))
     Image.fromarray(pixels).save(file)
@@ -76,10 +69,3 @@ def test_damage_is_named(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
         damaged = read_image(file, factor)
         assert "orrupt JPEG data" in damaged.damage
         assert damaged.pixels.shape[1::-1] == reduced_size(SIZE, factor)
-
-
-def test_inks_become_colours(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
-    Image.fromarray(pixels).convert("CMYK").save(tmp_path / "a.jpg", quality=95)
-    found = read_image(tmp_path / "a.jpg", 2).pixels
-    assert found.shape == (75, 102, 3)
-    assert np.abs(found.astype(float).mean(axis=(0, 1)) - pixels.mean(axis=(0, 1))).max() < 3

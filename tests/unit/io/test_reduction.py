@@ -12,7 +12,7 @@ from PIL import Image
 from rdstitch.features import FeatureOptions, View, detect, detect_view
 from rdstitch.features.options import CLOSER
 from rdstitch.io import Metadata, read_image, write_image
-from rdstitch.io.reduction import block_mean, block_minimum, fitting_reduction, halved, mean_of_channels
+from rdstitch.io.reduction import block_mean, halved
 from rdstitch.synthetic import ground
 
 WIDTH, HEIGHT = 203, 150
@@ -60,21 +60,6 @@ def test_jpeg_is_reduced_where_it_lies(
         assert error < 0.5 * np.abs(shifted - expected)[inner].mean()
 
 
-def test_grey_jpeg_stays_grey(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
-    write_image(tmp_path / "a.jpg", pixels[..., 0])
-    assert read_image(tmp_path / "a.jpg", 4).pixels.shape == (38, 51)
-
-
-def test_reductions_that_fit() -> None:
-    assert [fitting_reduction(shrink) for shrink in (0.3, 1.9, 2.0, 3.99, 7.0, 8.0, 100.0)] == [1, 1, 2, 2, 4, 8, 8]
-
-
-def test_one_transparent_px_makes_its_block_transparent() -> None:
-    alpha = np.full((5, 7), 255, np.uint8)
-    alpha[4, 6] = 0
-    np.testing.assert_array_equal(block_minimum(alpha, 4), [[255, 255], [255, 0]])
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 def test_halved_px_are_means_of_what_is_opaque(dtype: type[np.uint8 | np.uint16], channels: int) -> None:
@@ -105,11 +90,3 @@ def test_features_of_a_reduced_image_lie_where_they_are_in_the_whole(pixels: NDA
     assert asked == [options.work_megapixels, CLOSER * WIDTH * HEIGHT / 1e6]  # for a closer look
     distance = np.linalg.norm(whole.points[:50, None] - small.points[None], axis=2).min(axis=1)
     assert np.median(distance) < 0.2
-
-
-@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 1), (5, 7, 3), (5, 7, 4)])
-def test_the_mean_of_the_channels_keeps_what_is_not_known(shape: tuple[int, ...]) -> None:
-    samples = np.random.default_rng(0).uniform(size=shape).astype(np.float32)
-    samples[2, 3] = np.nan
-    expected = samples if samples.ndim == 2 else samples.mean(axis=2)
-    np.testing.assert_allclose(mean_of_channels(samples), expected, rtol=1e-6)

@@ -155,14 +155,6 @@ def test_nothing_folds_even_where_matches_say_so() -> None:
     assert 0.45 < max(field.steepest for field in fields) <= 0.501
 
 
-def test_equal_matches_give_equal_fields() -> None:
-    sequence = scene("bumps")
-    matrices = homographies(sequence)
-    first, again = (align_locally(matches(sequence), CAMERAS, matrices) for _ in range(2))
-    for a, b in zip(first.fields, again.fields, strict=True):
-        np.testing.assert_array_equal(a.values, b.values)
-
-
 def test_that_ground_is_flat_is_found_pair_by_pair() -> None:
     """Of thousands of images, the matches of all pairs together would be what takes memory."""
     sequence = scene(None)

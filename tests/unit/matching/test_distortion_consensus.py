@@ -43,21 +43,6 @@ def test_pairs_that_cannot_see_it_have_no_vote() -> None:
     assert "none of 2 pairs" in none.reason
 
 
-def test_two_votes_have_no_scatter_and_equal_ones_a_histogram() -> None:
-    assert vote([-0.2, -0.1], [0.01, 0.01]).scatter == 0.0
-    same = vote([-0.2, -0.2, -0.2], [0.01] * 3)
-    assert same.scatter == pytest.approx(0.0, abs=1e-6)
-    assert same.edges[0] < -0.2 < same.edges[-1]
-
-
-def test_votes_count_by_their_precision() -> None:
-    found = vote([-0.2, -0.1], [0.001, 0.04])
-    assert found.distortion == pytest.approx(-0.199937539, abs=1e-9)  # weights 1,000,000 and 625
-    assert found.std == pytest.approx(0.000999688, abs=1e-9)
-    assert (found.agreeing, found.votes) == (2, 2)
-    assert vote([0.3, -0.2], [0.1, 0.001]).distortion == pytest.approx(-0.2)  # half a unit is five of the larger
-
-
 @pytest.mark.parametrize(("offset", "agreeing", "distortion"), [(0.029, 2, -0.1855), (0.031, 1, -0.2)])
 def test_votes_agree_within_three_standard_deviations(offset: float, agreeing: int, distortion: float) -> None:
     found = vote([-0.2, -0.2 + offset], [0.01, 0.01])

@@ -41,13 +41,6 @@ def test_chaining_goes_along_links_in_either_direction() -> None:
     np.testing.assert_allclose(chained / ours, truth / unit, atol=1e-10)
 
 
-def test_a_spanning_forest_leaves_the_parts_apart_and_counts_a_pair_once() -> None:
-    i, j = np.array([0, 1, 0, 3, 4, 2, 1]), np.array([1, 2, 2, 4, 3, 0, 0])
-    weight = np.array([1.0, 5.0, 4.0, 1.0, 2.0, 4.0, 1.0])
-    # Of equal links the earlier; of two between the same images, in whichever direction, the heavier.
-    assert spanning_forest(6, i, j, weight).tolist() == [1, 2, 4]
-
-
 def test_a_spanning_forest_of_many_links_is_that_of_kruskal() -> None:
     rng = np.random.default_rng(0)
     count = 60

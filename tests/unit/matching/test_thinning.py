@@ -26,11 +26,3 @@ def test_each_cell_gives_one_before_any_gives_two() -> None:
     # Of each cell the first; then the second of the first one. The point on the border is in the last cell.
     assert spread_choice(points, 9).tolist() == [0, 10, 20, 30, 40, 50, 60, 70, 80]
     assert spread_choice(points, 10).tolist() == [0, 1, 10, 20, 30, 40, 50, 60, 70, 80]
-
-
-def test_whoever_wants_all_gets_all() -> None:
-    points = np.random.default_rng(0).uniform(size=(20, 2))
-    assert spread_choice(points, None).tolist() == list(range(20))
-    assert spread_choice(points, 20).tolist() == list(range(20))
-    assert len(spread_choice(points, 19)) == 19
-    assert spread_choice(np.zeros((5, 2)), 1).tolist() == [0]

@@ -13,12 +13,11 @@ from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import write_image
-from rdstitch.messages import Message, Severity, left_out
+from rdstitch.messages import Message, left_out
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.accept import _is_of_the_whole, _is_simpler, _may_be_another_plane, _without, accept
+from rdstitch.pipeline.accept import _without, accept
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
-from rdstitch.verification.findings import Finding
 from rdstitch.verification.verdict import RefusedError
 from tests.cli.running import flight
 
@@ -27,51 +26,6 @@ OPTIONS = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
 
 def _read(frames: list[Path]) -> list[Source]:
     return read_sources(frames, camera=None, focal=380.0, distortion=None, skip_bad=False)[0]
-
-
-@pytest.mark.parametrize(
-    ("images", "severity", "expected"),
-    [
-        ((0, 1, 2), "failure", True),
-        ((0, 1, 2), "warning", False),
-        ((0, 1), "failure", False),
-        ((0,), "failure", False),
-        ((), "failure", True),
-    ],
-)
-def test_leaving_out_an_image_or_a_pair_mends_what_is_theirs(
-    images: tuple[int, ...], severity: Severity, expected: bool
-) -> None:
-    assert _is_of_the_whole(Finding("errors", images, severity)) is expected
-
-
-@pytest.mark.parametrize(
-    ("finding", "expected"),
-    [
-        (Finding("image misfits", (0,)), False),
-        (Finding("unlike", (0, 1)), False),
-        (Finding("unmasked", (), "warning"), False),
-        (Finding("errors"), True),
-        (Finding("second motion", (0, 1), "warning"), True),
-        (Finding("undecided motion", (0, 1)), True),
-    ],
-)
-def test_another_plane_is_looked_for_where_there_may_be_one(finding: Finding, expected: bool) -> None:
-    assert _may_be_another_plane([finding]) is expected
-
-
-@pytest.mark.parametrize(
-    ("former", "model", "simpler"),
-    [
-        ("tilting", "rigid", True),
-        ("homography", "tilting", True),
-        ("rigid", "rigid", False),
-        ("rigid", "tilting", False),
-        ("tilting", "rotation", False),
-    ],
-)
-def test_motions_in_the_plane_are_compared_by_their_freedom(former: str, model: str, simpler: bool) -> None:
-    assert _is_simpler(model, former) is simpler
 
 
 def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Path) -> None:
@@ -104,24 +58,6 @@ def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest
     assert free.align(()).alignment.poses is None
     assert replace(free, needs_poses=True).align(()).alignment.poses is not None
     assert asked == ["auto", "auto", "pose"]
-
-
-@pytest.mark.parametrize(("rms", "rough"), [(8.9, True), (9.1, False)])
-def test_rough_ground_that_nothing_fits_is_no_ground(monkeypatch: pytest.MonkeyPatch, rms: float, rough: bool) -> None:
-    planes, ground = (_pairs_of_two() for _ in range(2))
-
-    def aligned(aligner: Aligner, pairs: object) -> Any:
-        return SimpleNamespace(rms=1.0 if pairs is planes else rms)
-
-    monkeypatch.setattr(Aligner, "_aligned", aligned)
-    monkeypatch.setattr(Aligner, "_explains", lambda *given: False)
-    monkeypatch.setattr("rdstitch.pipeline.aligner.over_rough_ground", lambda pairs, threshold: ground)
-    found = Aligner.of([], OPTIONS, NO_CACHE).align(planes)
-    assert (found.rough, found.alignment.rms) == (rough, rms if rough else 1.0)
-
-
-def _pairs_of_two() -> list[Any]:
-    return [SimpleNamespace(image1=0, image2=1)]
 
 
 def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path: Path) -> None:

@@ -16,14 +16,6 @@ def _two_pairs() -> Measurements:
     return Measurements.of_pairs(points, [(SMALL, LARGE), (LARGE, SMALL)])
 
 
-@pytest.mark.parametrize(
-    ("count", "length"),
-    [(0, 16), (16, 16), (17, 20), (31, 32), (32, 32), (33, 40), (64, 64), (65, 80), (100, 112), (1000, 1024)],
-)
-def test_padding_has_four_steps_an_octave(count: int, length: int) -> None:
-    assert padded_length(count) == length
-
-
 def test_points_are_in_half_diagonals_of_their_own_image() -> None:
     data = _two_pairs()
     assert data.x1.shape == (2, 2, padded_length(20))
@@ -43,23 +35,6 @@ def test_matches_that_are_left_out_stay_out() -> None:
     assert few.present.sum(axis=1).tolist() == [5, 9]
     # What was left out before is not let in again.
     assert few.only(np.ones_like(few.present)).present.sum(axis=1).tolist() == [5, 9]
-
-
-def test_places_beyond_the_matches_are_padding() -> None:
-    data = _two_pairs()
-    chosen = data.at(np.array([[3, 19, 40], [3, 8, 9]]))
-    assert chosen.present.tolist() == [[True, True, False], [True, True, False]]
-    assert chosen.count.tolist() == [2, 2]
-    np.testing.assert_array_equal(chosen.x1[:, :, 0], data.x1[:, :, 3])
-    np.testing.assert_array_equal(chosen.x2[0, :, 1], data.x2[0, :, 19])
-
-
-def test_some_of_the_pairs() -> None:
-    data = _two_pairs()
-    second = data.take(np.array([False, True]))
-    assert len(second) == 1
-    np.testing.assert_array_equal(second.x2, data.x2[1:])
-    assert (second.px.tolist(), second.px_ratio.tolist(), second.count.tolist()) == ([250.0], [0.5], [9])
 
 
 @pytest.mark.parametrize(

@@ -6,44 +6,13 @@ import pytest
 import rdstitch
 from rdstitch.planar_motion import rigid_in_plane, rotation_from_tilt
 from rdstitch.radial_homography import transfer
-from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
-from rdstitch.robust.pair_models import HomographyPairModel, PlanarPairModel
+from rdstitch.robust.minimal import minimal_solvers
 from tests.correspondences import correspondences
 
 FOCAL = 1.4
 K = np.diag([FOCAL, FOCAL, 1.0])
 TILTS = np.array([[0.1, -0.05], [-0.08, 0.12]])
 DISTORTION = -0.3
-
-
-def _names(solvers: list[MinimalSolver]) -> list[tuple[str, int, bool]]:
-    return [(solver.name, solver.sample_size, solver.fixed_distortion) for solver in solvers]
-
-
-def test_the_solvers_that_what_is_known_allows() -> None:
-    always = [
-        ("three_point_similarity", 3, False),
-        ("four_point", 4, False),
-        ("five_point", 5, False),
-        ("four_point_dlt", 4, False),
-    ]
-    assert _names(minimal_solvers(FOCAL, 0.1, False, None)) == [("three_point", 3, False), *always]
-    assert _names(minimal_solvers(FOCAL, 0.1, True, None)) == [("two_point", 2, False), *always]
-    known = [("two_point_similarity", 2, True), ("four_point_dlt", 4, True)]
-    assert _names(minimal_solvers(FOCAL, 0.1, False, -0.2)) == known
-
-
-def test_solutions_are_refined_in_the_model_that_the_solver_assumes() -> None:
-    for tilts_known in (False, True):
-        models = {s.name: s.model for s in minimal_solvers(FOCAL, 0.1, tilts_known, None)}
-        rigid = PlanarPairModel(FOCAL, 0.1, tilts_known)
-        assert models["four_point"] == rigid
-        assert models["two_point" if tilts_known else "three_point"] == rigid
-        assert models["three_point_similarity"] == PlanarPairModel(FOCAL, 0.1, tilts_known, height_free=True)
-        assert models["five_point"] == HomographyPairModel()
-    fixed = {s.name: s.model for s in minimal_solvers(FOCAL, 0.1, True, 0.0)}
-    assert fixed["two_point_similarity"] == PlanarPairModel(FOCAL, 0.1, True, height_free=True)
-    assert fixed["four_point_dlt"] == HomographyPairModel()
 
 
 @pytest.mark.parametrize("known", [None, DISTORTION])

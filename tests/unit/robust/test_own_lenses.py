@@ -9,9 +9,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.robust import estimate_radial_homography
 from rdstitch.robust.measurements import Measurements
-from rdstitch.robust.own_lenses import _OWN_STD, OwnLenses, own_lenses
-from rdstitch.robust.pair_models import HomographyPairModel
-from rdstitch.robust.refinement import PairProblems
+from rdstitch.robust.own_lenses import OwnLenses, own_lenses
 from tests.correspondences import correspondences
 
 _THRESHOLD = 3.0
@@ -70,17 +68,3 @@ def test_rotation_about_the_axis_does_not_show_the_lens() -> None:
     data = Measurements.from_pixels(points1, points2, lens, lens)
     found = own_lenses([replace(relation, camera=lens, camera2=lens)], data, _THRESHOLD)[0]
     assert np.sqrt(np.diag(found.covariance)).min() > 0.1
-
-
-def test_without_matches_only_the_priors_of_the_lens_count() -> None:
-    """λ of both images, μ and the centre, in their standard deviations, in units of the noise."""
-    points = np.random.default_rng(0).uniform((0, 0), (639, 479), (30, 2))
-    data = Measurements.from_pixels(points, points, Camera((640, 480)), Camera((640, 480)))
-    lens = np.array([-0.3, -0.2, 0.05, 0.01, -0.02])
-    std = np.array([0.5, 0.5, 0.1, 0.03, 0.03])
-    none = data.only(np.zeros_like(data.present))
-    problems = PairProblems(HomographyPairModel(), none, np.array([3.0]), np.array([0.5]), lens_std=_OWN_STD)
-    found = problems.normal_equations(np.concatenate([lens, np.eye(3).ravel() / np.sqrt(3.0)])[None])
-    assert found.cost == pytest.approx(0.25 * np.square(lens / std).sum())
-    np.testing.assert_allclose(found.gradient[0, :5], 0.25 * lens / std**2)
-    np.testing.assert_allclose(found.information[0, :5, :5], 0.25 * np.diag(std**-2.0))

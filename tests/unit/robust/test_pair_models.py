@@ -33,12 +33,6 @@ def test_jacobian_is_the_derivative_of_a_step(model: PairModel) -> None:
         np.testing.assert_allclose(jacobian[:, index], ((ahead - behind) / 2e-6).ravel(), atol=1e-7)
 
 
-def test_free_models_start_at_the_homography_itself() -> None:
-    for model in (PlanarPairModel(1.3, height_free=True), HomographyPairModel()):
-        found = model.homography(model.initialize(H[None]))[0]
-        np.testing.assert_allclose(found / found[2, 2], H / H[2, 2], atol=1e-9)
-
-
 def test_known_tilts_are_kept() -> None:
     r1, r2 = rotation_from_tilt(TILTS[0])
     h = K @ r2 @ rigid_in_plane(0.3, (0.2, 0.1), 0.9) @ r1.T @ np.linalg.inv(K)
@@ -54,16 +48,3 @@ def test_the_prior_pulls_the_focal_length_back() -> None:
     residual, derivative = model.prior(state)
     assert residual == pytest.approx(np.array([[0.5]]))
     np.testing.assert_allclose(derivative, [[0, 0, 0, 0, 0, 5.0]])
-
-
-@pytest.mark.parametrize("model", MODELS, ids=repr)
-def test_a_batch_is_as_each_alone(model: PairModel) -> None:
-    batch = np.stack([H, np.eye(3) + 0.1 * H, np.linalg.inv(H)])
-    tilts = np.concatenate([TILTS, 2.0 * TILTS, -TILTS])
-    states = model.initialize(batch, tilts)
-    for row in range(3):
-        only = slice(row, row + 1)
-        alone = model.initialize(batch[only], tilts[only])
-        np.testing.assert_allclose(states[only], alone, atol=1e-12)
-        np.testing.assert_allclose(model.homography(states)[only], model.homography(alone), atol=1e-12)
-        np.testing.assert_allclose(model.jacobian(states)[only], model.jacobian(alone), atol=1e-12)

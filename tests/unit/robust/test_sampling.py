@@ -51,16 +51,3 @@ def test_same_seed_same_samples_whatever_the_batches_and_the_other_pairs() -> No
 def test_as_many_matches_as_a_sample_needs() -> None:
     picks = _draw(Sampler(3, 10, 0), 3, 4, ordered=True)
     assert np.array_equal(np.sort(picks, axis=1), np.tile([0, 1, 2], (4, 1)))
-
-
-@pytest.mark.parametrize("size", [2, 3, 5])
-def test_the_pool_of_the_best_grows_by_the_root_of_the_sample_size(size: int) -> None:
-    """All but a share (n / N)^k of the samples come when the pool is larger than n (Chum and Matas)."""
-    growth, count = 1000, 100
-    for start in (0, 100, 400, 900):
-        pool = int(np.ceil(count * ((start + 1) / growth) ** (1.0 / size)))
-        last = [_draw(Sampler(size, growth, seed), count, 1, start=start, ordered=True).max() for seed in range(80)]
-        assert max(last) < max(pool, size)
-        assert max(last) >= 0.7 * pool - 1
-    late = [_draw(Sampler(size, growth, seed), count, 1, start=growth, ordered=True).max() for seed in range(80)]
-    assert max(late) > 90

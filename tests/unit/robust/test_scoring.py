@@ -27,15 +27,6 @@ def test_errors_are_pixels_of_the_second_image() -> None:
     np.testing.assert_allclose(errors[:, :40], 0.25, rtol=1e-9)
 
 
-@pytest.mark.parametrize("distortion", [-0.3, 0.0, 0.4])
-def test_errors_are_those_of_the_transfer(distortion: float) -> None:
-    data = _measurements()
-    found = transfer_errors2(H[None], np.array([distortion]), np.zeros(1, dtype=np.intp), data)[0, :40]
-    moved = transfer(H, distortion, data.x1[0, :, :40].T)
-    expected = (((moved - data.x2[0, :, :40].T) * CAMERAS[1].scale) ** 2).sum(axis=1)
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
-
-
 def test_there_is_no_error_behind_the_camera_nor_beyond_the_lens() -> None:
     data = _measurements()
     pair = np.zeros(2, dtype=np.intp)
@@ -45,17 +36,6 @@ def test_there_is_no_error_behind_the_camera_nor_beyond_the_lens() -> None:
     far = np.linalg.norm(4.0 * data.x1[0, :, :40], axis=0) / (1.0 + 0.9 * data.radius2[0, :40])
     np.testing.assert_array_equal(np.isinf(beyond[:40]), 1.0 - 3.6 * far**2 < 0.0)
     assert 0 < np.isinf(beyond[:40]).sum() < 40
-
-
-def test_costs_are_means_of_truncated_squares() -> None:
-    data = _measurements()
-    pair = np.zeros(1, dtype=np.intp)
-    moved = H.copy()
-    moved[0, 2] += 0.004
-    errors2 = transfer_errors2(moved[None], np.array([-0.2]), pair, data)[0, :40]
-    for threshold in (0.5, 1.0, 3.0):
-        cost = truncated_costs(moved[None], np.array([-0.2]), pair, data, threshold)
-        assert cost == pytest.approx(np.minimum(errors2 / threshold**2, 1.0).mean(), rel=1e-9)
 
 
 def test_padding_costs_nothing() -> None:

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import binom
 
 from rdstitch.arrays import FloatArray
-from rdstitch.robust.verification import MIN_PLACES, numbered_cells, places, rejection_reason
+from rdstitch.robust.verification import MIN_PLACES, places, rejection_reason
 
 SIZE = (1000, 800)
 CELL = np.hypot(*SIZE) / 32
@@ -58,11 +58,3 @@ def test_places_are_those_of_the_image_with_fewer() -> None:
     assert places(_apart(30), _apart(30), SIZE) == 30
     assert places(_apart(30), np.full((30, 2), 7.0), SIZE) == 1
     assert places(_apart(30)[:0], _apart(30)[:0], SIZE) == 0
-
-
-def test_cells_have_numbers_of_their_own() -> None:
-    rng = np.random.default_rng(0)
-    cells = np.unique(rng.integers(-400_000, 400_000, (5000, 2)), axis=0)
-    cells = np.vstack([cells, np.unique(rng.integers(-4, 4, (100, 2)), axis=0)])
-    cells = np.unique(cells, axis=0)
-    assert len(np.unique(numbered_cells(np.asarray(cells + 0.3, dtype=np.float64)))) == len(cells)

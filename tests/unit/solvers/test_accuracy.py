@@ -33,8 +33,6 @@ ROTATIONS: dict[str, dict[str, Any]] = {
     "pincushion": {"distortion": (0.0, 0.3)},
 }
 
-kinds = pytest.mark.parametrize("kind", KINDS)
-
 
 def tilts(instances: PlanarInstances) -> FloatArray:
     """What a solver of known tilt is told."""
@@ -50,29 +48,25 @@ def check(instances: Instances, solutions: Solutions, found: float, median: floa
     assert (h_error[error < 1e-9] < 1e-5).all()
 
 
-@kinds
-@pytest.mark.parametrize("separate", [False, True])
-def test_two_point(kind: str, separate: bool) -> None:
-    instances = planar_instances(COUNT, 2, seed=SEED, separate_tilts=separate, **KINDS[kind])
-    check(instances, solvers.two_point(instances.x1, instances.x2, tilts(instances)), 0.9995, 1e-13)
+PLANAR: dict[str, tuple[int, Callable[..., Solutions], bool, float, dict[str, Any]]] = {
+    "two_point": (2, solvers.two_point, True, 0.9995, {}),
+    "two_point of two tilts": (2, solvers.two_point, True, 0.9995, {"separate_tilts": True}),
+    "three_point": (3, solvers.three_point, False, 0.97, {}),
+    "similarity": (
+        3, solvers.three_point_similarity, True, 0.999, {"height": (0.75, 1.3), "separate_tilts": True},
+    ),
+    "four_point": (4, solvers.four_point, False, 0.999, {}),
+}  # fmt: skip
+"""Points, solver, whether it needs the tilt, the fraction of instances that it solves, and what instances it is for."""
 
 
-@kinds
-def test_three_point(kind: str) -> None:
-    instances = planar_instances(COUNT, 3, seed=SEED, **KINDS[kind])
-    check(instances, solvers.three_point(instances.x1, instances.x2), 0.97)
-
-
-@kinds
-def test_three_point_similarity(kind: str) -> None:
-    instances = planar_instances(COUNT, 3, seed=SEED, height=(0.75, 1.3), separate_tilts=True, **KINDS[kind])
-    check(instances, solvers.three_point_similarity(instances.x1, instances.x2, tilts(instances)), 0.999)
-
-
-@kinds
-def test_four_point(kind: str) -> None:
-    instances = planar_instances(COUNT, 4, seed=SEED, **KINDS[kind])
-    check(instances, solvers.four_point(instances.x1, instances.x2), 0.999)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", PLANAR)
+def test_planar_motion(name: str, kind: str) -> None:
+    count, solver, by_tilt, least, motion = PLANAR[name]
+    instances = planar_instances(COUNT, count, seed=SEED, **motion, **KINDS[kind])
+    known = (tilts(instances),) if by_tilt else ()
+    check(instances, solver(instances.x1, instances.x2, *known), least, 1e-13 if count == 2 else 1e-12)
 
 
 @pytest.mark.parametrize("solver", [solvers.five_point, solvers.five_point_qep])
@@ -111,12 +105,11 @@ def test_rotation(kind: str) -> None:
 
 def test_rotations_are_rotations_whatever_the_noise() -> None:
     noisy = rotation_instances(500, 3, seed=SEED, noise=3e-3)
-    for found, focal in (
-        (solvers.rotation_two_point(noisy.x1[:, :2], noisy.x2[:, :2]), None),
-        (solvers.rotation_three_point(noisy.x1, noisy.x2), "found"),
+    for found in (
+        solvers.rotation_two_point(noisy.x1[:, :2], noisy.x2[:, :2]),
+        solvers.rotation_three_point(noisy.x1, noisy.x2),
     ):
-        length = np.ones(len(found)) if focal is None else found.focal
-        assert length is not None
+        length = np.ones(len(found)) if found.focal is None else found.focal
         k = np.stack([length, length, np.ones(len(found))], axis=-1)
         rotation = found.homography * (k[:, None, :] / k[:, :, None])
         products = rotation @ np.swapaxes(rotation, 1, 2)

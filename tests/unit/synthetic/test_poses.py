@@ -17,7 +17,6 @@ from rdstitch.synthetic import (
     pair_poses,
     repeated,
     sequence_over,
-    survey_poses,
 )
 
 LENS = Camera((320, 240), -0.25, focal=260.0)
@@ -62,15 +61,6 @@ def test_motion_between_poses_is_the_homography_between_images() -> None:
         poses.shaken(seed=1, tilt=0.1).motion(0, 1)
 
 
-def test_a_turn_ends_at_its_angle_and_a_line_is_straight() -> None:
-    line, turn = (drive_poses(LENS, path, 41, heading=0.3) for path in ("line", "turn"))
-    steps = np.diff(line.position, axis=0)
-    np.testing.assert_allclose(np.arctan2(steps[:, 1], steps[:, 0]), 0.3, atol=1e-12)
-    assert turn.yaw[0] - turn.yaw[-1] == pytest.approx(np.pi / 2)
-    end = np.diff(turn.position[-2:], axis=0)[0]
-    assert np.arctan2(end[1], end[0]) == pytest.approx(np.pi / 2 + 0.3)
-
-
 def test_parking_ends_parallel_and_aside() -> None:
     poses = drive_poses(LENS, "parking", 101)
     assert poses.yaw[-1] == pytest.approx(poses.yaw[0])
@@ -78,16 +68,6 @@ def test_parking_ends_parallel_and_aside() -> None:
     step = np.linalg.norm(np.diff(poses.position[:2], axis=0))
     assert abs(poses.position[-1, 1]) > 5.0 * step
     assert (np.diff(poses.position[:, 0]) < 0.0).sum() == 50
-
-
-@pytest.mark.parametrize("count", [117, 158])
-def test_a_survey_covers_a_field_with_neighbours(count: int) -> None:
-    poses = survey_poses(LENS, count, attitude_jitter=0.02, seed=3)
-    assert len(poses) == count
-    extent = np.ptp(poses.position, axis=0)
-    assert 0.5 < extent[0] / extent[1] < 2.0
-    assert (np.abs(poses.height / poses.height.mean() - 1.0) < 0.07).all()
-    assert np.ptp(poses.tilt, axis=0).max() <= 0.04
 
 
 def test_endless_ground_is_the_same_wherever_it_is_cut() -> None:

@@ -48,35 +48,6 @@ def test_a_ray_ends_where_it_first_meets_the_ground(kind: str) -> None:
     assert np.linalg.norm(found - feet, axis=1).max() > 3.0
 
 
-@pytest.mark.parametrize("kind", sorted(RELIEFS))
-def test_relief_has_the_requested_height_and_follows_its_seed(kind: str) -> None:
-    made = RELIEFS[kind]((700, 500), 3, height=26.0)
-    assert made.height.shape == (500, 700)
-    assert made.height.min() == pytest.approx(0.0, abs=0.2)
-    assert made.height.max() == pytest.approx(26.0, abs=0.2)
-    assert made.height.std() > 2.0
-    np.testing.assert_array_equal(made.height, RELIEFS[kind]((700, 500), 3, height=26.0).height)
-    assert (made.height != RELIEFS[kind]((700, 500), 4, height=26.0).height).any()
-
-
-def test_truth_of_the_plane_does_not_know_of_relief() -> None:
-    rough = over("bumps", 0.1)
-    flat = Sequence(rough.texture, rough.lens, rough.poses)
-    points = np.random.default_rng(3).uniform((0, 0), (319, 239), (50, 2))
-    np.testing.assert_array_equal(rough.to_plane(0, points), flat.to_plane(0, points))
-    np.testing.assert_array_equal(flat.to_ground(0, points), flat.to_plane(0, points))
-    np.testing.assert_allclose(rough.to_image(0, rough.to_plane(0, points)), points, atol=1e-6)
-
-
-def test_heights_of_zero_are_a_plane() -> None:
-    rough = over("bumps", 0.1)
-    width, height = rough.texture.size
-    level = Sequence(rough.texture, rough.lens, rough.poses, relief=Relief(np.zeros((height, width), np.float32)))
-    flat = Sequence(rough.texture, rough.lens, rough.poses)
-    np.testing.assert_array_equal(level.frame(1), flat.frame(1))
-    assert (np.abs(rough.frame(1).astype(int) - flat.frame(1)) > 20).mean() > 0.1
-
-
 def test_a_wall_hides_what_is_behind_it_from_one_side_only() -> None:
     heights = np.zeros((400, 600), dtype=np.float32)
     heights[:, 280:300] = 60.0

@@ -1,17 +1,13 @@
 """Which overlaps are compared, and how many agree."""
 
-import math
-
 import numpy as np
-import pytest
 
 from rdstitch.alignment.motion_models.rotation import rotation_from_vector
 from rdstitch.alignment.result import LinkFit
 from rdstitch.camera import Camera
 from rdstitch.verification import overlap_check
-from rdstitch.verification.overlap_check import CheckedLink, _least_confirmed, share_alike
-from rdstitch.verification.photometric_agreement import Agreement, ComparedImage
-from rdstitch.verification.self_similarity import Ambiguity
+from rdstitch.verification.overlap_check import _least_confirmed
+from rdstitch.verification.photometric_agreement import ComparedImage
 
 
 def _fit(i: int, j: int, inliers: int = 50) -> LinkFit:
@@ -34,15 +30,6 @@ def test_of_many_those_with_the_fewest_triangles_and_matches_are_compared() -> N
     chosen = _least_confirmed([*weak, *chain])
     assert {fit for fit in weak if fit.inliers == 10} <= set(chosen)
     assert chosen == [fit for fit in [*weak, *chain] if fit in chosen]
-
-
-def test_the_share_alike_is_that_of_all_cells() -> None:
-    def checked(cells: int, confirming: int) -> CheckedLink:
-        return CheckedLink(_fit(0, 1), Agreement(cells, confirming), Ambiguity(1.0, 0.0, 0.0))
-
-    assert share_alike([checked(100, 90), checked(20, 0)]) == pytest.approx(0.75)
-    assert math.isnan(share_alike([checked(0, 0)]))
-    assert math.isnan(share_alike([]))
 
 
 def test_a_turn_is_compared_between_the_two_images() -> None:

@@ -54,34 +54,10 @@ def _checked(cells: int, share: float, pair: tuple[int, int] = (0, 1), *, unique
     return SimpleNamespace(agreement=link.agreement, pair=link.pair, unique=unique)
 
 
-@pytest.mark.parametrize(("cells", "share", "said"), [(1000, 0.149, 1), (1000, 0.15, 0), (1000, 0.5, 0), (2, 0.0, 0)])
-def test_overlaps_that_look_little_alike(cells: int, share: float, said: int) -> None:
-    found: Any = SimpleNamespace(seen=[_checked(cells, share)])
-    assert _kinds(rules._little_alike(found)) == ["little alike"] * said
-
-
-@pytest.mark.parametrize(("ambiguous", "checked", "kinds"), [(2, 5, []), (3, 5, ["pattern"]), (1, 2, ["pattern"])])
-def test_a_pattern_over_many_pairs(ambiguous: int, checked: int, kinds: list[str]) -> None:
-    shifted = SimpleNamespace(ambiguity=SimpleNamespace(shift=7.0))
-    found: Any = SimpleNamespace(
-        ambiguous={(k, k + 1): shifted for k in range(ambiguous)}, checked=[None] * checked, seen=[_checked(9, 1.0)]
-    )
-    assert _kinds(rules._pattern(found)) == kinds
-    (first, *_) = rules._ambiguous(found)
-    assert (first.kind, first.images, first.values) == ("ambiguous", (0, 1), {"shift": 7.0})
-
-
 def test_of_pairs_that_unique_places_decided_the_least_alike_is_named() -> None:
     seen = [_checked(100, 0.5, unique=True), _checked(100, 0.3, (1, 2), unique=True), _checked(100, 0.1, (2, 3))]
     (finding,) = rules._pattern(SimpleNamespace(ambiguous={}, checked=seen, seen=seen))  # type: ignore[arg-type]
     assert (finding.kind, finding.images) == ("settled pattern", (1, 2))
-
-
-@pytest.mark.parametrize(("used", "mixed", "said"), [(1, True, 0), (2, True, 1), (3, True, 0), (2, False, 0)])
-def test_two_images_left_of_one_lens(used: int, mixed: bool, said: int) -> None:
-    registration = SimpleNamespace(mixed=SimpleNamespace() if mixed else None)
-    found: Any = SimpleNamespace(alignment=SimpleNamespace(used=np.arange(4) < used), registration=registration)
-    assert [finding.images for finding in rules._two_left(found)] == [(0, 1)] * said
 
 
 @pytest.mark.parametrize("certain", [True, False])
