@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import binom
 
 from rdstitch.arrays import FloatArray
-from rdstitch.robust.verification import MIN_PLACES, numbered_cells, places, rejection_reason
+from rdstitch.robust.verification import MIN_PLACES, binomial_tail, numbered_cells, places, rejection_reason
 
 SIZE = (1000, 800)
 CELL = np.hypot(*SIZE) / 32
@@ -66,3 +66,12 @@ def test_cells_have_numbers_of_their_own() -> None:
     cells = np.vstack([cells, np.unique(rng.integers(-4, 4, (100, 2)), axis=0)])
     cells = np.unique(cells, axis=0)
     assert len(np.unique(numbered_cells(np.asarray(cells + 0.3, dtype=np.float64)))) == len(cells)
+
+
+@pytest.mark.parametrize(
+    ("least", "trials", "probability"), [(0, 5, 0.3), (3, 3, 0.2), (40, 4000, 0.011), (2500, 4000, 0.6)]
+)
+def test_the_tail_is_that_of_the_binomial_distribution(least: int, trials: int, probability: float) -> None:
+    assert binomial_tail(least, trials, probability) == pytest.approx(
+        binom.sf(least - 1, trials, probability), rel=1e-9
+    )
