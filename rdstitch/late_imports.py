@@ -12,16 +12,16 @@ class _Late(ModuleType):
 
 if TYPE_CHECKING:
     import tifffile
-    from scipy import fft, linalg, ndimage, sparse, spatial, special
+    from scipy import fft, ndimage, sparse, spatial
     from scipy.sparse import csgraph
     from scipy.sparse import linalg as sparse_linalg
 else:
-    fft, linalg, ndimage, sparse, spatial, special, csgraph, sparse_linalg, tifffile = map(
+    fft, ndimage, sparse, spatial, csgraph, sparse_linalg, tifffile = map(
         _Late,
         (
-            *("scipy.fft", "scipy.linalg", "scipy.ndimage", "scipy.sparse", "scipy.spatial", "scipy.special"),
+            *("scipy.fft", "scipy.ndimage", "scipy.sparse", "scipy.spatial"),
             *("scipy.sparse.csgraph", "scipy.sparse.linalg", "tifffile"),
         ),
     )
 
-__all__ = ["csgraph", "fft", "linalg", "ndimage", "sparse", "sparse_linalg", "spatial", "special", "tifffile"]
+__all__ = ["csgraph", "fft", "ndimage", "sparse", "sparse_linalg", "spatial", "tifffile"]

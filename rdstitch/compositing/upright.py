@@ -12,13 +12,14 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Literal, Self
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
-from rdstitch.late_imports import linalg, special
 from rdstitch.planar_motion import nearest_rotation
+from rdstitch.robust.verification import binomial_tail
 
 Segment = tuple[float, float, float, float]
 Corners = tuple[float, float, float, float, float, float, float, float]
@@ -131,8 +132,7 @@ def to_axes(frame: FloatArray, focal: float) -> FloatArray:
 
 def rotation(vector: ArrayLike) -> FloatArray:
     """Rotation (3, 3) about an axis (3,), by its length in radians."""
-    matrix: FloatArray = linalg.expm(np.cross(np.asarray(vector, dtype=np.float64), np.eye(3)).T)
-    return matrix
+    return np.asarray(cv2.Rodrigues(np.asarray(vector, dtype=np.float64))[0], dtype=np.float64)
 
 
 def of_rectangle(corners: FloatArray, focal: Focal, pixel: float) -> tuple[Upright, float, float]:
@@ -315,7 +315,7 @@ def _false_alarms(own: BoolArray, fitting: BoolArray) -> float:
     Edges come in pairs, one on each side of a line; only half of them count.
     """
     count, fit = int(own.sum()) // 2, int((own & fitting).sum()) // 2
-    return float(count**2 / 2.0 * special.bdtrc(fit - 1, count, _TOLERANCE / (np.pi / 4))) if fit else math.inf
+    return float(count**2 / 2.0 * binomial_tail(fit, count, _TOLERANCE / (np.pi / 4))) if fit else math.inf
 
 
 def _best_axes(edges: Edges, start: FloatArray, focal: float, *, depth: bool) -> tuple[FloatArray, float]:

@@ -1,10 +1,11 @@
 """Whether agreement is more than chance."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.late_imports import special
 
 _CELLS_PER_DIAGONAL = 32
 _CELL_STRIDE = 2.0**20
@@ -34,6 +35,18 @@ def numbered_cells(points: FloatArray) -> FloatArray:
     return numbers
 
 
+def binomial_tail(least: int, trials: int, probability: float) -> float:
+    """Probability that ``least`` or more of independent events happen, each with a probability in (0, 1)."""
+    if least <= 0:
+        return 1.0
+    first = math.lgamma(trials + 1) - math.lgamma(least + 1) - math.lgamma(trials - least + 1)
+    first += least * math.log(probability) + (trials - least) * math.log1p(-probability)
+    happened = np.arange(least, trials)
+    odds = probability / (1.0 - probability)
+    ratios = (trials - happened) / (happened + 1.0) * odds  # of each term to the one before
+    return math.exp(first) + float(np.exp(first + np.cumsum(np.log(ratios))).sum())
+
+
 def rejection_reason(
     points1: FloatArray, points2: FloatArray, inliers: NDArray[np.bool_], image_size: tuple[int, int], threshold: float
 ) -> str | None:
@@ -61,6 +74,6 @@ def rejection_reason(
         return f"{count} of {len(inliers)} matches agree, but they lie in {cells} places of the image only"
     by_chance = min(0.5, np.pi * threshold**2 / (image_size[0] * image_size[1]) + 0.01)
     trials = len(inliers) - 4
-    if trials > 0 and special.betainc(max(1, count - 4), trials - count + 5, by_chance) > _MAX_CHANCE:
+    if trials > 0 and binomial_tail(count - 4, trials, by_chance) > _MAX_CHANCE:
         return f"{count} of {len(inliers)} matches agree, no more than chance allows"
     return None

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import binom
 
 from rdstitch.arrays import FloatArray
-from rdstitch.robust.verification import MIN_PLACES, places, rejection_reason
+from rdstitch.robust.verification import MIN_PLACES, binomial_tail, places, rejection_reason
 
 SIZE = (1000, 800)
 CELL = np.hypot(*SIZE) / 32
@@ -58,3 +58,12 @@ def test_places_are_those_of_the_image_with_fewer() -> None:
     assert places(_apart(30), _apart(30), SIZE) == 30
     assert places(_apart(30), np.full((30, 2), 7.0), SIZE) == 1
     assert places(_apart(30)[:0], _apart(30)[:0], SIZE) == 0
+
+
+@pytest.mark.parametrize(
+    ("least", "trials", "probability"), [(0, 5, 0.3), (3, 3, 0.2), (40, 4000, 0.011), (2500, 4000, 0.6)]
+)
+def test_the_tail_is_that_of_the_binomial_distribution(least: int, trials: int, probability: float) -> None:
+    assert binomial_tail(least, trials, probability) == pytest.approx(
+        binom.sf(least - 1, trials, probability), rel=1e-9
+    )
