@@ -16,8 +16,8 @@ _TABLE = """
     (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS), camchain.yaml (Kalibr), .xml (lensfun).
 * --overwrite: Replace existing output files.
 * --images INPUT: Images to compose: what 'rdstitch mosaic' takes; may be given several times.
-* --preview: A quick draft of at most 1200 pixels: few features of reduced images, straight seams; options that are given
-    take precedence.
+* --preview: A quick draft of at most 1200 pixels: few features of reduced images, straight seams; options given take
+    precedence.
 * --reference NAME: Reference image; otherwise the best connected one.
 * --camera FILE: Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is not
     estimated.
@@ -77,7 +77,7 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 --features: Feature detector and descriptor.
 --aliked-model FILE: ONNX file of the network of --features aliked.
 --lightglue-model FILE: LightGlue network (ONNX) for these features.
---max-features N: Largest number of features of an image.  [default: 2000; of fewer than 8 images 16000 together, at most
+--max-features N: Most features of an image.  [default: 2000; of fewer than 8 images 16000 together, at most
     4000 each]
 --work-megapixels MP: Images are halved until they have no more megapixels before features are detected, once less where
     that shows too few; 0 is full size.  [default: 0.6; of fewer than 8 images 4.8 together, at most 2.4 each]
