@@ -165,11 +165,11 @@ class StitchOptions:
         if self.lens not in ("auto", *LENSES):
             raise ArgumentError(f"unknown lens {self.lens!r}; choose one of auto, {', '.join(LENSES)}")
         if self.lens != "auto" and self.known_distortion is not None:
-            raise ArgumentError("with a known lens there is none to choose; leave out lens, or the known one")
+            raise ArgumentError("the lens is known: leave out lens, or the known lens")
         if self.solver == "two_point" and self.tilt is None and (self.attitude is None or self.attitude_std > 0.0):
             raise ArgumentError("the two_point solver needs the tilt, or exact attitudes")
         if self.solver != "auto" and self.known_distortion is not None:
-            raise ArgumentError("with a known λ there is no solver to choose")
+            raise ArgumentError("with a known λ no solver can be chosen")
         if self.distortion is not None and not -1.0 < self.distortion < 1.0:
             raise ArgumentError(f"λ must lie between -1 and 1, not {self.distortion}")
         if self.focal is not None and not 0.0 < self.focal < float("inf"):

@@ -100,7 +100,7 @@ def _angles(text: str) -> tuple[float, float]:
     except ValueError:
         raise ValueError("is not two angles in degrees like 2.5,-1") from None
     if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
-        raise ValueError("is no tilt, which lies between -90 and 90 degrees")
+        raise ValueError("is not a tilt between -90 and 90 degrees")
     return psi, theta
 
 
@@ -111,7 +111,7 @@ def _angle(text: str) -> float:
     except ValueError:
         angle = math.nan
     if not 0.0 <= angle < math.inf:
-        raise ValueError("is no angle in degrees like 0.5")
+        raise ValueError("is not an angle in degrees such as 0.5")
     return angle
 
 
@@ -120,7 +120,7 @@ def _bytes(text: str) -> int:
     parts = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(?:i?B)?\s*", text, re.IGNORECASE)
     amount = int(float(parts[1]) * 2 ** (10 * " KMGT".index(parts[2].upper() or " "))) if parts else 0
     if amount < 1:
-        raise ValueError("is no amount of memory like 800M or 2G")
+        raise ValueError("is not an amount of memory such as 800M or 2G")
     return amount
 
 

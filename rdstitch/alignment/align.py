@@ -174,11 +174,11 @@ def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentO
         raise RegistrationError("nothing to align: no two images overlap")
     pairs = [(min(k.image1, k.image2), max(k.image1, k.image2)) for k in links]
     if min(pairs)[0] < 0 or max(high for _, high in pairs) >= len(cameras):
-        raise ArgumentError(f"a link names an image that is none of the {len(cameras)}")
+        raise ArgumentError(f"a link names an image outside of the {len(cameras)}")
     if len(set(pairs)) != len(pairs):
         raise ArgumentError("two links are between the same images")
     if options.reference is not None and not 0 <= options.reference < len(cameras):
-        raise ArgumentError(f"the reference image {options.reference} is none of the {len(cameras)}")
+        raise ArgumentError(f"the reference image {options.reference} is not among the {len(cameras)}")
 
 
 def _trust(observations: Observations, confirmed: IntArray) -> FloatArray:

@@ -171,14 +171,14 @@ def _expand(
                 yield Frame(path), True
         elif is_bag(path):
             if frames_folder is None:
-                raise InputError(f"{path}: a ROS bag is no image here; use 'rdstitch mosaic'")
+                raise InputError(f"{path}: a ROS bag is not accepted here; use 'rdstitch mosaic'")
             containers += path.iterdir() if path.is_dir() else [path]
             yield _Clip(path, frames_folder), True
         elif path.is_dir():
             yield from ((Frame(found), False) for found in _in_folder(path, notes))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             if frames_folder is None:
-                raise InputError(f"{path}: a video is no image here; use 'rdstitch mosaic' or extract its frames")
+                raise InputError(f"{path}: a video is not accepted here; use 'rdstitch mosaic' or extract its frames")
             containers.append(path)
             yield _Clip(path, frames_folder), True
         else:
@@ -288,7 +288,7 @@ def _elsewhere(others: Sequence[Path]) -> str:
 
 def _matching(pattern: str) -> list[Path]:
     if len(pattern) > _MAX_PATTERN:
-        raise InputError(f"{pattern[:40]}…: a pattern of {len(pattern)} characters is none")
+        raise InputError(f"{pattern[:40]}…: a pattern of {len(pattern)} characters is too long")
     matching = map(Path, glob.glob(pattern))  # noqa: PTH207 - a pattern may be absolute
     found = [path for path in matching if path.is_file()]
     if not found:

@@ -194,4 +194,4 @@ def _factory(file: Path, stream: BinaryIO) -> Callable[[IO[bytes], str], ImageFi
         return avif_factory(file) if beginning[8:12] in (b"avif", b"avis") else heif_factory(file)
     if file.suffix.lower() == ".tga":  # has no magic
         return TgaImagePlugin.TgaImageFile
-    raise InputError(f"{file}: is no image in a format that is read here: {_NAMES}")
+    raise InputError(f"{file}: not an image in a supported format: {_NAMES}")

@@ -199,7 +199,9 @@ def _without(registration: Registration, offenders: Offenders, aligner: Aligner)
         reasons |= {k: message for k in images if not used[k]}
     for image, others in held.items():
         named_others = ", ".join(names_of(aligner.paths[k] for k in sorted(others)))
-        reasons.setdefault(image, Message(f"hangs on {named_others}, which was left out; add images around it"))
+        reasons.setdefault(
+            image, Message(f"connected only through {named_others}, which was left out; add images around it")
+        )
     return _aligned_anew(registration, aligned, aligner.paths, reasons)
 
 

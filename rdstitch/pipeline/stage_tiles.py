@@ -167,7 +167,7 @@ def _plane(sources: Sequence[Source], channel: int | None, index: int) -> NDArra
     if channel is None:
         return mean_of_channels(pixels.astype(np.float32)) if pixels.shape[2] <= 4 else pixels.mean(axis=2)
     if channel >= pixels.shape[2]:
-        raise ArgumentError(f"{sources[index].path}: has {pixels.shape[2]} channels, of which {channel} is none")
+        raise ArgumentError(f"{sources[index].path}: has {pixels.shape[2]} channels, none with the number {channel}")
     return np.ascontiguousarray(pixels[..., channel])
 
 

@@ -68,7 +68,7 @@ class Poses:
     def motion(self, first: int, second: int) -> PlanarMotion:
         """Planar motion between two images of the same tilt."""
         if not np.array_equal(self.tilt[first], self.tilt[second]):
-            raise ArgumentError(f"images {first} and {second} have different tilts: that is no planar motion")
+            raise ArgumentError(f"images {first} and {second} have different tilts: that is not planar motion")
         c, s = np.cos(self.yaw[first]), np.sin(self.yaw[first])
         shift = np.array([[c, -s], [s, c]]) @ (self.position[second] - self.position[first])
         tx, ty = shift / self.height[first]

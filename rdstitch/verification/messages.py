@@ -72,7 +72,7 @@ TEXTS = {
     ),
     "two of one lens": (
         "mixed-lenses",
-        "{both} fit without the images of another lens, as any two do; if all are of one lens, the scene is no plane, "
+        "{both} fit without the images of another lens, as any two do; if all are of one lens, the scene is not flat, "
         "and these are off in the whole; add images of this lens",
     ),
     "several cameras": (

@@ -294,7 +294,7 @@ def test_mistakes_of_the_caller() -> None:
         align(given.cameras, [])
     with pytest.raises(ArgumentError, match="same images"):
         align(given.cameras, [given.links[0], given.links[0]])
-    with pytest.raises(ArgumentError, match="none of the 1"):
+    with pytest.raises(ArgumentError, match="outside of the 1"):
         align(given.cameras[:1], given.links)
     with pytest.raises(ArgumentError, match="model must be"):
         AlignmentOptions(model="affine")

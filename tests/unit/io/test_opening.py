@@ -38,7 +38,7 @@ def test_only_the_documented_formats_are_opened(
 
     monkeypatch.setattr("subprocess.Popen", started)
     (tmp_path / "a.jpg").write_bytes(content)
-    with pytest.raises(InputError, match=r"a\.jpg: (is no image in a format|not an image)"):
+    with pytest.raises(InputError, match=r"a\.jpg: not an image"):
         function(tmp_path / "a.jpg")  # type: ignore[operator]
 
 
