@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.io.read import read_image
+from rdstitch.io.tiff import write_cropped_tiff
 from tests.cli.running import CACHED, Run
 
 
