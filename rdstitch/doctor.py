@@ -1,8 +1,8 @@
-"""What a run will meet: a look at each image, and a dry run on small versions of them."""
+"""What a run will meet: a look at each image, and the plan of a mosaic of small versions of them."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import cv2
@@ -78,36 +78,31 @@ class Examination:
 
     def as_text(self) -> str:
         """For people, one line for each thing, advice at the end."""
+
+        def few(names: tuple[str, ...], what: str, none: str) -> str:
+            return f"{len(names)} {what}: {shortened(names)}" if names else none
+
         overlap = "none found" if self.overlap is None else f"about {self.overlap:.0%} with the best partner"
         effort = "no mosaic is to be expected"
         if (plan := self.plan) is not None:
             effort = "{} x {} pixels; about {} of memory and {} to composite them".format(
                 *plan.canvas_size, bytes_in_words(plan.memory_bytes), seconds_in_words(plan.seconds)
             )
+        burnt = few(self.burnt, "burnt out", "nothing burnt out")
         lines = [
             ("images", f"{self.images}" + (f", and {len(self.unreadable)} unreadable" if self.unreadable else "")),
-            ("sizes", _counted(self.sizes)),
-            ("cameras", _counted(self.cameras)),
-            ("focal", self.focal),
-            ("sharpness", _few(self.blurred, "blurred", "nothing blurred")),
-            (
-                "exposure",
-                f"{_few(self.dark, 'dark', 'nothing dark')}; {_few(self.burnt, 'burnt out', 'nothing burnt out')}",
+            *(
+                (name, "; ".join(f"{item} ({count})" for item, count in items))
+                for name, items in (("sizes", self.sizes), ("cameras", self.cameras))
             ),
-            ("overlap", f"{overlap}; {_few(self.alone, 'without a place', 'every image has a place')}"),
+            ("focal", self.focal),
+            ("sharpness", few(self.blurred, "blurred", "nothing blurred")),
+            ("exposure", f"{few(self.dark, 'dark', 'nothing dark')}; {burnt}"),
+            ("overlap", f"{overlap}; {few(self.alone, 'without a place', 'every image has a place')}"),
             ("mosaic", effort),
             *(("advice", item) for item in self.advice or ["none: go ahead"]),
         ]
         return "".join(f"{name + ':':<12}{text}\n" for name, text in lines)
-
-
-def _counted(items: tuple[tuple[str, int], ...]) -> str:
-    return "; ".join(f"{name} ({count})" for name, count in items) or "none"
-
-
-def _few(names: tuple[str, ...], what: str, none: str) -> str:
-    """The first names of a list, and how many there are."""
-    return f"{len(names)} {what}: {shortened(names)}" if names else none
 
 
 def examine(
@@ -138,22 +133,60 @@ def examine(
     InputError
         When an input names nothing, or nothing can be read.
     """
-    with found_images(as_inputs(inputs, channel_order), every=every, topic=topic) as found:
-        sources, unread = read_sources(found.frames, skip_bad=True)
+    with found_images(as_inputs(inputs, channel_order), every=every, topic=topic) as listed:
+        sources, unread = read_sources(listed.frames, skip_bad=True)
         unreadable = [f"{message.images[0]}: {message.text}" for message in unread]
         looks: dict[int, tuple[float, float, float]] = {}
         for index, source in enumerate(sources):
+            reduction = max(1, round(np.sqrt(np.prod(source.camera.image_size) / (_MEGAPIXELS * 1e6))))
             try:
-                looks[index] = _look(
-                    source.read(max(1, round(np.sqrt(np.prod(source.camera.image_size) / (_MEGAPIXELS * 1e6)))))
-                )
+                looks[index] = _look(source.read(reduction))
             except InputError as error:
                 unreadable.append(str(error))
             progress("examining", index + 1, len(sources))
         if not looks:
             raise InputError(unreadable[0] if unreadable else "there is nothing to examine")
-        plan, registration, problems = _dry_run(found.frames, progress) if len(looks) > 1 else (None, None, ())
-    return _conclude([sources[k] for k in looks], np.array([*looks.values()]), unreadable, plan, registration, problems)
+        plan, registration, problems = _dry_run(listed.frames, progress) if len(looks) > 1 else (None, None, ())
+    chosen, (sharpness, brightness, burnt) = [sources[k] for k in looks], np.array([*looks.values()]).T
+
+    def named(which: Iterable[Any]) -> tuple[str, ...]:
+        return tuple(source.name for source, is_one in zip(chosen, which, strict=True) if is_one)
+
+    alone, overlap = named([True] * len(chosen)), None
+    if registration is not None:
+        placed = zip(registration.sources, registration.alignment.used, strict=True)
+        alone, overlap = tuple(source.name for source, is_used in placed if not is_used), _overlap(registration)
+    focal, zoomed = _focal(chosen)
+    cameras = Counter(map(_camera, chosen)).most_common()
+    blurred, dark, faded = (
+        named(sharpness < _BLURRED * np.median(sharpness)),
+        named(brightness < _DARK),
+        named(burnt > _BURNT),
+    )
+    advice = (
+        (len(chosen) < 2, "stitching needs two images or more; name another one"),
+        (len(cameras) > 1, f"the images come from {len(cameras)} cameras: stitch those of each on their own"),
+        (zoomed, "the lens was zoomed between the images: stitch those of one zoom on their own"),
+        (unreadable, f"{len(unreadable)} file{'s' * (len(unreadable) != 1)} cannot be read: {''.join(unreadable[:1])}"),
+        *((True, str(problem)) for problem in problems),
+        (
+            overlap is not None and overlap < _MIN_OVERLAP,
+            f"images overlap by about {overlap or 0.0:.0%} only: take more images, a third is the least",
+        ),
+        (blurred, f"leave blurred images out if their neighbours overlap without them: {shortened(blurred)}"),
+        (dark or faded, "dark or burnt-out images have few features: fix the exposure if you can take them again"),
+    )
+    return Examination(
+        len(chosen),
+        tuple(unreadable),
+        tuple(Counter("{} x {}".format(*source.metadata.size) for source in chosen).most_common()),
+        tuple(cameras),
+        focal,
+        *(blurred, dark, faded, alone),
+        overlap,
+        plan,
+        tuple(text for applies, text in advice if applies),
+    )
 
 
 def _dry_run(
@@ -191,50 +224,15 @@ def _look(image: DecodedImage) -> tuple[float, float, float]:
     return fine / rough if rough > 1e-6 else 0.0, float(grey[seen].mean()), float(burnt[seen].mean())
 
 
-def _conclude(
-    sources: Sequence[Source],
-    looks: Any,
-    unreadable: Sequence[str],
-    plan: CompositePlan | None,
-    registration: Registration | None,
-    problems: Sequence[Message],
-) -> Examination:
-    sharpness, brightness, burnt = looks.T
-
-    def named(chosen: Iterable[Any]) -> tuple[str, ...]:
-        return tuple(source.name for source, is_one in zip(sources, chosen, strict=True) if is_one)
-
-    alone = tuple(source.name for source in sources)
-    if registration is not None:
-        placed = zip(registration.sources, registration.alignment.used, strict=True)
-        alone = tuple(source.name for source, is_used in placed if not is_used)
-    focal, zoomed = _focal(sources)
-    found = Examination(
-        len(sources),
-        tuple(unreadable),
-        tuple(Counter("{} x {}".format(*source.metadata.size) for source in sources).most_common()),
-        tuple(Counter(map(_camera, sources)).most_common()),
-        focal,
-        named(sharpness < _BLURRED * np.median(sharpness)),
-        named(brightness < _DARK),
-        named(burnt > _BURNT),
-        alone,
-        None if registration is None else _overlap(registration),
-        plan,
-        (),
-    )
-    return replace(found, advice=tuple(_advice(found, zoomed, problems)))
-
-
 def _overlap(registration: Registration) -> float | None:
     """Median over the images of the largest share that another one shows too."""
     alignment = registration.alignment
     best = np.zeros(len(registration.sources))
     for fit in (fit for fit in alignment.links if fit.used):
         for first, second in ((fit.image1, fit.image2), (fit.image2, fit.image1)):
-            own, other = alignment.cameras[first].image_size, alignment.cameras[second].image_size
+            size, other = alignment.cameras[first].image_size, alignment.cameras[second].image_size
             with np.errstate(invalid="ignore"):
-                moved = alignment.transfer(first, second, points_over(own, _GRID))
+                moved = alignment.transfer(first, second, points_over(size, _GRID))
                 inside = ((moved >= -0.5) & (moved < np.array(other) - 0.5)).all(axis=1)
             best[first] = max(best[first], inside.mean())
     return float(np.median(best[best > 0])) if (best > 0).any() else None
@@ -256,25 +254,3 @@ def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
     zoomed = max(shares) > _ZOOMED * min(shares)
     text = f"{min(pixels)[0]:.0f}" + (f" to {max(pixels)[0]:.0f}" if zoomed else "")
     return f"{text} pixels by EXIF in {len(pixels)} of {len(sources)} images", zoomed
-
-
-def _advice(found: Examination, zoomed: bool, problems: Sequence[Message]) -> list[str]:
-    """What to change, most important first."""
-    advice = []
-    if found.images < 2:
-        advice.append("stitching needs two images or more; name another one")
-    if len(found.cameras) > 1:
-        advice.append(f"the images come from {len(found.cameras)} cameras: stitch those of each on their own")
-    if zoomed:
-        advice.append("the lens was zoomed between the images: stitch those of one zoom on their own")
-    if found.unreadable:
-        several = "s" * (len(found.unreadable) != 1)
-        advice.append(f"{len(found.unreadable)} file{several} cannot be read: {found.unreadable[0]}")
-    advice += map(str, problems)
-    if found.overlap is not None and found.overlap < _MIN_OVERLAP:
-        advice.append(f"images overlap by about {found.overlap:.0%} only: take more images, a third is the least")
-    if found.blurred:
-        advice.append(f"leave blurred images out if their neighbours overlap without them: {shortened(found.blurred)}")
-    if found.dark or found.burnt:
-        advice.append("dark or burnt-out images have few features: fix the exposure if you can take them again")
-    return advice

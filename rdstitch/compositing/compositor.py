@@ -17,7 +17,7 @@ from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
-from rdstitch.io.layout import Layout
+from rdstitch.io.encoding import Layout
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, check_memory, write_strips

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.render import Renderer
-from rdstitch.io.layout import STRIP_ROWS
+from rdstitch.io.encoding import STRIP_ROWS
 from rdstitch.opencv_state import one_opencv_thread
 from rdstitch.progress import ShareProgress, unheard
 

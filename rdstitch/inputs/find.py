@@ -15,7 +15,7 @@ from rdstitch.file_access import MAX_FILE, canonical_name, canonical_text, is_ur
 from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.keyframes import wanted_frames
 from rdstitch.inputs.rosbag import extract_images, is_bag
-from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
+from rdstitch.io.opening import HEIF_SUFFIXES, RAW_SUFFIXES
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.messages import Message, names_of, shortened
 from rdstitch.outputs import TemporaryFolder

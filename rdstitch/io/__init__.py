@@ -1,7 +1,7 @@
 """Files in and out: images with their metadata, sidecars, and nothing half-written."""
 
 from rdstitch.io.attitude import Attitude
-from rdstitch.io.layout import Layout
+from rdstitch.io.encoding import Layout
 from rdstitch.io.metadata import GpsPosition, Metadata, read_metadata
 from rdstitch.io.read import DecodedImage, read_image
 from rdstitch.io.write import check_format, check_size, write_image, write_strips

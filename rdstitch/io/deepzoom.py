@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.io.encoding import jpeg_pieces
-from rdstitch.io.layout import Layout, Strip, as_eight_bit, with_alpha
+from rdstitch.io.encoding import Layout, Strip, as_eight_bit, jpeg_pieces, with_alpha
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.reduction import halved, reduced_size

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
+from xml.etree import ElementTree
 
 from PIL import ExifTags, Image
 
@@ -15,9 +16,16 @@ from rdstitch.camera import is_focal_length
 from rdstitch.file_access import open_regular
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
 from rdstitch.io.colour import ink_transform
-from rdstitch.io.ome_xml import read_ome
-from rdstitch.io.opening import check_megapixels, check_readable, decoding, has_late_metadata, opened_image
-from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
+from rdstitch.io.opening import (
+    check_megapixels,
+    check_readable,
+    decoding,
+    has_late_metadata,
+    is_raw,
+    opened_image,
+    raw_exif,
+    raw_size,
+)
 from rdstitch.late_imports import tifffile
 from rdstitch.orientation import turned_size, turning_matrix
 
@@ -38,6 +46,8 @@ _OF_WHOM = {
     int(getattr(ExifTags.Base, name))
     for name in ("Make", "Model", "Artist", "Copyright", "DateTime", "Software", "ImageDescription", "Orientation")
 }
+# What units of length count.
+_MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
 
 
@@ -72,7 +82,6 @@ class Metadata:
     # EXIF orientation (1 to 8) stored in the file; readers of this project have applied it already
     orientation: int = 1
     focal_px: float | None = None  # focal length, pixels, where the file tells it
-    focal_source: str | None = None  # tag that ``focal_px`` comes from
     gps: GpsPosition | None = None
     attitude: Attitude | None = None
     make: str = ""  # make, model, serial: of the camera; empty where not known
@@ -120,8 +129,8 @@ def read_metadata(path: str | Path) -> Metadata:
             with opened_image(file) as image:
                 if image.format == "PNG" and not _EXIF_OF_PNG & image.info.keys() and not has_late_metadata(file):
                     image.info["exif"] = b""  # so that Pillow does not decode the pixels in search of it
-                found = metadata_of(image)
-                return _with_ome(file, found) if image.format == "TIFF" else found
+                metadata = metadata_of(image)
+                return _with_ome(file, metadata) if image.format == "TIFF" else metadata
         except SyntaxError:
             # Pillow knows few sample layouts of TIFF (no 16-bit colour with alpha, no five bands).
             with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
@@ -130,19 +139,20 @@ def read_metadata(path: str | Path) -> Metadata:
                 if min(size) < 1:
                     raise ValueError("no pixels") from None
                 check_megapixels(file, size)
-                found = Metadata(size, bit_depth=page.bitspersample, channels=page.samplesperpixel)
-            return _with_ome(file, found)
+                metadata = Metadata(size, bit_depth=page.bitspersample, channels=page.samplesperpixel)
+            return _with_ome(file, metadata)
 
 
-def _with_ome(file: Path, found: Metadata) -> Metadata:
+def _with_ome(file: Path, metadata: Metadata) -> Metadata:
     """The same with what OME-XML says besides."""
     with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
         told = read_ome(tiff.ome_metadata)
         pages = 1 if told is None or told.channels == 1 else len(tiff.pages)
     if told is None:
-        return found
-    apart = 1 < told.channels <= pages
-    return replace(found, pixel_size=told.pixel_size, planes=apart, channels=told.channels if apart else found.channels)
+        return metadata
+    planes = 1 < told.channels <= pages
+    channels = told.channels if planes else metadata.channels
+    return replace(metadata, pixel_size=told.pixel_size, planes=planes, channels=channels)
 
 
 def _raw_metadata(file: Path) -> Metadata:
@@ -151,9 +161,9 @@ def _raw_metadata(file: Path) -> Metadata:
     # A small image carries the tags; its focal length is in its own pixels.
     header = Image.new("L", (max(1, size[0] // _HEADER), max(1, size[1] // _HEADER)))
     header.info["exif"] = raw_exif(file).tobytes()
-    found = metadata_of(header)
-    focal = None if found.focal_px is None else found.focal_px * size[0] / header.width
-    return replace(found, size=size, bit_depth=16, orientation=1, focal_px=focal)
+    metadata = metadata_of(header)
+    focal = None if metadata.focal_px is None else metadata.focal_px * size[0] / header.width
+    return replace(metadata, size=size, bit_depth=16, orientation=1, focal_px=focal)
 
 
 def metadata_of(image: Image.Image) -> Metadata:
@@ -164,15 +174,13 @@ def metadata_of(image: Image.Image) -> Metadata:
     orientation = _orientation(exif.get(_ORIENTATION))
     photo = exif.get_ifd(ExifTags.IFD.Exif)
     xmp = xmp_text(image)
-    focal, source = _focal_px(exif, photo, xmp, image.size)
     dpi = image.info.get("dpi")
     profile, profile_lost = _colour_profile(image)
     return Metadata(
         size=turned_size(image.size, orientation),
         bit_depth=bit_depth,
         orientation=orientation,
-        focal_px=focal,
-        focal_source=source,
+        focal_px=_focal_px(photo, xmp, image.size),
         gps=_gps(exif.get_ifd(ExifTags.IFD.GPSInfo)),
         attitude=read_attitude(xmp),
         make=_text(exif.get(ExifTags.Base.Make)),
@@ -244,13 +252,11 @@ def _text(value: Any) -> str:
     return text.split("\0")[0].strip()
 
 
-def _focal_px(
-    exif: Image.Exif, photo: dict[int, Any], xmp: str, size: tuple[int, int]
-) -> tuple[float | None, str | None]:
-    """Focal length in pixels and the tag it comes from, the most direct tag first."""
+def _focal_px(photo: dict[int, Any], xmp: str, size: tuple[int, int]) -> float | None:
+    """Focal length in pixels, by the most direct tag that has one."""
     calibrated = xmp_number(xmp, "CalibratedFocalLength")
     if calibrated and is_focal_length(calibrated, size):
-        return calibrated, "CalibratedFocalLength"
+        return calibrated
     focal = finite(photo.get(ExifTags.Base.FocalLength))
     resolution = finite(photo.get(ExifTags.Base.FocalPlaneXResolution))
     unit = _MM_PER_RESOLUTION_UNIT.get(photo.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
@@ -259,11 +265,11 @@ def _focal_px(
         original = finite(photo.get(_PIXEL_WIDTH)) or size[0]
         focal_px = focal * resolution / unit * size[0] / original
         if is_focal_length(focal_px, size):
-            return focal_px, "FocalPlaneXResolution"
+            return focal_px
     equivalent = finite(photo.get(ExifTags.Base.FocalLengthIn35mmFilm))
     if equivalent and is_focal_length(equivalent, (36, 24)):
-        return equivalent / _DIAGONAL_35MM * math.hypot(*size), "FocalLengthIn35mmFilm"
-    return None, None
+        return equivalent / _DIAGONAL_35MM * math.hypot(*size)
+    return None
 
 
 def _timestamp(photo: Mapping[int, Any]) -> float | None:
@@ -348,3 +354,38 @@ def _who_and_when(exif: Image.Exif) -> None:
         del photo[tag]
     for tag in set(exif) - _OF_WHOM - {int(ExifTags.IFD.Exif)}:
         del exif[tag]
+
+
+@dataclass(frozen=True)
+class OmeImage:
+    """What OME-XML says of the only or first image of a file."""
+
+    channels: int  # pages that are channels of one plane; 1 where there are several planes or times
+    pixel_size: float | None  # micrometres
+    position: tuple[float, float] | None  # of the first plane
+    unit: float | None  # micrometres that the position counts; None for pixels ("reference frame")
+
+
+def read_ome(text: str | None) -> OmeImage | None:
+    """What the OME-XML of a file says; None where it is none."""
+    try:
+        elements = list(ElementTree.fromstring(text or "").iter())
+    except ElementTree.ParseError:
+        return None
+    images = [element for element in elements if element.tag.rpartition("}")[2] == "Pixels"]
+    if not images:
+        return None
+    pixels = images[0]
+    planes = (e for e in pixels.iter() if e.tag.rpartition("}")[2] == "Plane")
+    plane = next((e for e in planes if {"PositionX", "PositionY"} <= e.attrib.keys()), None)
+    counts = [int(pixels.get(f"Size{axis}", 1)) for axis in "CZT"]
+    samples = [int(e.get("SamplesPerPixel", 1)) for e in pixels.iter() if e.tag.rpartition("}")[2] == "Channel"]
+    apart = len(images) == 1 and counts[1:] == [1, 1] and all(count == 1 for count in samples)
+    size, scale = pixels.get("PhysicalSizeX"), _MICROMETRES.get(pixels.get("PhysicalSizeXUnit", "µm"))
+    return OmeImage(
+        counts[0] if apart else 1,
+        float(size) * scale if size and scale else None,
+        None if plane is None else (float(plane.attrib["PositionX"]), float(plane.attrib["PositionY"])),
+        # What programs write that do not know the unit counts pixels.
+        None if plane is None else _MICROMETRES.get(plane.get("PositionXUnit", "µm")),
+    )

@@ -1,5 +1,7 @@
 """Opening image files: only the formats below, only regular files, and nothing of them decoded yet.
 
+Optional packages read HEIC of phones (``pillow-heif``) and raw files of cameras (``rawpy``).
+
 Failures of the decoders end as one InputError. Their warnings and log messages go where those of any library go: the
 process that this runs in decides what becomes of them, since Python's filters and handlers belong to all its threads.
 """
@@ -9,13 +11,18 @@ import stat
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from io import BytesIO
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import IO, Any, BinaryIO
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 from PIL import (
     BmpImagePlugin,
+    ExifTags,
     GifImagePlugin,
     Image,
     ImageFile,
@@ -25,13 +32,26 @@ from PIL import (
     PpmImagePlugin,
     TgaImagePlugin,
     TiffImagePlugin,
+    UnidentifiedImageError,
     WebPImagePlugin,
 )
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import is_url, open_regular, remote_status
-from rdstitch.io.optional_readers import avif_factory, check_reader, heif_factory, is_raw
 from rdstitch.late_imports import tifffile
+
+Factory = Callable[[IO[bytes], str], ImageFile.ImageFile]
+
+HEIF_SUFFIXES = frozenset((".heic", ".heif", ".hif"))
+RAW_SUFFIXES = frozenset(
+    (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".nrw", ".iiq", ".3fr", ".erf")
+)
+"""What TIFF readers see in raw files is their thumbnail."""
+
+_EXTRAS = {"pillow_heif": "heif", "rawpy": "raw"}
+_BITS = 16
+_KEPT_TAGS = {int(getattr(ExifTags.Base, name)) for name in ("Make", "Model", "Artist", "Copyright", "DateTime")}
+_KEPT_BLOCKS = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
 
 # What Pillow, tifffile and OpenCV have been seen to raise on damaged files; warnings, where filters make them errors.
 _DAMAGE = (
@@ -56,7 +76,7 @@ TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 # Pillow opens some forty formats, and starts Ghostscript for one of them, whatever a file is called.
-_FORMATS: dict[bytes, Callable[[IO[bytes], str], ImageFile.ImageFile]] = {
+_FORMATS: dict[bytes, Factory] = {
     b"\xff\xd8\xff": JpegImagePlugin.jpeg_factory,
     PNG_MAGIC: PngImagePlugin.PngImageFile,
     **dict.fromkeys(TIFF_MAGIC, TiffImagePlugin.TiffImageFile),
@@ -91,7 +111,7 @@ def check_readable(path: Path) -> None:
         raise InputError(f"{path}: is not a regular file; copy it to one first")
     if status.st_size == 0:
         raise InputError(f"{path}: is empty (0 bytes); copy it again from its source")
-    check_reader(path)
+    _check_reader(path)
     if not os.access(path, os.R_OK):
         raise InputError(f"{path}: permission denied; make it readable")
 
@@ -116,7 +136,7 @@ def _check_remote(path: Path) -> None:
     """The same of what a URL names."""
     if is_raw(path):
         raise InputError(f"{path}: raw files are read from this machine's disks only; download it first")
-    check_reader(path)
+    _check_reader(path)
     try:
         is_folder, size, _ = remote_status(path)
     except FileNotFoundError:
@@ -183,7 +203,7 @@ def check_megapixels(file: Path, size: tuple[int, int]) -> None:
         )
 
 
-def _factory(file: Path, stream: BinaryIO) -> Callable[[IO[bytes], str], ImageFile.ImageFile]:
+def _factory(file: Path, stream: BinaryIO) -> Factory:
     """What opens the format of a file, by its first bytes."""
     beginning = stream.read(_MAX_MAGIC)
     stream.seek(0)
@@ -191,7 +211,94 @@ def _factory(file: Path, stream: BinaryIO) -> Callable[[IO[bytes], str], ImageFi
         if beginning.startswith(magic):
             return factory
     if beginning[4:8] == b"ftyp":
-        return avif_factory(file) if beginning[8:12] in (b"avif", b"avis") else heif_factory(file)
+        if beginning[8:12] in (b"avif", b"avis"):
+            return _avif_factory(file)
+        # No opener is registered with Pillow, since that would be for the whole process.
+        heif: Factory = _package("pillow_heif", file).HeifImageFile
+        return heif
     if file.suffix.lower() == ".tga":  # has no magic
         return TgaImagePlugin.TgaImageFile
     raise InputError(f"{file}: not an image in a supported format: {_NAMES}")
+
+
+def _check_reader(path: Path) -> None:
+    """Refuse a file whose reader is not installed."""
+    for suffixes, package in ((HEIF_SUFFIXES, "pillow_heif"), (RAW_SUFFIXES, "rawpy")):
+        if path.suffix.lower() in suffixes:
+            _package(package, path)
+
+
+def _avif_factory(path: Path) -> Factory:
+    """What opens AVIF: Pillow, since version 11.3."""
+    try:
+        factory: Factory = import_module("PIL.AvifImagePlugin").AvifImageFile
+    except ImportError:
+        raise InputError(f"{path}: AVIF needs Pillow 11.3 or newer; or convert it to JPEG or TIFF") from None
+    return factory
+
+
+def is_raw(path: Path) -> bool:
+    """Whether a file is a camera's raw file, by its name."""
+    return path.suffix.lower() in RAW_SUFFIXES
+
+
+def read_raw(path: Path) -> NDArray[np.uint16]:
+    """Samples (h, w, 3) of a raw file, upright, with the camera's white balance, in sRGB without automatic exposure."""
+    with _raw(path) as raw:
+        samples = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=_BITS)
+        return np.asarray(samples, dtype=np.uint16)
+
+
+def raw_size(path: Path) -> tuple[int, int]:
+    """Width and height of a raw file, upright, without developing it."""
+    with _raw(path) as raw:
+        sizes = raw.sizes
+        sideways = sizes.flip in (5, 6)
+        size = (sizes.iheight, sizes.iwidth) if sideways else (sizes.iwidth, sizes.iheight)
+        return int(size[0]), int(size[1])
+
+
+def raw_exif(path: Path) -> Image.Exif:
+    """EXIF of a raw file: most are TIFF, others have a preview with it; what describes how it is stored is left out."""
+    exif = Image.Exif()
+    with suppress(SyntaxError, ValueError, OSError, struct.error), path.open("rb") as stream:
+        exif.load_from_fp(stream)
+    if not len(exif):
+        exif = _exif_of_preview(path)
+    kept = Image.Exif()
+    for tag in set(exif) & _KEPT_TAGS:
+        kept[tag] = exif[tag]
+    for ifd in _KEPT_BLOCKS:
+        kept.get_ifd(ifd).update(exif.get_ifd(ifd))
+    return kept
+
+
+def _exif_of_preview(path: Path) -> Image.Exif:
+    package = _package("rawpy", path)
+    with suppress(package.LibRawError, UnidentifiedImageError), package.imread(str(path)) as raw:
+        preview = raw.extract_thumb()
+        if preview.format == package.ThumbFormat.JPEG:
+            with Image.open(BytesIO(preview.data)) as image:
+                return image.getexif()
+    return Image.Exif()
+
+
+@contextmanager
+def _raw(path: Path) -> Iterator[Any]:
+    """An opened raw file; failures of LibRaw become those of any decoder."""
+    package = _package("rawpy", path)
+    try:
+        with package.imread(str(path)) as raw:
+            yield raw
+    except package.LibRawError as error:
+        text = error.args[0] if error.args else ""
+        raise ValueError(text.decode() if isinstance(text, bytes) else str(error)) from error
+
+
+def _package(name: str, path: Path) -> Any:
+    try:
+        return import_module(name)
+    except ImportError:
+        extra = _EXTRAS[name]
+        remedy = f'pip install "rdstitch[{extra}]"; or convert it to JPEG or TIFF'
+        raise InputError(f"{path}: {path.suffix} needs the extra {extra}: {remedy}") from None

@@ -17,10 +17,8 @@ from PIL import Image
 from rdstitch.errors import InputError
 from rdstitch.file_access import open_regular
 from rdstitch.io.colour import srgb_of_lab, without_inks
-from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
-from rdstitch.io.ome_xml import read_ome
-from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, opened_image
-from rdstitch.io.optional_readers import is_raw, read_raw
+from rdstitch.io.metadata import Metadata, metadata_of, read_metadata, read_ome
+from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image, read_raw
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.late_imports import tifffile
 from rdstitch.opencv_state import silent_opencv

@@ -1,31 +1,36 @@
-"""TIFF from strips: compressed, BigTIFF where needed, with overviews of half the size again and again.
+"""TIFF from strips: compressed, BigTIFF where needed, with overviews of half the size again and again; OME-TIFF.
 
 Grey samples with alpha are something that OpenCV (4.11 to 5.0) reads as stripes or reduces to 8 bits, and that Pillow
 does not read where they are deeper; their transparency is a mask on a page of its own, as GDAL writes it, and every
-program reads the first page. Where there are overviews, the file is in the order of a Cloud Optimized GeoTIFF.
+program reads the first page. Where there are overviews, the file is in the order of a Cloud Optimized GeoTIFF: what
+describes the pages comes first, then the pixels, smallest overview first, so that a reader of a part fetches little but
+that part. While an image is being made nobody knows where its parts will lie: compressed tiles are copied afterwards.
 
 Overviews are made while the strips pass, and wait in temporary files beside the output until their turn; memory is that
 of one strip, whatever the size of the image.
 """
 
+import struct
 import tempfile
+import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
+from itertools import accumulate
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, BinaryIO, NamedTuple
 
 import deflate
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from rdstitch.io.cloud_tiff import put_in_order
-from rdstitch.io.layout import STRIP_ROWS, Layout, Strip, with_alpha
+from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, with_alpha
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.reduction import halved
 from rdstitch.late_imports import tifffile
 
-TILE = 256
+OME_SUFFIXES = (".ome.tif", ".ome.tiff")
+_TILE = 256
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
 # Smaller images need no overview.
 _MIN_OVERVIEW = 256
@@ -35,6 +40,11 @@ _BUFFER = 2**24
 _LEVEL = 1  # of 1 to 12: 2 takes 1.7 times as long and makes files 2 % smaller
 _BIGTIFF_FROM = 2**32 - 2**27
 _XMP = 700
+_OFFSETS = (324, 273)  # of tiles and strips
+_ENTRY = "HH"  # of a directory, before count and value
+_DPI = 150  # offsets of cropped files are counted in inches; any resolution will do
+_X_POSITION, _Y_POSITION, _FULL_WIDTH, _FULL_LENGTH = 286, 287, 33300, 33301
+_RATIONAL, _LONG = 5, 4
 _COPIED_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.Artist, ExifTags.Base.Copyright)
 # (code, type, count, value, only on the first page), as tifffile takes them.
 ExtraTag = tuple[int, int, int, Any, bool]
@@ -42,7 +52,7 @@ ExtraTag = tuple[int, int, int, Any, bool]
 
 def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
     """Write a TIFF file whose first page is the image and whose other pages are its overviews."""
-    sizes = [layout.size, *overview_sizes(layout.size)]
+    sizes = [layout.size, *_overview_sizes(layout.size)]
     total = sum(w * h for w, h in sizes) * layout.samples_per_pixel * layout.dtype.itemsize
     joined: Iterable[NDArray[Any]] = (with_alpha(*strip) if layout.transparent else strip[0] for strip in strips)
     mask: list[bytes] | None = [] if _has_mask(layout) else None
@@ -62,7 +72,7 @@ def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: 
             if spill is not None:
                 joined = _reread(spill, sizes[level + 1], layout)
     if len(sizes) > 1:
-        put_in_order(path)
+        _put_in_order(path)
 
 
 def _has_mask(layout: Layout) -> bool:
@@ -86,15 +96,15 @@ def _write_page(
     extra = ["unspecified"] * (layout.channels - colour) + ["unassalpha"] * transparent
     dpi = None if kind else layout.metadata.dpi
     tiff.write(
-        (encoded_tile(tile) for tile in tiles_of(strips)),
+        (_encoded_tile(tile) for tile in _tiles_of(strips)),
         shape=(height, width, samples) if samples > 1 else (height, width),
         dtype=layout.dtype,
         photometric="rgb" if colour == 3 else "minisblack",
         planarconfig="contig" if samples > 1 else None,
         extrasamples=extra or None,
-        tile=(TILE, TILE),
+        tile=(_TILE, _TILE),
         compression="zlib",
-        predictor=has_predictor(layout.dtype),
+        predictor=_has_predictor(layout.dtype),
         # Tiles that tifffile holds before it writes them; 256 MB by default.
         buffersize=_BUFFER,
         metadata=None,
@@ -110,7 +120,7 @@ def _write_page(
 def _without_alpha(strips: Iterable[NDArray[Any]], mask: list[bytes]) -> Iterator[NDArray[Any]]:
     """The strips without alpha; tiles of where that is not 0, one bit a pixel, are added to ``mask`` as stored."""
     for strip in strips:
-        bits = (np.packbits(tile[..., 0], axis=1) for tile in tiles_of([strip[..., -1:] > 0]))
+        bits = (np.packbits(tile[..., 0], axis=1) for tile in _tiles_of([strip[..., -1:] > 0]))
         mask += [_deflated(tile) for tile in bits]
         yield strip[..., :-1]
 
@@ -122,7 +132,7 @@ def _write_mask(tiff: "tifffile.TiffWriter", size: tuple[int, int], tiles: list[
         shape=size[::-1],
         dtype=np.bool_,
         photometric="mask",
-        tile=(TILE, TILE),
+        tile=(_TILE, _TILE),
         compression="zlib",
         metadata=None,
         software="rdstitch",
@@ -130,25 +140,25 @@ def _write_mask(tiff: "tifffile.TiffWriter", size: tuple[int, int], tiles: list[
     )
 
 
-def tiles_of(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+def _tiles_of(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
     """Tiles in the order of the file; those at the right and lower border completed."""
     for strip in strips:
-        for y in range(0, strip.shape[0], TILE):
-            for x in range(0, strip.shape[1], TILE):
-                tile = strip[y : y + TILE, x : x + TILE]
-                missing = [(0, TILE - n) for n in tile.shape[:2]] + [(0, 0)]
+        for y in range(0, strip.shape[0], _TILE):
+            for x in range(0, strip.shape[1], _TILE):
+                tile = strip[y : y + _TILE, x : x + _TILE]
+                missing = [(0, _TILE - n) for n in tile.shape[:2]] + [(0, 0)]
                 yield np.pad(tile, missing) if any(b for _, b in missing) else tile
 
 
-def has_predictor(dtype: np.dtype[Any]) -> bool:
+def _has_predictor(dtype: np.dtype[Any]) -> bool:
     """Whether differences of neighbours are stored; what is usual for floating point, few programs can read."""
     return dtype.kind == "u"
 
 
-def encoded_tile(tile: NDArray[Any]) -> bytes:
+def _encoded_tile(tile: NDArray[Any]) -> bytes:
     """A tile (h, w, C) as it stands in the file."""
     stored = tile.copy()
-    if has_predictor(tile.dtype):
+    if _has_predictor(tile.dtype):
         stored[:, 1:] -= tile[:, :-1]
     return _deflated(stored)
 
@@ -195,7 +205,7 @@ def _copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
                 yield int(tag), 2, 0, text, True
 
 
-def overview_sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
+def _overview_sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
     """Sizes of the overviews, each half of the one before, rounded up."""
     sizes = []
     width, height = size
@@ -203,3 +213,177 @@ def overview_sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
         width, height = -(-width // 2), -(-height // 2)
         sizes.append((width, height))
     return sizes
+
+
+class _Page(NamedTuple):
+    """A directory: type, count and bytes of each value by its code; and where its tiles lie, and how long they are."""
+
+    values: dict[int, tuple[int, int, bytes]]
+    offsets: tuple[int, ...]
+    lengths: tuple[int, ...]
+
+    def bytes_at(self, room: int) -> int:
+        """Bytes, where values of so many fit into their entries."""
+        entries = len(self.values) * (struct.calcsize(f"={_ENTRY}") + 2 * room)
+        longer = sum(_even(len(data)) for _, _, data in self.values.values() if len(data) > room)
+        return _head(room) + entries + room + longer
+
+
+def _put_in_order(path: Path) -> None:
+    """Rewrite a TIFF file: header, directories in their order, tiles of the last page, …, tiles of the first.
+
+    Needs room for a copy beside it.
+    """
+    ordered = path.with_name(f"{path.name}.ordered")
+    with tifffile.TiffFile(path) as tiff, path.open("rb") as source, ordered.open("wb") as target:
+        order, room = tiff.byteorder, 8 if tiff.is_bigtiff else 4
+        pages = [_page(source, page) for page in tiff.pages]
+        place = 2 * room
+        target.write(_bytes_at(source, 0, room) + _packed(order, room, [place]))
+        *places, place = accumulate((page.bytes_at(room) for page in pages), initial=place)
+        tiles = []
+        for page in reversed(pages):
+            *starts, place = accumulate(map(_even, page.lengths), initial=place)
+            tiles.append(starts)
+        for page, at, following, offsets in zip(pages, places, [*places[1:], 0], reversed(tiles), strict=True):
+            target.write(_directory(page, order, room, at, following, offsets))
+        for page in reversed(pages):
+            for offset, length in zip(page.offsets, page.lengths, strict=True):
+                target.write(_bytes_at(source, offset, length).ljust(_even(length), b"\0"))
+    ordered.replace(path)
+
+
+def _page(source: BinaryIO, page: "tifffile.TiffPage | tifffile.TiffFrame") -> _Page:
+    assert isinstance(page, tifffile.TiffPage)
+    values = {
+        int(tag.code): (int(tag.dtype), int(tag.count), _bytes_at(source, tag.valueoffset, tag.valuebytecount))
+        for tag in page.tags
+    }
+    return _Page(values, tuple(page.dataoffsets), tuple(page.databytecounts))
+
+
+def _directory(page: _Page, order: str, room: int, place: int, following: int, offsets: list[int]) -> bytes:
+    """A directory at a place, with where the next one and its own tiles will lie."""
+    entries, longer = [], b""
+    place += page.bytes_at(room)
+    place -= sum(_even(len(data)) for _, _, data in page.values.values() if len(data) > room)
+    for code, (kind, count, data) in page.values.items():
+        if code in _OFFSETS:
+            data = _packed(order, len(data) // count, offsets)
+        if len(data) > room:
+            shown = _packed(order, room, [place + len(longer)])
+            longer += data.ljust(_even(len(data)), b"\0")
+        else:
+            shown = data.ljust(room, b"\0")
+        entries.append(struct.pack(f"{order}{_ENTRY}", code, kind) + _packed(order, room, [count]) + shown)
+    head = _packed(order, _head(room), [len(entries)])
+    return head + b"".join(entries) + _packed(order, room, [following]) + longer
+
+
+def _head(room: int) -> int:
+    """Bytes of the number of entries."""
+    return 8 if room == 8 else 2
+
+
+def _packed(order: str, size: int, numbers: list[int]) -> bytes:
+    """Whole numbers of so many bytes each."""
+    return struct.pack(f"{order}{len(numbers)}{ {2: 'H', 4: 'I', 8: 'Q'}[size] }", *numbers)
+
+
+def _bytes_at(source: BinaryIO, offset: int, length: int) -> bytes:
+    source.seek(offset)
+    return source.read(length)
+
+
+def _even(length: int) -> int:
+    return length + length % 2
+
+
+def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip]) -> None:
+    """Write an OME-TIFF file with a pyramid; what no image covers is 0.
+
+    Channels become pages; those of a colour image stay together.
+    """
+    sizes = [layout.size, *_overview_sizes(layout.size)]
+    apart = layout.metadata.planes or layout.channels != 3
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        levels: list[NDArray[Any]] = []
+        for number, (width, height) in enumerate(sizes):
+            level = np.memmap(Path(folder) / str(number), layout.dtype, "w+", shape=(height, width, layout.channels))
+            _fill(level, strips if number == 0 else _halves(levels[-1]))
+            levels.append(level)
+        size = layout.metadata.pixel_size
+        units = {} if size is None else {"PhysicalSizeX": size, "PhysicalSizeY": size}
+        names = {key + "Unit": "µm" for key in units}
+        identity = uuid.uuid5(uuid.NAMESPACE_OID, f"rdstitch {layout.size} {layout.channels} {layout.dtype}")
+        total = sum(level.nbytes for level in levels)
+        with tifffile.TiffWriter(path, ome=True, bigtiff=total > 2**31) as tiff:
+            for number, pixels in enumerate(levels):
+                height, width, channels = pixels.shape
+                parts = [pixels[..., k : k + 1] for k in range(channels)] if apart else [pixels]
+                tiff.write(
+                    (_encoded_tile(tile) for part in parts for tile in _tiles_of(_rows(part))),
+                    shape=(channels, height, width) if apart else (height, width, channels),
+                    dtype=layout.dtype,
+                    photometric="minisblack" if apart else "rgb",
+                    planarconfig=None if apart else "contig",
+                    tile=(_TILE, _TILE),
+                    compression="zlib",
+                    predictor=_has_predictor(layout.dtype),
+                    subifds=None if number else len(levels) - 1,
+                    subfiletype=1 if number else 0,
+                    metadata=None
+                    if number
+                    else {"axes": "CYX" if apart else "YXS", "UUID": f"urn:uuid:{identity}", **units, **names},
+                    software="rdstitch",
+                )
+
+
+def _fill(level: NDArray[Any], strips: Iterable[Strip]) -> None:
+    top = 0
+    for samples, alpha in strips:
+        rows = level[top : top + len(samples)]
+        rows[...] = samples if alpha is None else np.where(alpha[..., None] > 0, samples, samples.dtype.type(0))
+        top += len(samples)
+
+
+def _rows(level: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    for top in range(0, len(level), STRIP_ROWS):
+        yield np.ascontiguousarray(level[top : top + STRIP_ROWS])
+
+
+def _halves(level: NDArray[Any]) -> Iterator[Strip]:
+    for strip in _rows(level):
+        yield halved(strip, False), None
+
+
+def write_cropped_tiff(
+    path: Path, pixels: NDArray[Any], alpha: NDArray[np.uint8] | None, offset: tuple[int, int], size: tuple[int, int]
+) -> None:
+    """Write a part (h, w) or (h, w, C) of a canvas of ``size``, its first pixel at ``offset``; alpha is 0 or 255.
+
+    As Hugin's nona writes it and enblend reads it.
+    """
+    samples = pixels[..., None] if pixels.ndim == 2 else pixels
+    colours = 3 if samples.shape[2] == 3 else 1
+    extra = ["unspecified"] * (samples.shape[2] - colours)
+    if alpha is not None:
+        samples, extra = with_alpha(samples, alpha), [*extra, "unassalpha"]
+    positions = [
+        (tag, _RATIONAL, 1, (at, _DPI), True) for tag, at in zip((_X_POSITION, _Y_POSITION), offset, strict=True)
+    ]
+    whole = [(tag, _LONG, 1, side, True) for tag, side in zip((_FULL_WIDTH, _FULL_LENGTH), size, strict=True)]
+    tifffile.imwrite(
+        path,
+        samples if extra else samples[..., 0] if colours == 1 else samples,
+        photometric="rgb" if colours == 3 else "minisblack",
+        planarconfig="contig",
+        extrasamples=extra or None,
+        compression="zlib",
+        predictor=samples.dtype.kind == "u",
+        resolution=(_DPI, _DPI),
+        resolutionunit="inch",
+        extratags=[*positions, *whole],
+        metadata=None,
+        software=False,
+    )

@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
-from rdstitch.io import ome
 from rdstitch.io.deepzoom import write_deep_zoom
-from rdstitch.io.encoding import jpeg_pieces, png_pieces
-from rdstitch.io.layout import STRIP_ROWS, Layout, Strip, as_eight_bit, check_strips
+from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, as_eight_bit, check_strips, jpeg_pieces, png_pieces
 from rdstitch.io.metadata import Metadata
-from rdstitch.io.tiff import ExtraTag, write_tiff
+from rdstitch.io.tiff import OME_SUFFIXES, ExtraTag, write_ome_tiff, write_tiff
 from rdstitch.outputs import IMAGE_SUFFIXES, Fingerprint, Outputs, check_tiles_folder, fingerprint, naming, tiles_folder
 
 # Width and height that the formats (or their one encoder) can hold.
@@ -86,8 +84,8 @@ def write_strips(
             write_deep_zoom(staged, tiles, layout, checked)
     else:
         with outputs.writing(file) as staged:
-            if file.name.lower().endswith(ome.SUFFIXES):
-                ome.write_ome_tiff(staged, layout, checked)
+            if file.name.lower().endswith(OME_SUFFIXES):
+                write_ome_tiff(staged, layout, checked)
             else:
                 _write_file(staged, suffix, layout, checked, extra_tags)
     with naming(file):

@@ -19,7 +19,7 @@ from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.trajectory_files import as_csv
 from rdstitch.inputs.measurements import timestamps_of
-from rdstitch.io.cropped_tiff import write_cropped_tiff
+from rdstitch.io.tiff import write_cropped_tiff
 from rdstitch.orientation import quarter_turn, turning_matrix
 from rdstitch.outputs import Outputs, check_outputs
 from rdstitch.pipeline.apply_sidecar import Recomposition

@@ -14,7 +14,7 @@ import tifffile
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.file_access import canonical_name, canonical_text, open_regular, read_text
-from rdstitch.io.ome_xml import read_ome
+from rdstitch.io.metadata import read_ome
 from rdstitch.io.opening import TIFF_MAGIC, decoding
 from rdstitch.stage.grid import TileGrid
 
