@@ -17,8 +17,8 @@ from rdstitch.compositing.source_images import ImageReader
 from rdstitch.compositing.warp import Warp, locate, plan_warps
 from rdstitch.progress import ShareProgress, unheard
 
-_MAX_IMAGE = 600_000
-_MAX_TOTAL = 16_000_000
+_MAX_IMAGE = 200_000
+_MAX_TOTAL = 16_000_000  # pixels of one image and of all on the reduced canvas; OpenCV finds seams at 100,000
 
 
 @dataclass(frozen=True)
