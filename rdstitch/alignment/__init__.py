@@ -1,10 +1,10 @@
 """From pairs of images to all of them registered as one."""
 
-from rdstitch.alignment.align import align, most_matches_read
+from rdstitch.alignment.align import AlignmentTask, align, most_matches_read
 from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.result import Alignment
 from rdstitch.matching.links import Link
 
-__all__ = ["LENSES", "MODELS", "Alignment", "AlignmentOptions", "Link", "align", "most_matches_read"]
+__all__ = ["LENSES", "MODELS", "Alignment", "AlignmentOptions", "AlignmentTask", "Link", "align", "most_matches_read"]

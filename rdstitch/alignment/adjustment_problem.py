@@ -276,4 +276,4 @@ def homography_apart(
 
 def thin_for_selection(links: int) -> int:
     """Correspondences per link that suffice to choose a model: fewer where there are many links."""
-    return int(np.clip(20_000 // max(links, 1), 40, 150))
+    return int(np.clip(5_000 // max(links, 1), 40, 150))

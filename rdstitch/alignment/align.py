@@ -1,7 +1,8 @@
 """The recipe of the global adjustment: consensus, match graph, choice of the model, adjustment."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -54,13 +55,7 @@ _LITTLE_DEPTH, _LITTLE_DEPTH_PX = 0.0003, 0.3
 of. Less than the noise of keypoints says nothing: published pairs with depth leave 0.6 to 2 pixels."""
 
 
-def align(
-    cameras: Sequence[Camera],
-    links: Sequence[Link],
-    options: AlignmentOptions | None = None,
-    *,
-    progress: Callable[[str], None] | None = None,
-) -> Alignment:
+def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions | None = None) -> Alignment:
     """Align all images over one plane.
 
     Parameters
@@ -70,8 +65,6 @@ def align(
     links : sequence of Link
         The pairs that overlap, each once.
     options : AlignmentOptions, optional
-    progress : callable, optional
-        Called with the name of each stage as it begins.
 
     Raises
     ------
@@ -80,15 +73,40 @@ def align(
     RegistrationError
         When no two images are linked.
     """
-    report, options = progress or (lambda stage: None), options or AlignmentOptions()
-    _check(cameras, links, options)
+    return AlignmentTask(cameras, links, options or AlignmentOptions()).result
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentTask:
+    """Images to be aligned, as :func:`align` takes them: a draft, and the result, each computed when it is wanted."""
+
+    cameras: Sequence[Camera]
+    links: Sequence[Link]
+    options: AlignmentOptions
+
+    @cached_property
+    def draft(self) -> Alignment:
+        """Model, lens and poses by a few matches of each link; deviations are those of independent errors."""
+        return build_alignment(self._chosen, draft=True)
+
+    @cached_property
+    def result(self) -> Alignment:
+        """Adjusted to all matches."""
+        return build_alignment(_adjusted(self._chosen))
+
+    @cached_property
+    def _chosen(self) -> AdjustedImages:
+        _check(self.cameras, self.links, self.options)
+        return _chosen(self.cameras, self.links, self.options)
+
+
+def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> AdjustedImages:
+    """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
     known = options.camera_priors(cameras)
     everything, own = _observations(links, cameras, _matches_of_a_link(len(links), options))
-
-    report("consensus of the pairs")
+    few = everything.thinned(thin_for_selection(len(links)))
     votes = vote([k.relation.distortion for k in links], [k.relation.distortion_std for k in links])
     lens, free_lens = _lens_start(cameras, options, votes)
-    few = everything.thinned(thin_for_selection(len(links)))
     relations = relations_at(few, own, lens)
     apart = homography_apart(few, relations, lens, free_lens, known)
     observable = options.lens_known or _observable(apart)
@@ -103,7 +121,6 @@ def align(
     apart = chosen.apart
     free_lens, lens, relations = chosen.free if observable else none, apart.parameters.lens, apart.homographies
 
-    report("choice of the model")
     wrong, confirmed = cycle_consistency(apart, few, len(cameras))
     trust = _trust(few, confirmed)
     reference = -1 if options.reference is None else options.reference
@@ -114,7 +131,7 @@ def align(
         problem, overdispersion=noise_of_links(problem.observations, problem.homographies, problem.lens).overdispersion
     )
     if (doubt := check_attitudes(problem, options)) is not None:
-        return align(cameras, links, doubt[0], progress=progress).with_messages([doubt[1]])
+        return replace(_chosen(cameras, links, doubt[0]), messages=(doubt[1],))
     choice = select_model(
         problem,
         options.models,
@@ -123,32 +140,45 @@ def align(
         layout_matters=options.layout_matters,
     )
     choice, images, wrong = _drop_wrong_pairs(whole, problem, images, choice, wrong)
-    choice = choose_over_relief(whole.part(~wrong, images)[0], choice, options.models)
-
-    report("adjustment")
-    if choice.fit.model.on_sphere and most_matches_read(len(links), options) is None:
-        # Few images of a turn hardly determine the focal length; all their matches are used.
-        everything, _ = _observations(links, cameras, _MATCHES_OF_A_TURN // len(links))
-    full = replace(whole, observations=everything, free_lens=choice.fit.free_lens, overdispersion=choice.overdispersion)
-    problem, _ = full.part(~wrong, images)
-    problem, fit = adjust_over_relief(problem, choice)
-    problem, fit = with_third_coefficient(problem, fit) if options.lens_chosen else (problem, fit)
-    problem, fit, disagreement = hold_positions(problem, fit)
-    fit = weigh_lens(problem, fit) if observable else fit
-    found = AdjustedImages(
+    problem, _ = whole.part(~wrong, images)
+    choice = choose_over_relief(problem, choice, options.models)
+    free_lens = choice.fit.free_lens
+    whole = replace(whole, observations=everything, free_lens=free_lens, overdispersion=choice.overdispersion)
+    return AdjustedImages(
         cameras,
         links,
         images,
         ~wrong,
-        problem,
-        replace(choice, fit=fit),
-        chosen.refined(fit.free_lens),
+        whole,
+        replace(problem, free_lens=free_lens),
+        choice,
+        chosen.refined(free_lens),
         observable,
         depth,
         options,
-        disagreement,
     )
-    return build_alignment(found)
+
+
+def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
+    """Adjusted to all matches."""
+    choice, options, links = chosen.choice, chosen.options, chosen.links
+    whole = chosen.whole
+    if choice.fit.model.on_sphere and most_matches_read(len(links), options) is None:
+        # Few images of a turn hardly determine the focal length; all their matches are used.
+        every, _ = _observations(links, chosen.cameras, _MATCHES_OF_A_TURN // len(links))
+        whole = replace(whole, observations=every)
+    problem, _ = whole.part(chosen.right, chosen.images)
+    problem, fit = adjust_over_relief(problem, choice)
+    problem, fit = with_third_coefficient(problem, fit) if options.lens_chosen else (problem, fit)
+    problem, fit, disagreement = hold_positions(problem, fit)
+    fit = weigh_lens(problem, fit) if chosen.observable else fit
+    return replace(
+        chosen,
+        problem=problem,
+        choice=replace(choice, fit=fit),
+        lens=chosen.lens.refined(fit.free_lens),
+        positions_disagree=disagreement,
+    )
 
 
 def most_matches_read(links: int, options: AlignmentOptions) -> int | None:

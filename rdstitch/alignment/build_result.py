@@ -54,22 +54,27 @@ class AdjustedImages:
     links: Sequence[Link]
     images: IntArray  # (N,): the images aligned, ascending; the problem numbers them 0 … N-1
     right: BoolArray  # (L,): links not taken for wrong
-    problem: Problem  # the final one
+    whole: Problem  # of all links and images, with the matches that they are adjusted by in the end
+    problem: Problem  # of those aligned, with the matches that they were adjusted by
     choice: ModelChoice
     lens: LensChoice  # the lens, with the distortion centre if the motion model freed it
     observable: bool  # whether λ is observable, or known
     depth: bool  # whether that is because what few images show has depth
     options: AlignmentOptions
-    positions_disagree: str  # why the positions were not used; empty where they were, or where there are none
+    positions_disagree: str = ""  # why the positions were not used; empty where they were, or where there are none
+    messages: tuple[Message, ...] = ()  # on what was given
 
 
-def build_alignment(found: AdjustedImages) -> Alignment:
-    """The alignment, in the frame of the reference image."""
+def build_alignment(found: AdjustedImages, *, draft: bool = False) -> Alignment:
+    """The alignment, in the frame of the reference image.
+
+    A ``draft`` has no test of its shape, and the covariances of independent errors.
+    """
     problem, fit = found.problem, found.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
     shared, lens = fit.model.physical_parameters(adjusted.parameters.shared)[0], adjusted.parameters.lens
     covariance = adjusted.covariance
-    if covariance.size:
+    if covariance.size and not draft:
         covariance = sandwich_covariance(problem.adjuster_of(fit), adjusted)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (
@@ -88,7 +93,7 @@ def build_alignment(found: AdjustedImages) -> Alignment:
     agreeing = squared <= (ALIGNMENT_WIDTH * math.hypot(sigma, EXACTNESS)) ** 2
     relief = judge_relief(coherence(observations, errors, inliers), fit.model.name, len(observations))
     considered = lens_covariance
-    if found.observable and problem.free_lens[0]:
+    if found.observable and problem.free_lens[0] and not draft:
         considered = considered_covariance(problem, fit, rough=relief.found)
     tilt, tilt_std = ((float(values[0]), float(values[1])) if planar else None for values in (shared, std))
     focal_std = None if focal is None else float(std[names.index("log_focal")]) * focal
@@ -107,7 +112,7 @@ def build_alignment(found: AdjustedImages) -> Alignment:
     groups = _groups(found)
     used = np.zeros(len(found.cameras), dtype=np.bool_)
     used[found.images] = True
-    homographies, poses = _in_frame_of_reference(found)
+    homographies, poses = _in_frame_of_reference(found, draft=draft)
     return Alignment(
         cameras=cameras,
         homographies=homographies,
@@ -130,8 +135,8 @@ def build_alignment(found: AdjustedImages) -> Alignment:
         rms=float(np.sqrt(squared[agreeing].mean())) if agreeing.any() else math.nan,
         links=_link_fits(found, squared, agreeing),
         relief=relief,
-        shape=_shape(found),
-        messages=_warnings(found, own, considered),
+        shape=None if draft else _shape(found),
+        messages=(*_warnings(found, own, considered), *found.messages),
     )
 
 
@@ -185,7 +190,7 @@ def _nearest_distortion_std(camera: Camera, covariance: FloatArray) -> float:
     return math.sqrt(max(float(gradient @ covariance @ gradient), 0.0))
 
 
-def _in_frame_of_reference(found: AdjustedImages) -> tuple[FloatArray, PlanarPoses | None]:
+def _in_frame_of_reference(found: AdjustedImages, *, draft: bool) -> tuple[FloatArray, PlanarPoses | None]:
     """Image-to-plane homographies of all images, and their poses where the model has them.
 
     The adjustment may have held the reference image anywhere; here it comes to the origin, with yaw zero and, as
@@ -215,7 +220,7 @@ def _in_frame_of_reference(found: AdjustedImages) -> tuple[FloatArray, PlanarPos
     )
     frame = rigid_in_plane(yaw[reference], position[reference], height[reference])
     poses = PlanarPoses(yaw, position, height, tilt).relative_to(reference)
-    covariances = pose_covariances(found.problem, fit) if found.options.pose_covariance else ()
+    covariances = pose_covariances(found.problem, fit) if found.options.pose_covariance and not draft else ()
     own = (poses.yaw, poses.position, poses.height, poses.tilt, *covariances)
     return of_all(frame @ np.linalg.inv(matrices)), PlanarPoses(*map(of_all, own))
 

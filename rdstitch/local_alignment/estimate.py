@@ -1,5 +1,6 @@
 """Whether images are aligned locally, and how: decided by matches that are held out of the fit."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -16,6 +17,8 @@ LocalAlignmentMode = Literal["auto", "off"] | int
 
 MAX_CELLS = 100
 _CELLS = 12
+# Of the grids of all images together: of more than some 800 images the cells are larger, to bound memory.
+_MAX_NODES = 120_000
 # The stiffest fields first: they are taken unless freer ones are better by a share that matters.
 _SLOPES = (0.02, 0.06, 0.2)
 _HELD_OUT = 5  # every fifth match
@@ -99,7 +102,7 @@ def align_locally(
             )
     share = min(1.0, _MAX_MATCHES / count)
     placed = PlacedMatches.join(pair.thinned(share) for pair in place_matches(matches, images))
-    cells = _CELLS if choice == "auto" else choice
+    cells = max(2, min(_CELLS, math.isqrt(_MAX_NODES // len(cameras)))) if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
     start, before, after = _choose(placed.take(~held_out), placed.take(held_out), images, cells)
     text = f"matches held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} pixels with it"

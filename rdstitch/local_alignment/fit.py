@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.alignment.normal_equations import symmetric_factor
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.late_imports import sparse, sparse_linalg
+from rdstitch.late_imports import sparse
 from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_shape, node_points
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches
 
@@ -26,13 +27,11 @@ from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches
 # many rounds at the end.
 _ROBUST, _MIN_SCALE = 2.0, 0.3
 _WIDEST, _SHARPENED, _SHARP_ROUNDS = 95.0, 0.5, 2
-# Of the residual of the normal equations, and the most iterations, of which a tenth is usual.
-_TOLERANCE, _MAX_ITERATIONS = 1e-4, 2000
 # A field vanishes over about this share of an image where nothing supports it.
 _FADE = 0.2
 # Fixed-point iterations from where an image shows something to where the alignment expects it; each leaves the
 # gradient's share of the error.
-_STEPS = 6
+_STEPS = 4
 # Limit of the displacement's change per pixel: half of what would fold an image.
 _MAX_GRADIENT = 0.5
 # A residual leads from the second image to the first.
@@ -102,7 +101,6 @@ def fit_fields(
     else:
         left, expected, scale = *start.explain(matches), 0.0
     sharp = 0 if start is None else 1
-    solution = np.zeros((prior.shape[0], left.shape[1])) if start is None else np.concatenate(start.values)
     while sharp < _SHARP_ROUNDS:
         length = np.linalg.norm(left, axis=1)
         sharpest = max(_MIN_SCALE, _ROBUST * min(float(np.median(length)), matches.noise))
@@ -110,7 +108,7 @@ def fit_fields(
         scale = max(scale, sharpest)
         weight = (1.0 / (1.0 + (length / scale) ** 2)) ** 2 / sharpest**2
         design = _design(matches, expected, cameras, shapes)
-        solution = _solve(design, weight, prior, matches.residual, solution)
+        solution = _solve(design, weight, prior, matches.residual)
         left = matches.residual - design @ solution
         expected = _expected(matches, images, design, solution)
         scale *= _SHARPENED
@@ -118,21 +116,12 @@ def fit_fields(
 
 
 def _solve(
-    design: "sparse.csr_array", weight: FloatArray, prior: "sparse.csr_array", residual: FloatArray, start: FloatArray
+    design: "sparse.csr_array", weight: FloatArray, prior: "sparse.csr_array", residual: FloatArray
 ) -> FloatArray:
-    """All coordinates (nodes, D) of the fields, from near ones, by conjugate gradients."""
+    """All coordinates (nodes, D) of the fields."""
     weighted = sparse.csr_array(design.T * weight)
-    # Hardly larger than the design, which each iteration would go through twice otherwise.
-    matrix = sparse.csr_array(weighted @ design + prior)
-
-    def normal(values: FloatArray) -> FloatArray:
-        return np.concatenate([matrix @ one for one in values.reshape(start.shape[::-1])])
-
-    diagonal = np.tile(matrix.diagonal(), start.shape[1])
-    operator = sparse_linalg.LinearOperator((diagonal.size, diagonal.size), normal, dtype=np.float64)
-    solution, _ = sparse_linalg.cg(operator, (weighted @ residual).T.ravel(), start.T.ravel(), rtol=_TOLERANCE,
-                                   maxiter=_MAX_ITERATIONS, M=sparse.diags_array(1.0 / diagonal))  # fmt: skip
-    return np.asarray(solution).reshape(start.shape[::-1]).T
+    solution: FloatArray = symmetric_factor(sparse.csc_array(weighted @ design + prior)).solve(weighted @ residual)
+    return solution
 
 
 def _expected(

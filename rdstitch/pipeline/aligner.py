@@ -1,14 +1,13 @@
 """Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Literal, Self
 
 import numpy as np
 
-from rdstitch.alignment import Alignment, AlignmentOptions, align, most_matches_read
+from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.frames import stored, turned_alignment, turned_link, turned_tilts, turns
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
@@ -35,10 +34,11 @@ a plane explains the images as well; for "calibrate" images of a repeated patter
 doubts about their places do not matter; for "trajectory" poses must be metric, so that the freest model is that of
 planar motion with small tilts."""
 
-_CLOSURE_ROUNDS = 2
+_ROUNDS = 2
+"""Of registering more pairs and selecting inliers again at most, each by what the one before has shown."""
 
-_SELECTION_ROUNDS = 2
-"""Of selecting inliers by the whole lens at most, each with what the one before has found."""
+_SETTLED = 0.05
+"""Share of the inliers that must have changed for the images to be aligned again."""
 
 _EXPLAINED = 0.5
 """Share of the matches off the planes of their pairs that are where the alignment expects them: more than half, and it
@@ -64,6 +64,7 @@ class AlignedPairs:
     pairs: tuple[PairRegistration, ...]  # every pair that was compared, in the order of the images
     alignment: Alignment
     rough: bool = False  # whether the inliers that it was made from are those over rough ground
+    task: AlignmentTask | None = None  # what the alignment is a draft of; None where it is complete
 
 
 @dataclass(frozen=True)
@@ -112,14 +113,25 @@ class Aligner:
 
     def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
         """Align the images by the pairs that were registered; from an earlier run where the cache has it."""
+        return self.completed(self.draft(pairs))
+
+    def draft(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
+        """Model, lens and poses by a few matches of each pair: what shows which pairs and matches are missing."""
         return_freed_memory()
-        aligned = AlignedPairs(tuple(pairs), self._aligned(pairs))
+        aligned = self._drafted(pairs)
         ground = over_rough_ground(pairs, self.threshold)
         if ground is not pairs and not self._explains(aligned.alignment, pairs, ground):
-            over = self._aligned(ground)
-            if over.rms <= limit("error of rough ground") * self.threshold:  # else it is not one ground
-                aligned = replace(aligned, alignment=over, rough=True)
+            over = self._drafted(ground)
+            if over.alignment.rms <= limit("error of rough ground") * self.threshold:  # else it is not one ground
+                aligned = replace(over, pairs=tuple(pairs), rough=True)
         return self.metric(aligned) if self.needs_poses else aligned
+
+    def completed(self, aligned: AlignedPairs) -> AlignedPairs:
+        """The images adjusted to all matches, where their alignment is a draft."""
+        if (task := aligned.task) is None:
+            return aligned
+        alignment = self._recalled("alignment", task, lambda: task.result)
+        return replace(aligned, alignment=alignment, task=None)
 
     def used(self, aligned: AlignedPairs) -> Sequence[PairRegistration]:
         """The pairs with the inliers that the alignment was made from."""
@@ -140,65 +152,60 @@ class Aligner:
         every = np.concatenate(errors)
         return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
 
-    def _aligned(self, pairs: Sequence[PairRegistration]) -> Alignment:
-        found = [pair for pair in pairs if pair.relation]
-        most = most_matches_read(len(found), self.options)
-        links = tuple(pair.link().thinned(most) for pair in found)
-        if not links:
+    def _drafted(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
+        related = [pair for pair in pairs if pair.relation]
+        if not related:
             raise RegistrationError(_no_overlap(self.paths, pairs))
-        back, gravity = stored(self._turns), self.options.gravity
-        cameras = tuple(camera.turned(own) for camera, own in zip(self.cameras, back, strict=True))
-        links = tuple(turned_link(link, self.cameras, back) for link in links)
-        inputs = (cameras, self.cache.digest(links), self.options)
-        compute = partial(align, cameras, links, self.options)
-        alignment = self.cache.recall("alignment", inputs, compute)
+        most, back = most_matches_read(len(related), self.options), stored(self._turns)
+        cameras = tuple(camera.turned(turn) for camera, turn in zip(self.cameras, back, strict=True))
+        links = tuple(turned_link(pair.link().thinned(most), self.cameras, back) for pair in related)
+        task = AlignmentTask(cameras, links, self.options)
+        return AlignedPairs(tuple(pairs), self._recalled("draft", task, lambda: task.draft), task=task)
+
+    def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Alignment]) -> Alignment:
+        """An alignment of the upright images; from an earlier run where the cache has it."""
+        inputs = (task.cameras, self.cache.digest(task.links), task.options)
+        gravity = task.options.gravity
         down = None if gravity is None else np.einsum("nij,nj->ni", turns(self._turns), np.asarray(gravity))
-        return turned_alignment(alignment, self._turns, down)
+        return turned_alignment(self.cache.recall(stage, inputs, compute), self._turns, down)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
-        """The same pairs with a model that has metric poses, where the user left the choice of the model open."""
+        """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""
         if aligned.alignment.poses is not None or aligned.alignment.on_sphere or self.options.model != "auto":
             return aligned
-        return replace(self, options=replace(self.options, model="pose")).align(aligned.pairs)
+        return replace(self, options=replace(self.options, model="pose")).draft(aligned.pairs)
 
 
 def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candidates: Sequence[Pair]) -> AlignedPairs:
-    """Register images that the poses put beside each other, and the candidate pairs of images without a pose."""
-    for _ in range(_CLOSURE_ROUNDS):
+    """Draft the alignment anew with what a draft shows to be missing: pairs, and inliers.
+
+    Those are pairs of images that the poses put beside each other, candidate pairs of images without a pose, and, where
+    the lens has more than λ, what it selects: with the one λ of a pair, matches at the corners of it are outliers.
+    """
+    for _ in range(_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
         tried = {pair.images for pair in pairs}
         loop_closures = neighbours(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
         unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
-        found = pairing.estimate(sorted(unaligned.union(loop_closures)), distortion=alignment.distortion)
-        pairs = tuple(sorted([*pairs, *found], key=lambda pair: pair.images))
-        if not any(pair.relation for pair in found):
+        more = pairing.estimate(sorted(unaligned.union(loop_closures)), distortion=alignment.distortion)
+        selected = select_by_whole_lens(aligned, aligner.threshold)
+        pairs = tuple(sorted([*(selected or pairs), *more], key=lambda pair: pair.images))
+        if selected is None and not any(pair.relation for pair in more):
             return replace(aligned, pairs=pairs)
-        aligned = aligner.align(pairs)
+        aligned = aligner.draft(pairs)
     return aligned
 
 
-def select_by_whole_lens(aligner: Aligner, aligned: AlignedPairs) -> AlignedPairs:
-    """Where the lens has more than λ, select the inliers of all pairs again with it.
-
-    Pairs on their own have one λ, with which matches at the corners of such a lens are outliers.
-    """
-    pairs = aligned.pairs
-    for _ in range(_SELECTION_ROUNDS):
-        former = aligned.alignment
-        if former.lens == "division" and not former.cameras[former.reference].higher:
-            break
-        selected = reselect_inliers(pairs, former, aligner.threshold)
-        aligned = aligner.align([selected.get(k, pair) for k, pair in enumerate(pairs)])
-        if _same_lens(*(found.cameras[found.reference] for found in (former, aligned.alignment))):
-            break
-    return aligned
-
-
-def _same_lens(former: Camera, found: Camera) -> bool:
-    """Whether no parameter of a lens has changed by more than its standard deviation."""
-    before, after = (np.array([*c.coefficients, *np.array(c.center) / c.scale]) for c in (former, found))
-    variance = 0.0 if found.lens_covariance is None else np.diag(found.lens_covariance)
-    return bool(((after - before) ** 2 <= variance).all())
+def select_by_whole_lens(aligned: AlignedPairs, threshold: float) -> list[PairRegistration] | None:
+    """The pairs with the inliers that a lens of more than λ selects; None where these are hardly others."""
+    alignment, pairs = aligned.alignment, aligned.pairs
+    if alignment.lens == "division" and not alignment.cameras[alignment.reference].higher:
+        return None
+    selected = reselect_inliers(pairs, alignment, threshold)
+    changed = sum(int((pair.relation.inliers != pairs[k].relation.inliers).sum()) for k, pair in selected.items())
+    if changed <= _SETTLED * sum(int(pair.relation.inliers.sum()) for pair in selected.values()):
+        return None
+    return [selected.get(k, pair) for k, pair in enumerate(pairs)]
 
 
 def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:

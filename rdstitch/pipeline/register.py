@@ -18,7 +18,7 @@ from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, names_of, shortened
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner, Purpose, close_loops, impossible_estimates_fail, select_by_whole_lens
+from rdstitch.pipeline.aligner import Aligner, Purpose, close_loops, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.repeated_pattern import match_crossings, settle_repeated_pattern
 from rdstitch.pipeline.working_size import at_working_size
@@ -85,14 +85,14 @@ def register(
     pairing, pairs = moving or (pairing, pairs)
     pairs = pairing.match_repeated_patterns(pairs) if purpose == "calibrate" else pairs
     mixed, other_lens = separate_lenses(aligner.cameras, pairs, options.threshold, options.known_distortion)
-    aligned = aligner.align([pair for pair in pairs if not {*pair.images} & other_lens.keys()])
+    aligned = aligner.draft([pair for pair in pairs if not {*pair.images} & other_lens.keys()])
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
     aligned = close_loops(aligner, pairing, aligned, candidates)
-    aligned = select_by_whole_lens(aligner, aligned)
+    aligned = aligner.completed(aligner.metric(aligned) if purpose == "trajectory" else aligned)
     settle = match_crossings if purpose == "calibrate" else settle_repeated_pattern
     aligned, undecided = settle(aligner, pairing, aligned, sources, detected.stretch, options.threads)
     if purpose == "trajectory":
-        aligned = aligner.metric(aligned)
+        aligned = aligner.completed(aligner.metric(aligned))
     unplaced = {**other_lens, **detected.damaged, **undecided}
     return Registration(
         tuple(sources),

@@ -16,7 +16,7 @@ from rdstitch.io import write_image
 from rdstitch.messages import Message, left_out
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import _without, accept
-from rdstitch.pipeline.aligner import Aligner
+from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.pipeline.register import register
 from rdstitch.verification.verdict import RefusedError
 from tests.cli.running import flight
@@ -50,9 +50,10 @@ def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest
 
     def aligned(aligner: Aligner, pairs: object) -> Any:
         asked.append(aligner.options.model)
-        return SimpleNamespace(poses=None if aligner.options.model == "auto" else "poses", on_sphere=False)
+        found: Any = SimpleNamespace(poses=None if aligner.options.model == "auto" else "poses", on_sphere=False)
+        return AlignedPairs((), found)
 
-    monkeypatch.setattr(Aligner, "_aligned", aligned)
+    monkeypatch.setattr(Aligner, "_drafted", aligned)
     monkeypatch.setattr("rdstitch.pipeline.aligner.over_rough_ground", lambda pairs, threshold: pairs)
     free = Aligner.of([], OPTIONS, NO_CACHE)
     assert free.align(()).alignment.poses is None
