@@ -34,8 +34,8 @@ from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions
 
 _PAIRS_MATCHED_AT_ONCE, _MIN_BATCHES = 32, 8  # pairs of a task at the most; tasks at the least
-_PRESCREEN_FEATURES = 1000  # strongest features of an image, by which pairs are prescreened
-_MIN_PRESCREEN_MATCHES = 8  # matches among these; images that share nothing have three to six by chance
+_PRESCREEN_FEATURES = 500  # strongest features of an image, by which pairs are prescreened
+_MIN_PRESCREEN_MATCHES = 6  # matches among these; images that share nothing have two to five by chance
 _MIN_RELATIVE_MATCHES = 0.05  # share of the matches that an image has with the one most like it; less adds nothing
 _FEW_INLIERS = 50  # of a pair of a repeated pattern, which shows hundreds of keypoints
 _MIN_INLIER_RATIO = 0.7  # of such matches that agree: right pairs have 0.8 to 1, lattices that hardly match half

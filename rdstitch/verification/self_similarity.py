@@ -15,11 +15,12 @@ from rdstitch.radial_homography import to_plane
 from rdstitch.verification.limits import limit
 from rdstitch.verification.photometric_agreement import ComparedImage, Grey
 
-MAX_SIDE = 256  # pixels of the images that are compared
+MAX_SIDE = 128  # pixels of the images that are compared; twice as many say the same, and take four times as long
 _MAX_PX = 4  # times the sides of an image that its outline on the plane may have
-_COARSEST = 8.0  # pixels, standard deviation of the blur that brightness is measured by
-_MIN_SHIFT = 14  # pixels: shifts that are none
-SLACK = 3  # pixels by which the registration may be off
+_COARSEST = 4.0  # pixels, standard deviation of the blur that brightness is measured by
+_MIN_SHIFT = 7  # pixels: shifts that are none
+SLACK = 1.5  # pixels by which the registration may be off
+_PEAK_SIDE = 5  # pixels, in which a peak is the largest value
 _MIN_NORM = 1e-4  # of the largest: where fewer pixels overlap, rounding decides
 
 
@@ -57,8 +58,11 @@ def drawing_scale(camera: Camera, homography: FloatArray, longest_side: int = MA
     return float(min(1.0, longest_side / max(height, width)) / np.sqrt(area))
 
 
-def draw(image: ComparedImage, scale: float, longest_side: int = MAX_SIDE) -> Drawing:
-    """Draw an image on the plane with so many pixels a unit; ``longest_side`` is that of :func:`drawing_scale`."""
+def draw(image: ComparedImage, scale: float, longest_side: int = MAX_SIDE, coarsest: float = _COARSEST) -> Drawing:
+    """Draw an image on the plane with so many pixels a unit; ``longest_side`` is that of :func:`drawing_scale`.
+
+    What is coarser than a blur by ``coarsest`` pixels counts as brightness.
+    """
     outline = to_plane(image.camera, image.homography, image.camera.outline(16)) * scale
     if not np.isfinite(outline).any():  # all of it behind the horizon
         return Drawing(np.full((1, 1), np.nan, dtype=np.float32), np.zeros(2))
@@ -75,7 +79,7 @@ def draw(image: ComparedImage, scale: float, longest_side: int = MAX_SIDE) -> Dr
         blurred = np.asarray(cv2.GaussianBlur(image.grey, (0, 0), 0.5 * factor), dtype=np.float32)
         image = replace(image, grey=blurred)
     drawn = image.sampled(lambda px: (px + origin) / scale, (0, 0, width, height))
-    return Drawing(_without_brightness(drawn), origin)
+    return Drawing(_without_brightness(drawn, coarsest), origin)
 
 
 def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
@@ -91,7 +95,7 @@ def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
         return Ambiguity(0.0, 0.0, 0.0)
     score = overlaps.correlation()
     # A peak of its own, not the flank of the one here.
-    peak = score >= cv2.dilate(score, np.ones((2 * SLACK + 1, 2 * SLACK + 1), dtype=np.uint8))
+    peak = score >= cv2.dilate(score, np.ones((_PEAK_SIDE, _PEAK_SIDE), dtype=np.uint8))
     enough = overlaps.area >= limit("kept overlap") * most
     other = np.where(peak & (distance > _MIN_SHIFT) & enough, score, np.float32(0.0))
     best = int(other.argmax())
@@ -104,11 +108,11 @@ def find_ambiguity(first: ComparedImage, second: ComparedImage) -> Ambiguity:
     return placement_ambiguity(draw(first, scale), draw(second, scale))
 
 
-def _without_brightness(image: Grey) -> Grey:
+def _without_brightness(image: Grey, coarsest: float) -> Grey:
     """What is finer than a blur, where the image is."""
     seen = np.isfinite(image)
-    weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), _COARSEST)
-    coarse = cv2.GaussianBlur(np.where(seen, image, np.float32(0)), (0, 0), _COARSEST) / np.maximum(weight, 1e-6)
+    weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), coarsest)
+    coarse = cv2.GaussianBlur(np.where(seen, image, np.float32(0)), (0, 0), coarsest) / np.maximum(weight, 1e-6)
     return np.where(seen, image - coarse, np.float32(np.nan)).astype(np.float32)
 
 
