@@ -5,15 +5,13 @@ from pathlib import Path
 import click
 
 from rdstitch_cli import options
-from rdstitch_cli.help_pages import GroupedCommand
+from rdstitch_cli.help_pages import command
 from rdstitch_cli.terminal import Reporter
 
 
-@click.command(
-    cls=GroupedCommand,
-    short_help="What to expect of a run, and what to change before it.",
-    epilog="""\b
-Examples:
+@command(
+    "What to expect of a run, and what to change before it.",
+    """
   rdstitch doctor flight/
   rdstitch doctor drive.mp4 --json
 """,
