@@ -101,7 +101,7 @@ def main() -> None:
 
 
 def _open_standard_streams() -> None:
-    """What was closed by whoever started this leads to nowhere: the next file opened must not become its successor."""
+    """Lead what whoever started this has closed to nowhere: the next file opened must not become its successor."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             nowhere = os.open(os.devnull, os.O_RDWR)
@@ -192,7 +192,7 @@ def _nobody_listens() -> int:
 
 
 def _is_nowhere() -> bool:
-    """Whether the current folder has been deleted, so that relative names lead nowhere."""
+    """Check whether the current folder has been deleted, so that relative names lead nowhere."""
     try:
         Path.cwd()
     except FileNotFoundError:

@@ -61,7 +61,7 @@ def resolve(inputs: tuple[Path, ...]) -> list[Path]:
 
 
 def is_given(name: str) -> bool:
-    """Whether the user set an option of the running command, rather than left it at its default."""
+    """Check whether the user set an option of the running command, rather than left it at its default."""
     return click.get_current_context().get_parameter_source(name) not in (None, ParameterSource.DEFAULT)
 
 

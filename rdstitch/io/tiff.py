@@ -63,7 +63,7 @@ def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: 
 
 
 def _has_mask(layout: Layout) -> bool:
-    """Whether transparency goes onto a page of its own."""
+    """Check whether transparency goes onto a page of its own."""
     return layout.transparent and layout.channels == 1
 
 
@@ -138,7 +138,7 @@ def _tiles_of(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
 
 
 def _has_predictor(dtype: np.dtype[Any]) -> bool:
-    """Whether differences of neighbours are stored; what is usual for floating point, few programs can read."""
+    """Check whether differences of neighbours are stored; what is usual for floating point, few programs can read."""
     return dtype.kind == "u"
 
 

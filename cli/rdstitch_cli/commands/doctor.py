@@ -31,9 +31,9 @@ def doctor(inputs: tuple[Path, ...], every: int | None, topic: str | None, as_js
     from rdstitch.doctor import examine
     from rdstitch.outputs import json_bytes
 
-    found = examine(options.resolve(inputs), every=every, topic=topic, progress=reporter)
+    examination = examine(options.resolve(inputs), every=every, topic=topic, progress=reporter)
     reporter.finish()
     if as_json:
-        click.echo(json_bytes(found.as_dict()), nl=False)
+        click.echo(json_bytes(examination.as_dict()), nl=False)
     else:
-        click.echo(found.as_text(), nl=False)
+        click.echo(examination.as_text(), nl=False)
