@@ -105,7 +105,7 @@ class Cache:
             raise OutputError(f"{self.folder}: no permission to write into the folder of the cache")
 
     def recall(self, stage: str, inputs: tuple[Any, ...], compute: Callable[[], Value]) -> Value:
-        """What a stage gives for its inputs: from an earlier run, else computed now and kept."""
+        """Give what a stage gives for its inputs: from an earlier run, else computed now and kept."""
         return self.recall_many(stage, [inputs], lambda _: [compute()])[0]
 
     def stored(self, stage: str, inputs: tuple[Any, ...], compute: Callable[[], Value]) -> Stored[Value]:
@@ -133,7 +133,7 @@ class Cache:
         return [kept[0] for kept in results]
 
     def _file(self, stage: str, inputs: tuple[Any, ...]) -> Path:
-        """Where the result of a stage is kept: its name is the digest of everything that it depends on."""
+        """Give where the result of a stage is kept: its name is the digest of everything that it depends on."""
         assert self.folder is not None
         # A run has one software from beginning to end.
         name = digest((_FORMAT, software() if self.temporary is None else {}, stage, inputs))
@@ -155,7 +155,7 @@ class Cache:
         return False
 
     def file(self, path: str | Path | None) -> str:
-        """What stands for the content of a file in the inputs of a stage; empty without a file or a cache.
+        """Give what stands for the content of a file in the inputs of a stage; empty without a file or a cache.
 
         A file that cannot be read is unlike any other, and itself the next time: nothing is kept of it.
         """
@@ -172,7 +172,7 @@ class Cache:
             return os.urandom(16).hex()
 
     def digest(self, value: Any) -> str:
-        """What stands for a large value in the inputs of several results; empty without a cache."""
+        """Give what stands for a large value in the inputs of several results; empty without a cache."""
         return "" if self.folder is None else digest(value)
 
 

@@ -63,7 +63,7 @@ _GUESSED_FOCAL = 1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middl
 
 
 def is_focal_length(focal: float, image_size: tuple[int, int]) -> bool:
-    """Whether a number can be a focal length, pixels, of images of a size; damaged files hold others."""
+    """Check whether a number can be a focal length, pixels, of images of a size; damaged files hold others."""
     low, high = _FOCAL_LIMITS
     return low < focal / (math.hypot(*image_size) / 2) < high
 
@@ -204,7 +204,7 @@ class Camera:
         return nearest, float(np.sqrt(np.mean(excess**2))), float(np.abs(excess).max())
 
     def excess_radius(self, radii: FloatArray) -> FloatArray:
-        """How much farther out this lens measures rays than the nearest one-parameter lens does, pixels (N,).
+        """Give how much farther out this lens measures rays than the nearest one-parameter lens does, pixels (N,).
 
         Parameters
         ----------

@@ -98,14 +98,14 @@ def epsg_of(text: str) -> int | None:
 
     ``EPSG:32632``, ``WGS84 UTM 32N`` and PROJ's ``+proj=utm +zone=32 +datum=WGS84`` and ``+proj=longlat`` are known.
     """
-    if found := re.fullmatch(r"EPSG:(\d{1,5})", text.strip(), re.IGNORECASE):
-        return int(found[1])
-    if found := re.fullmatch(r"WGS ?84 UTM (\d{1,2}) ?([NS])", text.strip(), re.IGNORECASE):
-        return (_NORTH if found[2] in "nN" else _SOUTH) + int(found[1])
+    if code := re.fullmatch(r"EPSG:(\d{1,5})", text.strip(), re.IGNORECASE):
+        return int(code[1])
+    if code := re.fullmatch(r"WGS ?84 UTM (\d{1,2}) ?([NS])", text.strip(), re.IGNORECASE):
+        return (_NORTH if code[2] in "nN" else _SOUTH) + int(code[1])
     if re.search(r"\+proj=(longlat|latlong)\b", text):
         return WGS84
-    if re.search(r"\+proj=utm\b", text) and (found := re.search(r"\+zone=(\d{1,2})\b", text)):
-        return (_SOUTH if "+south" in text else _NORTH) + int(found[1])
+    if re.search(r"\+proj=utm\b", text) and (code := re.search(r"\+zone=(\d{1,2})\b", text)):
+        return (_SOUTH if "+south" in text else _NORTH) + int(code[1])
     return None
 
 

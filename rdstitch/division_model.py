@@ -217,21 +217,21 @@ def _distorted_radius(radius: FloatArray, distortion: float, higher: tuple[float
     with np.errstate(all="ignore"):
         solvable = limit - radius * float(divisor(np.asarray(limit**2), distortion, higher)) > 0.0
         discriminant = np.maximum(1.0 - 4.0 * distortion * radius**2, 0.0)
-        found = np.minimum(2.0 * radius / (1.0 + np.sqrt(discriminant)), limit)
+        measured = np.minimum(2.0 * radius / (1.0 + np.sqrt(discriminant)), limit)
         settled = np.zeros_like(solvable)
         for _ in range(_QUICK_STEPS):
-            q = found**2
-            slope = 1.0 - 2.0 * radius * found * divisor_slope(q, distortion, higher)
-            step = (found - radius * divisor(q, distortion, higher)) / slope
-            found = found - step
+            q = measured**2
+            slope = 1.0 - 2.0 * radius * measured * divisor_slope(q, distortion, higher)
+            step = (measured - radius * divisor(q, distortion, higher)) / slope
+            measured = measured - step
             settled = np.abs(step) <= _QUICK_TOLERANCE * limit
             if settled.all():
                 break
-    left = solvable & ~(settled & (slope > 0.0) & (found >= 0.0) & (found <= limit))
+    left = solvable & ~(settled & (slope > 0.0) & (measured >= 0.0) & (measured <= limit))
     if left.any():
-        found = np.array(found)
-        found[left] = _guarded_radius(radius[left], distortion, higher)
-    return np.where(solvable, found, np.nan)
+        measured = np.array(measured)
+        measured[left] = _guarded_radius(radius[left], distortion, higher)
+    return np.where(solvable, measured, np.nan)
 
 
 def _guarded_radius(radius: FloatArray, distortion: float, higher: tuple[float, ...]) -> FloatArray:
@@ -239,27 +239,27 @@ def _guarded_radius(radius: FloatArray, distortion: float, higher: tuple[float, 
     limit = valid_radius(distortion, higher)
     with np.errstate(over="ignore", invalid="ignore"):
         low, high = np.zeros_like(radius), np.full_like(radius, limit)
-        found = (low + high) / 2.0
+        measured = (low + high) / 2.0
         for _ in range(_NEWTON_STEPS):
-            q = found**2
-            value = found - radius * divisor(q, distortion, higher)
-            low, high = np.where(value > 0.0, low, found), np.where(value > 0.0, found, high)
-            slope = 1.0 - 2.0 * radius * found * divisor_slope(q, distortion, higher)
-            following = found - value / np.where(slope > 0.0, slope, np.nan)
+            q = measured**2
+            value = measured - radius * divisor(q, distortion, higher)
+            low, high = np.where(value > 0.0, low, measured), np.where(value > 0.0, measured, high)
+            slope = 1.0 - 2.0 * radius * measured * divisor_slope(q, distortion, higher)
+            following = measured - value / np.where(slope > 0.0, slope, np.nan)
             following = np.where((following >= low) & (following <= high), following, (low + high) / 2.0)
-            step = np.abs(following - found)
-            found = following
+            step = np.abs(following - measured)
+            measured = following
             if not (step > _NEWTON_TOLERANCE * limit).any():
                 break
-    return found
+    return measured
 
 
 def is_one_to_one(radius: float, coefficients: Sequence[float]) -> bool:
-    """Whether the model of λ, μ, … holds out to a radius."""
+    """Check whether the model of λ, μ, … holds out to a radius."""
     return valid_radius(float(coefficients[0]), tuple(float(value) for value in coefficients[1:])) > radius
 
 
 def folds(radius: float, coefficients: Sequence[float]) -> bool:
-    """Whether the undistorted radius stops growing within a radius, among rays that are before the camera."""
+    """Check whether the undistorted radius stops growing within a radius, among rays that are before the camera."""
     distortion, higher = float(coefficients[0]), tuple(float(value) for value in coefficients[1:])
     return _fold_radius(distortion, higher) <= min(radius, horizon_radius(distortion, higher))

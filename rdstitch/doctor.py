@@ -246,7 +246,7 @@ def _camera(source: Source) -> str:
 
 
 def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
-    """What is known of the focal length, and whether the lens was zoomed."""
+    """Give what is known of the focal length, and whether the lens was zoomed."""
     pixels = [(s.metadata.focal_px, max(s.metadata.size)) for s in sources if s.metadata.focal_px is not None]
     if not pixels:
         return "not known from EXIF; it is guessed, which matters for trajectory only", False

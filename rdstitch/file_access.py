@@ -47,7 +47,7 @@ def canonical_text(name: str) -> str:
 
 
 def is_url(path: str | Path) -> bool:
-    """Whether a name is a URL; also once it was made a path."""
+    """Check whether a name is a URL; also once it was made a path."""
     return _SCHEME.match(str(path).rpartition(_SEVERAL)[2]) is not None
 
 
@@ -97,11 +97,11 @@ def held_in_memory(path: Path) -> Iterator[None]:
 
 
 def remote_status(path: str | Path) -> tuple[bool, int | None, str]:
-    """Whether it is a folder, its size in bytes where the server says that, and what changes with its content."""
+    """Check whether it is a folder, its size in bytes where the server says that, and what changes with its content."""
     with _as_os_error():
         system, name = _filesystem(path)
-        found = system.info(name)
-        return found["type"] == "directory", found.get("size"), system.ukey(name)
+        info = system.info(name)
+        return info["type"] == "directory", info.get("size"), system.ukey(name)
 
 
 def remote_names(url: str) -> list[str]:
@@ -109,12 +109,12 @@ def remote_names(url: str) -> list[str]:
     with _as_os_error():
         system, name = _filesystem(url)
         if any(letter in url for letter in "*["):
-            found = system.glob(name)
+            entries = system.glob(name)
         else:
-            found = system.ls(name, detail=False) if system.isdir(name) else []
+            entries = system.ls(name, detail=False) if system.isdir(name) else []
         before = url.rpartition(_SEVERAL)[0]
         chain = f"{before}{_SEVERAL}" if before else ""
-        return [chain + system.unstrip_protocol(entry).rpartition(_SEVERAL)[2] for entry in found]
+        return [chain + system.unstrip_protocol(entry).rpartition(_SEVERAL)[2] for entry in entries]
 
 
 def _filesystem(path: str | Path) -> tuple[Any, str]:

@@ -72,7 +72,7 @@ def _groups(root: Path, controller: str) -> Iterator[Path]:
 
 
 def _text(file: Path) -> str:
-    """What a file of the system says; empty where it says nothing."""
+    """Give what a file of the system says; empty where it says nothing."""
     try:
         return file.read_text()
     except (OSError, UnicodeDecodeError):

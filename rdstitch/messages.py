@@ -98,9 +98,11 @@ def _listed(paths: Sequence[str]) -> str:
     """All of them; the folder is named where it changes."""
     folders = [None, *(Path(path).parent for path in paths)]
     named = zip(paths, names_of(paths), folders[:-1], folders[1:], strict=True)
-    return ", ".join(name if own == before or _is_temporary(own) else path for path, name, before, own in named)
+    return ", ".join(
+        name if folder == before or _is_temporary(folder) else path for path, name, before, folder in named
+    )
 
 
 def _is_temporary(folder: Path | None) -> bool:
-    """Whether it is one that frames of a video were extracted to, which nobody finds afterwards."""
+    """Check whether it is one that frames of a video were extracted to, which nobody finds afterwards."""
     return folder is not None and folder.name.startswith("rdstitch-") and folder.suffix == ".part"

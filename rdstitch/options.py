@@ -227,7 +227,7 @@ class StitchOptions:
         )
 
     def executor(self, images: int) -> Executor:
-        """Where the tasks of a set of so many images are computed; to be used in a ``with`` block."""
+        """Give where the tasks of a set of so many images are computed; to be used in a ``with`` block."""
         return open_executor(self.threads, images, scheduler=self.scheduler, store=self.cache)
 
     @property

@@ -144,7 +144,7 @@ def check_tiles_folder(folder: Path, overwrite: bool) -> None:
 
 
 def holds_only_tiles(folder: Path) -> bool:
-    """Whether everything in a folder, however deep, is what :func:`write_deep_zoom` writes there."""
+    """Check whether everything in a folder, however deep, is what :func:`write_deep_zoom` writes there."""
     with os.scandir(folder) as levels:
         for level in levels:
             if not _LEVEL_NAME.fullmatch(level.name) or not level.is_dir(follow_symlinks=False):
@@ -169,8 +169,8 @@ def fingerprint(image: Path, tiles: Path | None = None) -> Fingerprint:
     """The fingerprint of an image, and of the tiles that belong to it."""
     if tiles is None:
         return Fingerprint(image.stat().st_size, _sha256(image))
-    found = sorted(path for path in tiles.rglob("*") if path.is_file())
-    files = [(".dzi", image), *((file.relative_to(tiles).as_posix(), file) for file in found)]
+    members = sorted(path for path in tiles.rglob("*") if path.is_file())
+    files = [(".dzi", image), *((file.relative_to(tiles).as_posix(), file) for file in members)]
     listing = "".join(f"{_sha256(file)}  {name}\n" for name, file in files)
     return Fingerprint(sum(file.stat().st_size for _, file in files), hashlib.sha256(listing.encode()).hexdigest())
 
@@ -321,7 +321,7 @@ class Outputs:
         return []
 
     def staged(self, path: str | Path) -> Path | None:
-        """Where an output lies until it is in its place; None where none of this name is staged."""
+        """Give where an output lies until it is in its place; None where none of this name is staged."""
         return next((item.staged for item in self._items if item.name == Path(path)), None)
 
     def _stage(self, name: Path, *, is_folder: bool) -> Path:

@@ -107,9 +107,9 @@ def motions_from_homographies(homography: FloatArray, normal: FloatArray | None 
     )
     motions = _motions_for_normals(np.repeat(h, 4, axis=0), normals.reshape(-1, 3)).reshape(-1, 4, 6)
     rotation = rotation_from_tilt(motions[..., :2])
-    own = rotation @ rigid_in_plane(motions[..., 2], motions[..., 3:5], motions[..., 5]) @ np.swapaxes(rotation, -2, -1)
-    own = own / np.linalg.norm(own, axis=(-2, -1), keepdims=True)
-    distance = [np.linalg.norm(own - sign * h[:, None], axis=(-2, -1)) for sign in (1.0, -1.0)]
+    fit = rotation @ rigid_in_plane(motions[..., 2], motions[..., 3:5], motions[..., 5]) @ np.swapaxes(rotation, -2, -1)
+    fit = fit / np.linalg.norm(fit, axis=(-2, -1), keepdims=True)
+    distance = [np.linalg.norm(fit - sign * h[:, None], axis=(-2, -1)) for sign in (1.0, -1.0)]
     best = np.minimum(*distance).argmin(axis=1)
     return np.asarray(motions[np.arange(len(h)), best])
 

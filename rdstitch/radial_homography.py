@@ -32,7 +32,7 @@ def project(homogeneous: FloatArray) -> FloatArray:
 
 
 def to_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
-    """Where measured points of an image, pixels (N, 2), lie on the plane; NaN at and beyond the horizon.
+    """Give where measured points of an image, pixels (N, 2), lie on the plane; NaN at and beyond the horizon.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def _mapped(homography: FloatArray, points: FloatArray) -> FloatArray:
 def transfer(
     homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, higher: Sequence[float] = ()
 ) -> FloatArray:
-    """Where measured points of image 1 are measured in image 2: undistort, apply H, distort.
+    """Give where measured points of image 1 are measured in image 2: undistort, apply H, distort.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ class RadialHomography:
         return f"<RadialHomography {self.model}, {agreeing}, {known}, rms {self.rms:.2f} pixels>"
 
     def __bool__(self) -> bool:
-        """Whether the fit succeeded."""
+        """Check whether the fit succeeded."""
         return self.ok
 
     @property

@@ -8,27 +8,10 @@ from typing import Any
 import click
 
 from rdstitch.errors import InputError
-from rdstitch_cli.option_texts import TEXTS
+from rdstitch_cli.option_texts import option
 
-COMMON = "common"
-"""The table that holds for every command."""
-
-
-CONFIG_FILE = "rdstitch_cli.config"
-"""Key of the file in the context's ``meta``."""
-
-
-def config_option() -> click.Option:
-    """The option ``--config``, which sets defaults before any other option is looked at."""
-    return click.Option(
-        ["--config"],
-        type=click.Path(path_type=Path, readable=False),
-        metavar=TEXTS["--config"].called,
-        is_eager=True,
-        expose_value=False,
-        callback=_apply,
-        help=TEXTS["--config"].text,
-    )
+COMMON = "common"  # the table that holds for every command
+CONFIG_FILE = "rdstitch_cli.config"  # key of the file in the context's meta
 
 
 def read_config(path: Path, commands: Mapping[str, click.Command], running: str) -> dict[str, Any]:
@@ -36,7 +19,7 @@ def read_config(path: Path, commands: Mapping[str, click.Command], running: str)
     tables = _parse(path)
     known = {name: _options(command) for name, command in commands.items()}
     known[COMMON] = {key: option for options in known.values() for key, option in options.items()}
-    found: dict[str, Any] = {}
+    defaults: dict[str, Any] = {}
     for table in sorted(tables, key=lambda name: name != COMMON):  # the command's own table wins
         if not isinstance(tables[table], dict):
             raise InputError(f"{path}: {table}: options belong into a table, such as [{COMMON}] or [{running}]")
@@ -48,17 +31,8 @@ def read_config(path: Path, commands: Mapping[str, click.Command], running: str)
             option = known[table][key]
             converted = _converted(option, value, f"{path}: {table}.{key}")
             if table in (COMMON, running) and key in known[running] and option.name is not None:
-                found[option.name] = converted
-    return found
-
-
-def _apply(context: click.Context, option: click.Parameter, path: Path | None) -> None:
-    """Make the values of the file the defaults of the running command."""
-    group = context.find_root().command
-    if path is None or context.resilient_parsing or not isinstance(group, click.Group):
-        return
-    context.meta[CONFIG_FILE] = path
-    context.default_map = read_config(path, group.commands, str(context.command.name))
+                defaults[option.name] = converted
+    return defaults
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -100,3 +74,22 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
 
     close = get_close_matches(name.replace("_", "-"), list(known), n=1)
     return f"; do you mean {close[0]!r}?" if close else ""
+
+
+def _apply(context: click.Context, option: click.Parameter, path: Path | None) -> None:
+    """Make the values of the file the defaults of the running command."""
+    group = context.find_root().command
+    if path is None or context.resilient_parsing or not isinstance(group, click.Group):
+        return
+    context.meta[CONFIG_FILE] = path
+    context.default_map = read_config(path, group.commands, str(context.command.name))
+
+
+config = option(
+    "--config",
+    click.Path(path_type=Path, readable=False),
+    is_eager=True,
+    expose_value=False,
+    callback=_apply,
+)
+"""The option ``--config``, which sets defaults before any other option is looked at."""

@@ -66,8 +66,8 @@ def followed(
         arrivals = Arrivals(str(inputs[0]), frames_folder=lambda: folder, names=sys.stdin, every=every or 1, idle=idle)
         try:
             again = arrivals.comes_again
-            found = follow_frames(arrivals, stitch, poses, comes_again=again, preview=preview, refresh=refresh or 0.0)
-            for frame in found:
+            frames = follow_frames(arrivals, stitch, poses, comes_again=again, preview=preview, refresh=refresh or 0.0)
+            for frame in frames:
                 print_line(frame.as_dict())
         except KeyboardInterrupt:
             reporter.note("interrupted: registering what has arrived; interrupt once more to give up")

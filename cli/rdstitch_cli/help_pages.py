@@ -1,14 +1,29 @@
 """Help pages: options in groups, those that matter first on top; ``rdstitch help``."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import click
 
-from rdstitch_cli.option_texts import PLACES, TEXTS
+from rdstitch_cli.config import config
+from rdstitch_cli.option_texts import PLACES, option
+
+EXIT_STATUSES = """\b
+Exit status:
+  0    done; images left out are named on standard error
+  1    unexpected failure
+  2    wrong usage
+  3    a file cannot be read
+  4    no overlap, or no reliable result
+  5    partial result under --strict
+  6    output cannot be written, or exists (see --overwrite)
+  7    refused: too large for memory, format or common sense
+  130  interrupted; 143 when asked to end by SIGTERM, 129 by SIGHUP
+  141  nobody reads standard output any more; the files are written
+"""
 
 _FEW = 25  # options that are shown all at once
 _ALL = "rdstitch_cli.help_all"
@@ -31,16 +46,7 @@ class GroupedCommand(click.Command):
     def __init__(self, *arguments: Any, **given: Any) -> None:
         super().__init__(*arguments, **given)
         if len(self.params) > _FEW:
-            self.params.append(
-                click.Option(
-                    ["--help-all"],
-                    is_flag=True,
-                    is_eager=True,
-                    expose_value=False,
-                    callback=_show_all,
-                    help=TEXTS["--help-all"].text,
-                )
-            )
+            option("--help-all", bool, is_eager=True, expose_value=False, callback=_show_all)(self)
 
     def format_options(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the groups in their order, each with the options that this command has of it."""
@@ -55,13 +61,25 @@ class GroupedCommand(click.Command):
                     rows[entry.group][entry.rank] = record
                 else:
                     left += 1
-        for group, found in rows.items():
-            if found:
+        for group, records in rows.items():
+            if records:
                 with formatter.section(group):
-                    formatter.write_dl([record for _, record in sorted(found.items())])
+                    formatter.write_dl([record for _, record in sorted(records.items())])
         if left:
             formatter.write_paragraph()
             formatter.write_text(f"{left} more options: {context.command_path} --help-all")
+
+
+def command(short_help: str, examples: str) -> Callable[[Callable[..., Any]], click.Command]:
+    """A command with a text for the list of commands, and lines of examples; and with what all commands have."""
+
+    def make(function: Callable[..., Any]) -> click.Command:
+        epilog = f"\b\nExamples:{examples}\n\n{EXIT_STATUSES}"
+        made = click.command(cls=GroupedCommand, short_help=short_help, epilog=epilog)(function)
+        config(made)
+        return made
+
+    return make
 
 
 @click.command(
@@ -89,7 +107,7 @@ def help_command(context: click.Context, topics: Sequence[str]) -> None:
 
 
 def troubleshooting() -> dict[str, str]:
-    """What to do about each message, by its code: the paragraphs of docs/troubleshooting.md."""
+    """Give what to do about each message, by its code: the paragraphs of docs/troubleshooting.md."""
     page = resources.files("rdstitch_cli") / "troubleshooting.md"
     if not page.is_file():  # a checkout
         page = Path(__file__).parents[2] / "docs" / "troubleshooting.md"

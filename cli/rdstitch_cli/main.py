@@ -26,23 +26,8 @@ from rdstitch_cli.commands.pano import pano
 from rdstitch_cli.commands.tiles import tiles
 from rdstitch_cli.commands.trajectory import trajectory
 from rdstitch_cli.commands.undistort import undistort
-from rdstitch_cli.config import config_option
-from rdstitch_cli.help_pages import help_command
+from rdstitch_cli.help_pages import EXIT_STATUSES, help_command
 from rdstitch_cli.terminal import one_line, write_whatever_the_encoding
-
-EXIT_STATUSES = """\b
-Exit status:
-  0    done; images left out are named on standard error
-  1    unexpected failure
-  2    wrong usage
-  3    a file cannot be read
-  4    no overlap, or no reliable result
-  5    partial result under --strict
-  6    output cannot be written, or exists (see --overwrite)
-  7    refused: too large for memory, format or common sense
-  130  interrupted; 143 when asked to end by SIGTERM, 129 by SIGHUP
-  141  nobody reads standard output any more; the files are written
-"""
 
 _EXAMPLES = """\b
 Examples:
@@ -94,11 +79,8 @@ def cli(context: click.Context, debug: bool) -> None:
     context.obj = debug
 
 
-for command in (pano, mosaic, tiles, apply, calibrate, trajectory, undistort, doctor):
-    command.params.append(config_option())
-    command.epilog = f"{command.epilog or ''}\n\n{EXIT_STATUSES}"
+for command in (pano, mosaic, tiles, apply, calibrate, trajectory, undistort, doctor, help_command):
     cli.add_command(command)
-cli.add_command(help_command)
 
 
 def main() -> None:
@@ -119,7 +101,7 @@ def main() -> None:
 
 
 def _open_standard_streams() -> None:
-    """What was closed by whoever started this leads to nowhere: the next file opened must not become its successor."""
+    """Lead what whoever started this has closed to nowhere: the next file opened must not become its successor."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             nowhere = os.open(os.devnull, os.O_RDWR)
@@ -210,7 +192,7 @@ def _nobody_listens() -> int:
 
 
 def _is_nowhere() -> bool:
-    """Whether the current folder has been deleted, so that relative names lead nowhere."""
+    """Check whether the current folder has been deleted, so that relative names lead nowhere."""
     try:
         Path.cwd()
     except FileNotFoundError:

@@ -4,7 +4,10 @@ A heading begins with #, an option of the first page with *. A command before th
 defaults are in :mod:`rdstitch_cli.options`.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import click
 
 _TABLE = """
 # Options that matter first
@@ -150,7 +153,7 @@ class Entry(NamedTuple):
 
 def _parsed(table: str) -> dict[str, Entry]:
     """The entries by the command, if any, and the names."""
-    found, group = {}, ""
+    entries, group = {}, ""
     for rank, line in enumerate(table.strip().replace("\n    ", " ").splitlines()):
         if line.startswith("# "):
             group = line.removeprefix("# ")
@@ -158,11 +161,28 @@ def _parsed(table: str) -> dict[str, Entry]:
         head, _, text = line.removeprefix("* ").partition(": ")
         words = head.split()
         called = None if words[-1].startswith("-") else words.pop()
-        found[" ".join(words)] = Entry(called, text, group, rank, line.startswith("* "))
-    return found
+        entries[" ".join(words)] = Entry(called, text, group, rank, line.startswith("* "))
+    return entries
 
 
 TEXTS = _parsed(_TABLE)
 
 PLACES = {names.split()[-1].partition("/")[0]: entry for names, entry in TEXTS.items()}
 """Entries by the long name of the option."""
+
+
+def option(
+    names: str, kind: Any = None, usual: Any = None, *, of: str = "", dest: str | None = None, **more: Any
+) -> Callable[[Any], Any]:
+    """An option of the table.
+
+    ``kind`` is a type, some words, or bool for a flag; ``usual`` the default that help pages show; ``of`` the command
+    whose text it is, where others have another; ``dest`` the parameter's name where it is not the option's.
+    """
+    entry = TEXTS[f"{of} {names}".strip()]
+    kinds = {"is_flag": True} if kind is bool else {"type": click.Choice(kind) if isinstance(kind, tuple) else kind}
+    default = {} if usual is None else {"default": usual, "show_default": True}
+    called_in_code = [] if dest is None else [dest]
+    return click.option(
+        *names.split(), *called_in_code, **{"metavar": entry.called, "help": entry.text, **kinds, **default, **more}
+    )

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import click
 from click.core import ParameterSource
 
-from rdstitch_cli.option_texts import TEXTS
+from rdstitch_cli.option_texts import TEXTS, option
 from rdstitch_cli.parameter_types import (
     ANGLE,
     ANGLES,
@@ -42,8 +42,8 @@ def together(*options: Callable[[Any], Any]) -> Decorator[Any]:
     """Several options as one decorator, shown in this order."""
 
     def decorate(command: Any) -> Any:
-        for option in reversed(options):
-            command = option(command)
+        for each in reversed(options):
+            command = each(command)
         return command
 
     return decorate
@@ -61,25 +61,8 @@ def resolve(inputs: tuple[Path, ...]) -> list[Path]:
 
 
 def is_given(name: str) -> bool:
-    """Whether the user set an option of the running command, rather than left it at its default."""
+    """Check whether the user set an option of the running command, rather than left it at its default."""
     return click.get_current_context().get_parameter_source(name) not in (None, ParameterSource.DEFAULT)
-
-
-def option(
-    names: str, kind: Any = None, usual: Any = None, *, of: str = "", dest: str | None = None, **more: Any
-) -> Decorator[Any]:
-    """An option of the table in :mod:`rdstitch_cli.option_texts`.
-
-    ``kind`` is a type, some words, or bool for a flag; ``usual`` the default that help pages show; ``of`` the command
-    whose text it is, where others have another; ``dest`` the parameter's name where it is not the option's.
-    """
-    entry = TEXTS[f"{of} {names}".strip()]
-    kinds = {"is_flag": True} if kind is bool else {"type": click.Choice(kind) if isinstance(kind, tuple) else kind}
-    default = {} if usual is None else {"default": usual, "show_default": True}
-    called_in_code = [] if dest is None else [dest]
-    return click.option(
-        *names.split(), *called_in_code, **{"metavar": entry.called, "help": entry.text, **kinds, **default, **more}
-    )
 
 
 inputs = click.argument("inputs", nargs=-1, required=True, type=UserPath(allow_dash=True), metavar="INPUT...")

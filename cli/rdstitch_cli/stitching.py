@@ -33,14 +33,14 @@ def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
         return None
     from rdstitch.camera_files import read_camera_file
 
-    found = read_camera_file(file, partial(_size_of_images, file))
-    if found.fit is not None:
-        cause = f"; {found.cause}" if found.cause else ""
+    read = read_camera_file(file, partial(_size_of_images, file))
+    if read.fit is not None:
+        cause = f"; {read.cause}" if read.cause else ""
         reporter.warn(
-            f"{file}: λ = {found.camera.nearest_distortion:.6f} was fitted to the {found.kind} lens model, "
-            f"rms {found.fit.rms:.2f} pixels, at most {found.fit.largest:.2f} pixels{cause}"
+            f"{file}: λ = {read.camera.nearest_distortion:.6f} was fitted to the {read.kind} lens model, "
+            f"rms {read.fit.rms:.2f} pixels, at most {read.fit.largest:.2f} pixels{cause}"
         )
-    return found.camera
+    return read.camera
 
 
 def _size_of_images(file: Path) -> tuple[int, int]:
@@ -171,7 +171,7 @@ def staged_beside(
     poses: Path | None = None,
     frame: "PosesFrame" = "enu",
 ) -> Callable[["Outputs", "StitchResult"], None]:
-    """What stages the report, and the layers, the project and the poses that are wanted, together with the image."""
+    """Give what stages report, layers, project and poses, those that are wanted, together with the image."""
     from rdstitch.outputs import check_distinct, check_output
 
     given, files = click.get_current_context().params, [file for file in (hugin_project, poses) if file is not None]
@@ -217,7 +217,7 @@ def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = Fal
 
 
 def show_plan(plan: "CompositePlan") -> None:
-    """What compositing would take, to standard output."""
+    """Give what compositing would take, to standard output."""
     (width, height), megapixels = plan.canvas_size, plan.canvas_size[0] * plan.canvas_size[1] / 1e6
     click.echo(f"images: {plan.images}")
     click.echo(f"canvas: {width} x {height} pixels, {megapixels:.4g} megapixels")
@@ -244,7 +244,7 @@ def report_registration(
 
 
 def warn_of(registration: "Registration", reporter: Reporter) -> None:
-    """What the user must know of a registration."""
+    """Give what the user must know of a registration."""
     from rdstitch.messages import of_severity, told_once
 
     alignment = registration.alignment

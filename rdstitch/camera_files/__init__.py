@@ -72,9 +72,9 @@ def read_camera_file(path: str | Path, image_size: formats.ImageSize | None = No
     try:
         if text.lstrip().startswith("{"):
             return _of_content(parse_json(text, file), file, image_size)
-        own = next((line for line in text.splitlines() if line.startswith(formats.OWN_COMMENT)), None)
-        if own is not None:
-            return _own(parse_json(own.removeprefix(formats.OWN_COMMENT), file), file)
+        own_record = next((line for line in text.splitlines() if line.startswith(formats.OWN_COMMENT)), None)
+        if own_record is not None:
+            return _own(parse_json(own_record.removeprefix(formats.OWN_COMMENT), file), file)
         if text.lstrip().startswith("<"):
             return read_lensfun(text, file, image_size)
         if is_hugin(text):
@@ -89,15 +89,15 @@ def read_camera_file(path: str | Path, image_size: formats.ImageSize | None = No
 def _of_content(content: Any, file: str, image_size: formats.ImageSize | None) -> CameraFile:
     """The camera of plain values, whosever they are."""
     if formats.is_opencv(content):
-        if (own := content.get(formats.OWN)) is not None:
-            return _own(own, file, formats.OWN)
+        if (own_record := content.get(formats.OWN)) is not None:
+            return _own(own_record, file, formats.OWN)
         return formats.read_opencv(content, file, image_size)
     entries = content.items() if isinstance(content, dict) else ()
     for key, read in (("projection_type", formats.read_opendronemap), ("camera_model", formats.read_kalibr)):
-        if found := [(name, entry) for name, entry in entries if isinstance(entry, dict) and key in entry]:
-            name, entry = _only(found)
-            if (own := entry.get(formats.OWN)) is not None:
-                return _own(own, file, f"{name}.{formats.OWN}")
+        if matching := [(name, entry) for name, entry in entries if isinstance(entry, dict) and key in entry]:
+            name, entry = _only(matching)
+            if (own_record := entry.get(formats.OWN)) is not None:
+                return _own(own_record, file, f"{name}.{formats.OWN}")
             return read(entry, file, str(name))
     return _own(content, file)
 
@@ -109,7 +109,7 @@ def _only(cameras: Sequence[Value]) -> Value:
 
 
 def _own(content: Any, file: str, field: str = "") -> CameraFile:
-    """What rdstitch wrote, alone or into the file of others."""
+    """Give what rdstitch wrote, alone or into the file of others."""
     return CameraFile(convert(content, CameraRecord, file, field).camera(), "rdstitch")
 
 

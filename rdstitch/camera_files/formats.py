@@ -118,7 +118,7 @@ class _Kalibr(Struct, kw_only=True):
 
 
 def is_opencv(content: Any) -> bool:
-    """Whether plain values look like OpenCV's."""
+    """Check whether plain values look like OpenCV's."""
     return isinstance(content, dict) and any(_ALIASES.get(name, name) == "camera_matrix" for name in content)
 
 
@@ -166,7 +166,7 @@ def read_opencv(content: dict[str, Any], file: str, image_size: ImageSize | None
 
 
 def _is_rather(fisheye: CameraFile, brown: CameraFile) -> bool:
-    """Whether coefficients are a fisheye's: these make a symmetric lens of a wide field of view, Brown's do not."""
+    """Check whether coefficients are a fisheye's: these make a symmetric lens of a wide view, Brown's do not."""
     camera, one, other = brown.camera, fisheye.fit, brown.fit
     if camera.focal is None or one is None or other is None:
         return False

@@ -35,7 +35,7 @@ HEAD = """# hugin project file
 
 
 def is_hugin(text: str) -> bool:
-    """Whether text looks like a project file."""
+    """Check whether text looks like a project file."""
     return re.search(r"^(?:[pimo] |# hugin)", text, re.MULTILINE) is not None
 
 
@@ -134,7 +134,7 @@ class Polynomial:
     fit: LensFit
 
     def moved(self) -> tuple[float, tuple[float, ...]]:
-        """How much larger the undistorted image is where the scale is kept at r = 1, ``1 - Σ k`` at the centre; and k.
+        """Give how much larger the undistorted image is with the scale kept at r = 1, ``1 - Σ k`` at the centre; and k.
 
         r = s u, where s (1 - Σ k) = 1, and k are those found over s^p.
         """

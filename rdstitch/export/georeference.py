@@ -117,7 +117,7 @@ class Georeference:
         return places
 
     def tiff_tags(self) -> list[ExtraTag]:
-        """What makes a TIFF file a GeoTIFF."""
+        """Give what makes a TIFF file a GeoTIFF."""
         a, b = self.scale.real, self.scale.imag
         # GeoTIFF counts from the corner of the first pixel.
         corner = self.origin - self.scale * (0.5 - 0.5j)
@@ -152,7 +152,7 @@ def world_file_paths(image: str | Path) -> tuple[Path, ...]:
 
 
 def has_place(positions: Sequence[GpsPosition | None]) -> bool:
-    """Whether enough images have a position for a place to be expected."""
+    """Check whether enough images have a position for a place to be expected."""
     return sum(position is not None for position in positions) >= MIN_POSITIONS
 
 

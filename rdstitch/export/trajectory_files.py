@@ -125,7 +125,7 @@ def _positions(path: Trajectory, frame: TrajectoryFrame) -> FloatArray:
 
 
 def has_times(path: Trajectory) -> bool:
-    """Whether every frame has a time stamp."""
+    """Check whether every frame has a time stamp."""
     return path.timestamp is not None and bool(np.isfinite(path.timestamp).all())
 
 

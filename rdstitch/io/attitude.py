@@ -42,8 +42,8 @@ def xmp_number(xmp: str, name: str) -> float | None:
     # A search rather than an XML parser: drones write XMP that no parser accepts.
     # Repetitions are bounded, so that it takes time in proportion to the text, whatever that is.
     gap, value = rf"\s{{0,{_MAX_NUMBER_LENGTH}}}", rf"{{0,{_MAX_NUMBER_LENGTH}}}"
-    found = re.search(rf"""[<:\s]{name}{gap}(?:={gap}["']([^"'<]{value})|>([^<]{value})<)""", xmp)
-    return None if found is None else finite((found.group(1) or found.group(2) or "").strip())
+    match = re.search(rf"""[<:\s]{name}{gap}(?:={gap}["']([^"'<]{value})|>([^<]{value})<)""", xmp)
+    return None if match is None else finite((match.group(1) or match.group(2) or "").strip())
 
 
 def finite(value: Any) -> float | None:

@@ -52,7 +52,7 @@ def _srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> FloatArray:
 
 
 def ink_transform(profile: bytes) -> ImageCms.ImageCmsTransform | None:
-    """What a colour profile of inks (CMYK) makes of them in sRGB; None where it cannot be used."""
+    """Give what a colour profile of inks (CMYK) makes of them in sRGB; None where it cannot be used."""
     try:
         return ImageCms.buildTransform(io.BytesIO(profile), ImageCms.createProfile("sRGB"), "CMYK", "RGB")
     except (ImageCms.PyCMSError, ImportError):
@@ -67,7 +67,7 @@ def without_inks(image: Image.Image) -> Image.Image:
 
 
 def colour_space(profile: bytes) -> bytes:
-    """What is equal of profiles of one colour space; images without one are taken for sRGB."""
+    """Give what is equal of profiles of one colour space; images without one are taken for sRGB."""
     if not profile or b"sRGB" in profile or b"s\0R\0G\0B" in profile:
         return b""
     return profile

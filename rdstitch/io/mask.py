@@ -21,15 +21,15 @@ def mask_frame(
     What the camera sees in every image belongs to the stored frame, as its lens does; the mask of one image is as
     that looks. Where a mask fits in one of the two only, it belongs there.
     """
-    own, (width, height) = read_metadata(path), size
-    stored = turned_size(turned_size(own.size, inverse(own.orientation)), orientation)
-    frames: list[tuple[int | None, tuple[int, int]]] = [(None, own.size), (orientation, stored)]
+    mask, (width, height) = read_metadata(path), size
+    stored = turned_size(turned_size(mask.size, inverse(mask.orientation)), orientation)
+    frames: list[tuple[int | None, tuple[int, int]]] = [(None, mask.size), (orientation, stored)]
     for frame, (w, h) in frames[::-1] if of_camera else frames:
         # Sizes are whole pixels, so that the shape may differ by one pixel of the larger.
         if abs(width * h - height * w) <= max(width, height, w, h):
             return frame
     raise InputError(
-        f"{path}: a mask of {own.size[0]} x {own.size[1]} pixels does not fit on {image}, which has "
+        f"{path}: a mask of {mask.size[0]} x {mask.size[1]} pixels does not fit on {image}, which has "
         f"{width} x {height} pixels; a mask has its image's size, or another size of the same shape"
     )
 

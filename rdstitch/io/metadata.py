@@ -367,7 +367,7 @@ class OmeImage:
 
 
 def read_ome(text: str | None) -> OmeImage | None:
-    """What the OME-XML of a file says; None where it is none."""
+    """Give what the OME-XML of a file says; None where it is none."""
     try:
         elements = list(ElementTree.fromstring(text or "").iter())
     except ElementTree.ParseError:

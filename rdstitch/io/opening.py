@@ -117,7 +117,7 @@ def check_readable(path: Path) -> None:
 
 
 def _missing(path: Path) -> str:
-    """What is wrong with a name that leads nowhere, and which one may be meant."""
+    """Say what is wrong with a name that leads nowhere, and which one may be meant."""
     if path.is_symlink():
         return "a link to nothing; check the name"
     try:
@@ -175,7 +175,7 @@ def opened_image(file: Path) -> Iterator[ImageFile.ImageFile]:
 
 
 def has_late_metadata(file: Path) -> bool:
-    """Whether a PNG file says something of itself after its pixels, or cannot be followed to its end.
+    """Check whether a PNG file says something of itself after its pixels, or cannot be followed to its end.
 
     Only the heads of its chunks are read. Pillow looks for EXIF there, and decodes all pixels to come there.
     """
@@ -204,7 +204,7 @@ def check_megapixels(file: Path, size: tuple[int, int]) -> None:
 
 
 def _factory(file: Path, stream: BinaryIO) -> Factory:
-    """What opens the format of a file, by its first bytes."""
+    """Give what opens the format of a file, by its first bytes."""
     beginning = stream.read(_MAX_MAGIC)
     stream.seek(0)
     for magic, factory in _FORMATS.items():
@@ -229,7 +229,7 @@ def _check_reader(path: Path) -> None:
 
 
 def _avif_factory(path: Path) -> Factory:
-    """What opens AVIF: Pillow, since version 11.3."""
+    """Give what opens AVIF: Pillow, since version 11.3."""
     try:
         factory: Factory = import_module("PIL.AvifImagePlugin").AvifImageFile
     except ImportError:
@@ -238,7 +238,7 @@ def _avif_factory(path: Path) -> Factory:
 
 
 def is_raw(path: Path) -> bool:
-    """Whether a file is a camera's raw file, by its name."""
+    """Check whether a file is a camera's raw file, by its name."""
     return path.suffix.lower() in RAW_SUFFIXES
 
 

@@ -69,10 +69,10 @@ def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) 
 
 
 def _is_padding(complaint: str, data: bytes) -> bool:
-    """Whether the decoder only complains of zeros before the end, as some cameras write them."""
-    found = _PADDING.search(complaint)
+    """Check whether the decoder only complains of zeros before the end, as some cameras write them."""
+    padding = _PADDING.search(complaint)
     end = data.rfind(_END_OF_IMAGE)
-    return found is not None and not data[max(0, end - int(found[1])) : end].strip(b"\0\xff")
+    return padding is not None and not data[max(0, end - int(padding[1])) : end].strip(b"\0\xff")
 
 
 Pixels = NDArray[Any]
@@ -130,8 +130,8 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
                 samples, alpha = _split(_read_16_bit_png(file))
             else:
                 factor = _decoders_share(opened, metadata, reduction)
-                found, damage = _from_jpeg(file, opened, factor)
-                samples, alpha = from_pillow(opened, factor) if found is None else (found, None)
+                decoded, damage = _from_jpeg(file, opened, factor)
+                samples, alpha = from_pillow(opened, factor) if decoded is None else (decoded, None)
                 image = replace(as_image(file, samples, alpha, metadata), damage=damage)
                 return reduced(image, reduction // factor)
         return reduced(as_image(file, samples, alpha, metadata), reduction)
@@ -146,7 +146,7 @@ def reduced(image: DecodedImage, factor: int) -> DecodedImage:
 
 
 def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> int:
-    """By how much of a reduction the decoder can make the image smaller; 1 for nothing."""
+    """Give by how much of a reduction the decoder can make the image smaller; 1 for nothing."""
     factor = math.gcd(reduction, _MAX_DECODED_REDUCTION)
     # Blocks begin at the stored image's first pixel; in one that is to be mirrored they must end at its last.
     crosswise = metadata.orientation != 1 and any(n % factor for n in image.size)
@@ -194,7 +194,7 @@ def _samples(image: Image.Image) -> Pixels:
 
 
 def _is_grey(image: Image.Image) -> bool:
-    """Whether a palette holds shades of grey only."""
+    """Check whether a palette holds shades of grey only."""
     palette = np.array(image.getpalette("RGB") or [], dtype=np.uint8).reshape(-1, 3)
     return bool((palette == palette[:, :1]).all())
 

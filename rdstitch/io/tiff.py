@@ -5,28 +5,23 @@ does not read where they are deeper; their transparency is a mask on a page of i
 program reads the first page. Where there are overviews, the file is in the order of a Cloud Optimized GeoTIFF: what
 describes the pages comes first, then the pixels, smallest overview first, so that a reader of a part fetches little but
 that part. While an image is being made nobody knows where its parts will lie: compressed tiles are copied afterwards.
-
-Overviews are made while the strips pass, and wait in temporary files beside the output until their turn; memory is that
-of one strip, whatever the size of the image.
 """
 
 import struct
 import tempfile
 import uuid
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
 from itertools import accumulate
 from pathlib import Path
-from typing import IO, Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import deflate
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, with_alpha
+from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, pyramid, pyramid_sizes, with_alpha
 from rdstitch.io.metadata import Metadata
-from rdstitch.io.reduction import halved
 from rdstitch.late_imports import tifffile
 
 OME_SUFFIXES = (".ome.tif", ".ome.tiff")
@@ -34,8 +29,6 @@ _TILE = 256
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
 # Smaller images need no overview.
 _MIN_OVERVIEW = 256
-# Rows that are reduced at a time, even.
-_HALVED_ROWS = 32
 _BUFFER = 2**24
 _LEVEL = 1  # of 1 to 12: 2 takes 1.7 times as long and makes files 2 % smaller
 _BIGTIFF_FROM = 2**32 - 2**27
@@ -52,31 +45,25 @@ ExtraTag = tuple[int, int, int, Any, bool]
 
 def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
     """Write a TIFF file whose first page is the image and whose other pages are its overviews."""
-    sizes = [layout.size, *_overview_sizes(layout.size)]
+    sizes = pyramid_sizes(layout.size, _MIN_OVERVIEW)
     total = sum(w * h for w, h in sizes) * layout.samples_per_pixel * layout.dtype.itemsize
-    joined: Iterable[NDArray[Any]] = (with_alpha(*strip) if layout.transparent else strip[0] for strip in strips)
+    joined = (with_alpha(*strip) if layout.transparent else strip[0] for strip in strips)
     mask: list[bytes] | None = [] if _has_mask(layout) else None
-    with ExitStack() as stack:
-        tiff = stack.enter_context(tifffile.TiffWriter(path, bigtiff=total > _BIGTIFF_FROM))
-        for level, size in enumerate(sizes):
-            is_last = level + 1 == len(sizes)
-            spill = None if is_last else stack.enter_context(tempfile.TemporaryFile(dir=path.parent))
-            tags = [] if level else [*_copied_tags(layout.metadata), *extra_tags]
-            passing = _spilling(joined, spill, layout.transparent)
+    with tifffile.TiffWriter(path, bigtiff=total > _BIGTIFF_FROM) as tiff:
+        for size, passing in pyramid(sizes, joined, path.parent, transparent=layout.transparent):
+            kind = 0 if size == layout.size else _REDUCED
+            tags = [] if kind else [*_copied_tags(layout.metadata), *extra_tags]
             shown = passing if mask is None else _without_alpha(passing, mask)
-            kind = _REDUCED if level else 0
             _write_page(tiff, layout, size, shown, tags, kind)
             if mask is not None:
                 _write_mask(tiff, size, mask, kind | _MASK)
                 mask.clear()
-            if spill is not None:
-                joined = _reread(spill, sizes[level + 1], layout)
     if len(sizes) > 1:
         _put_in_order(path)
 
 
 def _has_mask(layout: Layout) -> bool:
-    """Whether transparency goes onto a page of its own."""
+    """Check whether transparency goes onto a page of its own."""
     return layout.transparent and layout.channels == 1
 
 
@@ -151,7 +138,7 @@ def _tiles_of(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
 
 
 def _has_predictor(dtype: np.dtype[Any]) -> bool:
-    """Whether differences of neighbours are stored; what is usual for floating point, few programs can read."""
+    """Check whether differences of neighbours are stored; what is usual for floating point, few programs can read."""
     return dtype.kind == "u"
 
 
@@ -168,28 +155,6 @@ def _deflated(stored: NDArray[Any]) -> bytes:
     return bytes(deflate.zlib_compress(stored, _LEVEL))
 
 
-def _spilling(strips: Iterable[NDArray[Any]], spill: IO[bytes] | None, transparent: bool) -> Iterator[NDArray[Any]]:
-    """The strips; what passes is also written, half as large, to a file."""
-    for strip in strips:
-        # Before it is passed on: the writer does not come back after the last tile.
-        if spill is not None:
-            for top in range(0, len(strip), _HALVED_ROWS):
-                spill.write(halved(strip[top : top + _HALVED_ROWS], transparent).data)
-        yield strip
-
-
-def _reread(spill: IO[bytes], size: tuple[int, int], layout: Layout) -> Iterator[NDArray[Any]]:
-    """Strips from a file of plain samples, which is closed afterwards."""
-    width, height = size
-    row = width * layout.samples_per_pixel * layout.dtype.itemsize
-    spill.seek(0)
-    for top in range(0, height, STRIP_ROWS):
-        rows = min(STRIP_ROWS, height - top)
-        samples = np.frombuffer(spill.read(rows * row), dtype=layout.dtype)
-        yield samples.reshape(rows, width, layout.samples_per_pixel)
-    spill.close()
-
-
 def _copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
     """XMP, and tags of the first image's EXIF that stay true of a mosaic."""
     if metadata.xmp:
@@ -203,16 +168,6 @@ def _copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
             text = text.split("\0")[0].strip() if isinstance(text, str) else ""
             if text and text.isascii():
                 yield int(tag), 2, 0, text, True
-
-
-def _overview_sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
-    """Sizes of the overviews, each half of the one before, rounded up."""
-    sizes = []
-    width, height = size
-    while max(width, height) > _MIN_OVERVIEW:
-        width, height = -(-width // 2), -(-height // 2)
-        sizes.append((width, height))
-    return sizes
 
 
 class _Page(NamedTuple):
@@ -304,13 +259,17 @@ def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip]) -> None:
 
     Channels become pages; those of a colour image stay together.
     """
-    sizes = [layout.size, *_overview_sizes(layout.size)]
+    sizes = pyramid_sizes(layout.size, _MIN_OVERVIEW)
     apart = layout.metadata.planes or layout.channels != 3
+    shown = (pixels if alpha is None else np.where(alpha[..., None] > 0, pixels, 0) for pixels, alpha in strips)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         levels: list[NDArray[Any]] = []
-        for number, (width, height) in enumerate(sizes):
+        for number, ((width, height), passing) in enumerate(pyramid(sizes, shown, path.parent, transparent=False)):
             level = np.memmap(Path(folder) / str(number), layout.dtype, "w+", shape=(height, width, layout.channels))
-            _fill(level, strips if number == 0 else _halves(levels[-1]))
+            top = 0
+            for rows in passing:
+                level[top : top + len(rows)] = rows
+                top += len(rows)
             levels.append(level)
         size = layout.metadata.pixel_size
         units = {} if size is None else {"PhysicalSizeX": size, "PhysicalSizeY": size}
@@ -339,22 +298,9 @@ def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip]) -> None:
                 )
 
 
-def _fill(level: NDArray[Any], strips: Iterable[Strip]) -> None:
-    top = 0
-    for samples, alpha in strips:
-        rows = level[top : top + len(samples)]
-        rows[...] = samples if alpha is None else np.where(alpha[..., None] > 0, samples, samples.dtype.type(0))
-        top += len(samples)
-
-
 def _rows(level: NDArray[Any]) -> Iterator[NDArray[Any]]:
     for top in range(0, len(level), STRIP_ROWS):
         yield np.ascontiguousarray(level[top : top + STRIP_ROWS])
-
-
-def _halves(level: NDArray[Any]) -> Iterator[Strip]:
-    for strip in _rows(level):
-        yield halved(strip, False), None
 
 
 def write_cropped_tiff(

@@ -40,18 +40,18 @@ def lens_curve(registration: Registration) -> str:
 
 
 def _places(registration: Registration) -> FloatArray:
-    """Where the matches that agree with the alignment are, pixels of images of the reference's size, (N, 2)."""
+    """Give where the matches that agree with the alignment are, pixels of images of the reference's size, (N, 2)."""
     alignment, camera = registration.alignment, registration.upright_camera
-    found = [np.empty((0, 2))]
+    places = [np.empty((0, 2))]
     for fit in alignment.links:
         if fit.used and fit.rms > 0.0:
             other = alignment.cameras[fit.image2]
-            found.append(camera.denormalize(other.normalize(residuals(registration, fit)[0])))
-    return np.concatenate(found)
+            places.append(camera.denormalize(other.normalize(residuals(registration, fit)[0])))
+    return np.concatenate(places)
 
 
 def _support(camera: Camera, places: FloatArray, farthest: float) -> str:
-    """Where in the image there are matches, one sentence."""
+    """Give where in the image there are matches, one sentence."""
     if not len(places):
         return "No match supports it."
     across, down = _CELLS

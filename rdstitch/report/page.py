@@ -228,7 +228,7 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
 
 
 def place(result: StitchResult) -> str:
-    """Where the output lies on the Earth, and the largest residuals of the positions that say so."""
+    """Give where the output lies on the Earth, and the largest residuals of the positions that say so."""
     if (placed := result.georeference) is None:
         return ""
     residuals = sorted(placed.residuals, key=lambda residual: -residual.off)[:_MAX_ROWS]
@@ -238,7 +238,7 @@ def place(result: StitchResult) -> str:
 
 
 def local_alignment(result: StitchResult) -> str:
-    """How much local alignment mended, and the image that it moved farthest."""
+    """Give how much local alignment mended, and the image that it moved farthest."""
     local = result.local_alignment
     if result.plan is not None:
         return ""
@@ -300,7 +300,7 @@ def stage(registration: Registration) -> str:
 
 
 def backlash(rows: FloatArray) -> tuple[float, float]:
-    """What every other row is off against the rows between, (x, y), pixels: rows (R, 2) are taken to and fro."""
+    """Give what every other row is off against the rows between, (x, y), pixels: rows (R, 2) are taken to and fro."""
     if len(rows) < 2:
         return 0.0, 0.0
     x, y = (np.median(rows[1::2], axis=0) - np.median(rows[::2], axis=0)).tolist()

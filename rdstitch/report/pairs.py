@@ -137,13 +137,13 @@ def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: fl
 def residual_map(registration: Registration) -> str:
     """Errors of all pairs over the area of the image: rms as grey, mean as an arrow."""
     alignment = registration.alignment
-    found = [residuals(registration, fit) for fit in alignment.links if fit.used and fit.rms > 0.0]
+    errors = [residuals(registration, fit) for fit in alignment.links if fit.used and fit.rms > 0.0]
     cameras = [alignment.cameras[fit.image2] for fit in alignment.links if fit.used and fit.rms > 0.0]
-    if not found:
+    if not errors:
         return section("Residuals", "There are none.")
     # Images of several sizes are laid over one another.
-    places = np.concatenate([(p + 0.5) / camera.image_size for (p, _), camera in zip(found, cameras, strict=True)])
-    off = np.concatenate([residual for _, residual in found])
+    places = np.concatenate([(p + 0.5) / camera.image_size for (p, _), camera in zip(errors, cameras, strict=True)])
+    off = np.concatenate([residual for _, residual in errors])
     width, height = registration.upright_camera.image_size
     rows = max(1, round(_COLUMNS * height / width))
     cell = np.clip((places * (_COLUMNS, rows)).astype(int), 0, (_COLUMNS - 1, rows - 1)) @ (1, _COLUMNS)
@@ -201,7 +201,7 @@ def pairs_of(registration: Registration) -> dict[tuple[int, int], PairRegistrati
 
 
 def residuals(registration: Registration, fit: LinkFit) -> tuple[FloatArray, FloatArray]:
-    """Where the matches of a link are in the second image, and how far from there the alignment puts them, pixels.
+    """Give where the matches of a link are in the second image, and how far from there the alignment puts them, pixels.
 
     Matches that the pair itself takes for wrong are left out, and those that miss by more than four times the link's
     error.

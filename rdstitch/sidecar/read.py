@@ -59,8 +59,8 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
     from rdstitch.sidecar.schema import SidecarRecord
 
     content = parse_json(read_text(path), str(path))
-    if isinstance(content, dict) and isinstance(found := content.get("version"), int) and found > VERSION:
-        raise InputError(f"{path}: version: this rdstitch reads versions 1 to {VERSION} of sidecars, not {found}")
+    if isinstance(content, dict) and isinstance(version := content.get("version"), int) and version > VERSION:
+        raise InputError(f"{path}: version: this rdstitch reads versions 1 to {VERSION} of sidecars, not {version}")
     record = convert(content, SidecarRecord, str(path))
     unknown = [name for name in record.options.composite if name not in CompositeOptions.__dataclass_fields__]
     if unknown:
@@ -97,7 +97,7 @@ def mismatch_with_image(saved: SavedRegistration) -> str:
 
 
 def _place(output: "OutputRecord") -> Georeference | None:
-    """Where the plane lies on the Earth; versions before did not say."""
+    """Give where the plane lies on the Earth; versions before did not say."""
     record = output.georeference
     if record is None or record.crs is None or record.pixel_to_map is None or output.plane_to_output is None:
         return None
@@ -124,9 +124,9 @@ def _place(output: "OutputRecord") -> Georeference | None:
 def _image(record: "ImageRecord") -> SavedImage:
     camera = None if record.size is None else record.lens(record.size)
     to_plane = np.array(record.to_plane, dtype=np.float64) if record.used else None
-    moved, found = None, record.displacement
-    if found is not None and record.used and camera is not None:
-        columns, rows = found.grid
-        nodes = np.array(found.px, dtype=np.float64).reshape(rows, columns, 2)
+    moved, given = None, record.displacement
+    if given is not None and record.used and camera is not None:
+        columns, rows = given.grid
+        nodes = np.array(given.px, dtype=np.float64).reshape(rows, columns, 2)
         moved = DisplacementField(camera.image_size, nodes)
     return SavedImage(record.name, record.path, camera, to_plane, record.reason, moved)

@@ -121,7 +121,7 @@ def output_geometry(canvas: Canvas, *, turned: bool) -> dict[str, Any]:
 
 
 def georeference_fields(place: Georeference | None, reason: str) -> dict[str, Any]:
-    """Where the output lies on the Earth, by what; or why that is not known."""
+    """Give where the output lies on the Earth, by what; or why that is not known."""
     if place is None:
         return {"reason": reason}
     return {
@@ -146,7 +146,7 @@ def to_output(canvas: Canvas, homography: FloatArray) -> FloatArray | None:
 
 
 def identity_fields(output: Path | None, written: Fingerprint | None) -> dict[str, Any]:
-    """What the sidecar belongs to; by size and digest a reader sees whether it still does."""
+    """Give what the sidecar belongs to; by size and digest a reader sees whether it still does."""
     return {
         "file": None if output is None else output.name,
         "bytes": None if written is None else written.size,
@@ -155,7 +155,7 @@ def identity_fields(output: Path | None, written: Fingerprint | None) -> dict[st
 
 
 def _local_alignment(local: LocalAlignment) -> dict[str, Any]:
-    """What local alignment found, beside the displacements, which are with their images."""
+    """Give what local alignment found, beside the displacements, which are with their images."""
     return {
         "used": bool(local.fields),
         "reason": local.reason,
@@ -165,7 +165,7 @@ def _local_alignment(local: LocalAlignment) -> dict[str, Any]:
 
 
 def _stage(registration: Registration) -> dict[str, Any] | None:
-    """What the stage does, and which tiles have their places from it alone; None where the images are no tiles."""
+    """Give what the stage does, and which tiles have their places from it alone; None where the images are no tiles."""
     if registration.tiles is None:
         return None
     grid, model = registration.tiles.grid, registration.tiles.adjustment.stage
@@ -195,7 +195,7 @@ def displacement(field: DisplacementField | None) -> dict[str, Any] | None:
 
 
 def lens_fields(camera: Camera) -> dict[str, Any]:
-    """What of an image's camera depends on the size of the image, and λ with it."""
+    """Give what of an image's camera depends on the size of the image, and λ with it."""
     return {
         "center_px": camera.center,
         "image_circle_px": camera.image_circle,

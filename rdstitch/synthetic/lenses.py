@@ -3,13 +3,12 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import border_of
+from rdstitch.camera import Camera, border_of
 from rdstitch.camera_files.lens_models import LensModel
 from rdstitch.errors import ArgumentError
 
@@ -19,31 +18,6 @@ _FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatAr
     "stereographic": (lambda angle: 2.0 * np.tan(angle / 2.0), lambda r: 2.0 * np.arctan(r / 2.0)),
 }
 """Measured radius of the angle to the axis, in focal lengths, and the inverse, of each kind of fisheye."""
-
-
-class Lens(Protocol):
-    """A lens as rendering needs it; :class:`Camera` with a focal length is one."""
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Width and height, pixels."""
-
-    @property
-    def center(self) -> tuple[float, float]:
-        """Principal point, pixels."""
-
-    @property
-    def focal(self) -> float | None:
-        """Focal length at the centre, pixels."""
-
-    def undistort(self, points: ArrayLike) -> FloatArray:
-        """Measured pixels (..., 2) to pixels of a pinhole camera with the same focal length and centre, or NaN."""
-
-    def distort(self, points: ArrayLike) -> FloatArray:
-        """The inverse of :meth:`undistort`."""
-
-    def outline(self, points_per_side: int) -> FloatArray:
-        """Outer border of what the lens draws, clockwise, pixels (4 points_per_side, 2)."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +125,10 @@ class BrownLens(_FixedFocalLens):
     def undistort(self, points: ArrayLike) -> FloatArray:
         """Measured pixels to pinhole pixels; NaN where the polynomial folds."""
         return self._model.undistort(np.asarray(points, dtype=np.float64))
+
+
+Lens = Camera | FisheyeLens | BrownLens
+"""A lens to render with; a camera needs a focal length."""
 
 
 def focal_length(lens: Lens) -> float:

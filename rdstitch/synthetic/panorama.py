@@ -36,9 +36,7 @@ def camera_rotations(heading: ArrayLike, pitch: ArrayLike = 0.0, roll: ArrayLike
     return np.ascontiguousarray(np.swapaxes(to_scene, 1, 2))
 
 
-def panorama_rotations(
-    count: int, step: float, *, rows: int = 1, row_pitch: float = 0.5, jitter: float = 0.05, seed: int = 0
-) -> FloatArray:
+def panorama_rotations(count: int, step: float, *, rows: int = 1, jitter: float = 0.05, seed: int = 0) -> FloatArray:
     """Rotations (rows count, 3, 3) of images taken by hand, one row after the other.
 
     Parameters
@@ -48,14 +46,14 @@ def panorama_rotations(
     step : float
         Between neighbours, radians.
     rows : int
-        Rows, whose pitches are ``row_pitch`` radians apart, around the horizon.
+        Rows, whose pitches are half a radian apart, around the horizon.
     jitter : float
         Headings, pitches and rolls are uniform in ± this, radians, around what is aimed at.
     """
     rng = np.random.default_rng(seed)
     row, column = np.divmod(np.arange(rows * count), count)
     heading = (column - (count - 1) / 2) * step
-    pitch = ((rows - 1) / 2 - row) * row_pitch
+    pitch = ((rows - 1) / 2 - row) * 0.5
     errors = rng.uniform(-jitter, jitter, (3, rows * count))
     return camera_rotations(heading + errors[0], pitch + errors[1], errors[2])
 

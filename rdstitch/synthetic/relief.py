@@ -124,19 +124,17 @@ def hills(size: tuple[int, int], seed: int, *, height: float, width: int = 200) 
     return Relief(_scaled(np.asarray(ground, dtype=np.float32), height))
 
 
-def boxes(size: tuple[int, int], seed: int, *, height: float, width: int = 60, count: int | None = None) -> Relief:
+def boxes(size: tuple[int, int], seed: int, *, height: float, width: int = 60) -> Relief:
     """Flat ground with boxes, between a quarter and the whole of ``height`` high: a town.
 
     Parameters
     ----------
     width : int
-        Of the widest box, texels; the narrowest is a third of that.
-    count : int, optional
-        Boxes; if not given, as many as cover about a third of the ground.
+        Of the widest box, texels; the narrowest is a third of that, and all cover about a third of the ground.
     """
     rng = np.random.default_rng(seed)
     ground = np.zeros((size[1], size[0]), dtype=np.float32)
-    for k in range(max(1, round(0.8 * size[0] * size[1] / width**2)) if count is None else count):
+    for k in range(max(1, round(0.8 * size[0] * size[1] / width**2))):
         x, y = (int(rng.integers(0, max(1, n - width))) for n in size)
         w, h = (int(n) for n in rng.integers(width // 3, width + 1, 2))
         ground[y : y + h, x : x + w] = height * (1.0 if k == 0 else rng.uniform(0.25, 1.0))

@@ -170,18 +170,12 @@ class Sequence:
             paths.append(path)
         return paths
 
-    def reachable(self, scale: float = 1.0) -> NDArray[np.bool_]:
-        """Mark the texels that any image shows.
-
-        Parameters
-        ----------
-        scale : float
-            Size of the mask in units of the texture's size.
-        """
-        width, height = (max(1, round(n * scale)) for n in self.texture.size)
+    def reachable(self) -> NDArray[np.bool_]:
+        """Mark the texels that any image shows."""
+        width, height = self.texture.size
         mask = np.zeros((height, width), dtype=np.uint8)
         for outline in plane_outline(self.lens, self._from_plane):
-            points = (outline[np.isfinite(outline).all(axis=1)] + 0.5) * scale - 0.5
+            points = outline[np.isfinite(outline).all(axis=1)]
             cv2.fillPoly(mask, [np.rint(points * 16.0).astype(np.int32)], 1, cv2.LINE_8, 4)
         return mask.astype(np.bool_)
 

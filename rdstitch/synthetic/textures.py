@@ -114,21 +114,21 @@ def ground(size: tuple[int, int], seed: int, channels: int = 3) -> Texture:
     return ImageTexture(_grained(_dead_leaves(rng, size, channels, wrap=False), rng))
 
 
-def blank(size: tuple[int, int], level: float = 0.5, channels: int = 1) -> Texture:
+def blank(size: tuple[int, int]) -> Texture:
     """No texture at all."""
-    return ImageTexture(np.full((size[1], size[0], channels), level, dtype=np.float32))
+    return ImageTexture(np.full((size[1], size[0]), 0.5, dtype=np.float32))
 
 
-def gradient(size: tuple[int, int], channels: int = 1) -> Texture:
+def gradient(size: tuple[int, int]) -> Texture:
     """Smooth shading without a single corner: a sky, or a white wall."""
     x = np.linspace(0.2, 0.6, size[0], dtype=np.float32)
     y = np.linspace(0.0, 0.3, size[1], dtype=np.float32)
-    return ImageTexture(np.repeat((y[:, None] + x)[:, :, None], channels, axis=2))
+    return ImageTexture(y[:, None] + x)
 
 
-def repeated(size: tuple[int, int], seed: int, period: int = 96, channels: int = 3) -> Texture:
+def repeated(size: tuple[int, int], seed: int, period: int = 96) -> Texture:
     """One tile over and over: rich in corners, yet every match is ambiguous."""
-    tile = _periodic_ground(period, (seed, period), channels)
+    tile = _periodic_ground(period, (seed, period), 3)
     rows, columns = -(-size[1] // period), -(-size[0] // period)
     return ImageTexture(np.tile(tile, (rows, columns, 1))[: size[1], : size[0]].copy())
 

@@ -6,7 +6,8 @@ import sys
 
 import click
 import pytest
-from rdstitch_cli.main import EXIT_STATUSES, cli
+from rdstitch_cli.help_pages import EXIT_STATUSES
+from rdstitch_cli.main import cli
 from rdstitch_cli.stitching import stitch_options
 from rdstitch_cli.terminal import Reporter
 

@@ -7,17 +7,15 @@ from typing import Any, Literal
 import click
 
 from rdstitch_cli import options
-from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.options import option
+from rdstitch_cli.help_pages import command
+from rdstitch_cli.option_texts import option
 from rdstitch_cli.stitching import composite_fields, show_plan
 from rdstitch_cli.terminal import Reporter
 
 
-@click.command(
-    cls=GroupedCommand,
-    short_help="Compose again by a saved sidecar, without estimating.",
-    epilog="""\b
-Examples:
+@command(
+    "Compose again by a saved sidecar, without estimating.",
+    """
   rdstitch apply field.tif.json --images flight/ -o field_again.tif --blend feather
   rdstitch apply field_red.tif.json --images flight_nir/ -o field_nir.tif
   rdstitch apply small.jpg.json --images originals/ -o large.tif --match name --strict

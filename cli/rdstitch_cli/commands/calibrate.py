@@ -3,26 +3,23 @@
 from pathlib import Path
 from typing import Any
 
-import click
-
 from rdstitch_cli import options
-from rdstitch_cli.help_pages import GroupedCommand
+from rdstitch_cli.help_pages import command
+from rdstitch_cli.option_texts import option
 from rdstitch_cli.stitching import Report, report_registration, stitch_options
 from rdstitch_cli.terminal import Reporter
 
 
-@click.command(
-    cls=GroupedCommand,
-    short_help="The lens, from images of a plane.",
-    epilog="""\b
-Examples:
+@command(
+    "The lens, from images of a plane.",
+    """
   rdstitch calibrate wall/ -o camera.json
   rdstitch calibrate wall/ -o camera.yml --report lens.html
   rdstitch undistort other/*.jpg --camera camera.json -o straight/
 """,
 )
 @options.inputs
-@options.option("-o --output", options.IMAGE, of="calibrate", required=True)
+@option("-o --output", options.IMAGE, of="calibrate", required=True)
 @options.every
 @options.topic
 @options.registration

@@ -5,15 +5,13 @@ from pathlib import Path
 import click
 
 from rdstitch_cli import options
-from rdstitch_cli.help_pages import GroupedCommand
+from rdstitch_cli.help_pages import command
 from rdstitch_cli.terminal import Reporter
 
 
-@click.command(
-    cls=GroupedCommand,
-    short_help="What to expect of a run, and what to change before it.",
-    epilog="""\b
-Examples:
+@command(
+    "What to expect of a run, and what to change before it.",
+    """
   rdstitch doctor flight/
   rdstitch doctor drive.mp4 --json
 """,
@@ -33,9 +31,9 @@ def doctor(inputs: tuple[Path, ...], every: int | None, topic: str | None, as_js
     from rdstitch.doctor import examine
     from rdstitch.outputs import json_bytes
 
-    found = examine(options.resolve(inputs), every=every, topic=topic, progress=reporter)
+    examination = examine(options.resolve(inputs), every=every, topic=topic, progress=reporter)
     reporter.finish()
     if as_json:
-        click.echo(json_bytes(found.as_dict()), nl=False)
+        click.echo(json_bytes(examination.as_dict()), nl=False)
     else:
-        click.echo(found.as_text(), nl=False)
+        click.echo(examination.as_text(), nl=False)

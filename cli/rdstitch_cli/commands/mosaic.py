@@ -10,8 +10,8 @@ import click
 from rdstitch.messages import shortened
 from rdstitch_cli import following as live
 from rdstitch_cli import options
-from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.options import option
+from rdstitch_cli.help_pages import command
+from rdstitch_cli.option_texts import option
 from rdstitch_cli.parameter_types import RealNumber
 from rdstitch_cli.stitching import Report, staged_beside, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
@@ -20,11 +20,9 @@ if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
 
 
-@click.command(
-    cls=GroupedCommand,
-    short_help="One rectified image of a whole folder or video.",
-    epilog="""\b
-Examples:
+@command(
+    "One rectified image of a whole folder or video.",
+    """
   rdstitch mosaic floor/ -o floor.tif
   rdstitch mosaic flight/*.jpg -o field.tif --camera camera.json
   find . -name '*.jpg' -print0 | rdstitch mosaic - -o all.tif

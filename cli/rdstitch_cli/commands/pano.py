@@ -3,19 +3,15 @@
 from pathlib import Path
 from typing import Any
 
-import click
-
 from rdstitch_cli import options
-from rdstitch_cli.help_pages import GroupedCommand
+from rdstitch_cli.help_pages import command
 from rdstitch_cli.stitching import Report, staged_beside, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
 
 
-@click.command(
-    cls=GroupedCommand,
-    short_help="One image of a few that overlap.",
-    epilog="""\b
-Examples:
+@command(
+    "One image of a few that overlap.",
+    """
   rdstitch pano left.jpg right.jpg -o pano.jpg
   rdstitch pano *.png -o wall.png --reference middle.png --report wall.html
   rdstitch pano a.jpg b.jpg -o ab.tif --camera camera.json

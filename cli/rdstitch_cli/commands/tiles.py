@@ -6,18 +6,16 @@ from typing import Any
 import click
 
 from rdstitch_cli import options
-from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.options import option
+from rdstitch_cli.help_pages import command
+from rdstitch_cli.option_texts import option
 from rdstitch_cli.parameter_types import RealNumber, WholeNumber
 from rdstitch_cli.stitching import Report, composite_fields, report_registration, summarize
 from rdstitch_cli.terminal import Reporter
 
 
-@click.command(
-    cls=GroupedCommand,
-    short_help="One image of tiles taken on a microscope's stage.",
-    epilog="""\b
-Examples:
+@command(
+    "One image of tiles taken on a microscope's stage.",
+    """
   rdstitch tiles slide/ --grid 'r{row}c{col}' --overlap 10 -o slide.tif
   rdstitch tiles slide/*.tif --positions stage.csv -o slide.dzi
   rdstitch tiles ome/ --channel 0 -o slide.ome.tif --report slide.html

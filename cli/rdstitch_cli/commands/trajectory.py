@@ -5,12 +5,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import click
-
 from rdstitch_cli import following as live
 from rdstitch_cli import options
-from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.options import option
+from rdstitch_cli.help_pages import command
+from rdstitch_cli.option_texts import option
 from rdstitch_cli.parameter_types import RealNumber
 from rdstitch_cli.stitching import report_registration, stitch_options
 from rdstitch_cli.terminal import Reporter
@@ -19,11 +17,9 @@ if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
 
 
-@click.command(
-    cls=GroupedCommand,
-    short_help="The path of the camera over the plane, for robots.",
-    epilog="""\b
-Examples:
+@command(
+    "The path of the camera over the plane, for robots.",
+    """
   rdstitch trajectory floor/ -o poses.csv
   rdstitch trajectory floor/ -o poses.txt --format tum --height 0.42
   rdstitch trajectory drive.bag --topic /camera/image_raw -o poses.csv

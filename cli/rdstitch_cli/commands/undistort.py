@@ -6,17 +6,15 @@ from typing import Any
 import click
 
 from rdstitch_cli import options
-from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.options import option
+from rdstitch_cli.help_pages import command
+from rdstitch_cli.option_texts import option
 from rdstitch_cli.stitching import read_lens
 from rdstitch_cli.terminal import Reporter
 
 
-@click.command(
-    cls=GroupedCommand,
-    short_help="Images with straight lines straight, by a known lens.",
-    epilog="""\b
-Examples:
+@command(
+    "Images with straight lines straight, by a known lens.",
+    """
   rdstitch undistort frames/*.jpg --camera camera.json -o straight/
   rdstitch undistort wall.jpg --lambda -0.25 -o straight/
 """,
