@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import rdstitch
+from examples.judging import registration_error
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.errors import InputError
@@ -22,7 +23,6 @@ from rdstitch.io.mask import mask_frame, read_mask
 from rdstitch.io.metadata import Metadata
 from rdstitch.orientation import SIDEWAYS, turned, turned_size
 from rdstitch.synthetic import FisheyeLens, grid_poses, ground, sequence_over
-from tests.acceptance.rendered import geometry
 
 SIZE = (40, 30)
 
@@ -178,7 +178,7 @@ def test_a_circular_fisheye_is_stitched_and_calibrated(tmp_path: Path) -> None:
         lens.undistort(inner) - lens.center, axis=1
     )
     assert ratio == pytest.approx(ratio.mean(), rel=0.02)
-    error = geometry(sequence, result, "similarity")
+    error = registration_error(result.registration.alignment, sequence, "similarity")
     assert error.median < 0.3
     camera.save(tmp_path / "camera.json")
     again = rdstitch.Camera.load(tmp_path / "camera.json")
