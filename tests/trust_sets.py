@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from examples.judging import alignment_error
+from examples import judging
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
 from rdstitch.features import FeatureOptions
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.radial_homography import to_plane
 from rdstitch.registration import Registration
 from rdstitch.synthetic import (
     BrownLens,
@@ -251,11 +250,8 @@ def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None
 def registration_error(sequence: Sequence, registration: Registration) -> tuple[float, float]:
     """Median error of the images used, and that of the worst of them, px, up to one homography of the plane."""
     alignment = registration.alignment
-    transfers = {}
-    for position, number in _used(registration).items():
-        camera, matrix = alignment.cameras[position], alignment.homographies[position]
-        transfers[number] = partial(to_plane, camera, matrix)
-    measured = alignment_error(sequence, transfers, model="homography")
+    order = [_number(source.path.name) for source in registration.sources]
+    measured = judging.registration_error(alignment, sequence, "homography", order)
     return measured.median, max(measured.per_image().values())
 
 

@@ -17,15 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from examples.benchmarks.driver import run
-from examples.judging import AlignmentError, alignment_error
-from rdstitch.alignment import Alignment
+from examples.judging import registration_error
 from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
 from rdstitch.executors import open_executor
 from rdstitch.inputs.source import read_sources
 from rdstitch.options import LensName, StitchOptions
 from rdstitch.pipeline.register import register
-from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import BrownLens, FisheyeLens, Sequence, grid_poses, ground, sequence_over
 from rdstitch.synthetic.lenses import Lens
 
@@ -88,7 +86,7 @@ def measure(name: str, seed: int, chosen: LensName, files: list[Path], sequence:
     with open_executor(1, len(sources)) as executor:
         options = StitchOptions(lens=chosen, workers=1)
         found = register(sources, options, executor).alignment
-    error = _error(sequence, found)
+    error = registration_error(found, sequence, "similarity")
     print(
         f"{name:20s} {seed:3d} {chosen:9s} {found.lens:16s} λ {found.distortion:+.4f} ± "
         f"{found.distortion_std:.4f}  {found.model:10s} {int(found.used.sum())} images  "
@@ -97,12 +95,6 @@ def measure(name: str, seed: int, chosen: LensName, files: list[Path], sequence:
         flush=True,
     )
     return Figures(found.lens, error.median, error.percentile95)
-
-
-def _error(sequence: Sequence, alignment: Alignment) -> AlignmentError:
-    used = np.flatnonzero(alignment.used).tolist()
-    places = {i: partial(to_plane, alignment.cameras[i], alignment.homographies[i]) for i in used}
-    return alignment_error(sequence, places, model="similarity")
 
 
 def summary(name: str, chosen: str, found: list[Figures]) -> str:

@@ -9,31 +9,24 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
 import rdstitch
 from examples.benchmarks.driver import StageTimes, peak_memory, run, timed
-from examples.paper.common.peers import optional_module
-from examples.paper.common.stitchers import installed_stitchers
-from examples.paper.common.subprocesses import run_all
+from examples.judging import registration_error
+from examples.paper.common.estimators import lomsac_estimators
+from examples.paper.common.stitchers import installed_stitchers, run_all
 from examples.paper.end_to_end import SETS
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.io.read import read_image
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.synthetic import Sequence
-from tests.acceptance.rendered import geometry
 from tests.correspondences import correspondences
 from tests.floor_drives import floor_drive
 
 MATCHES = 300
-PEERS = {
-    "homlib LOMSAC, Fitzgibbon": "lomsac_fitzgibbon_cvpr_2001_two_sided_equal",
-    "homlib LOMSAC, Kukelova": "lomsac_kukelova_cvpr_2015_two_sided_equal",
-    "homlib LOMSAC, Wadenbäck": "lomsac_wadenback_3dv_2026_two_sided_equal",
-}
 _ROUNDS = 3
 _SELECT_BELOW = 50  # as registration estimates its pairs
 _COMPARED = ("OpenCV Stitcher, SCANS", "stitching, AffineStitcher")
@@ -65,30 +58,16 @@ def _estimators(pairs: list[PairMatches]) -> Iterator[tuple[str, FloatArray, Flo
     for name, options in (("rdstitch, one by one", how), ("  with competing motion models", EstimationOptions())):
         alone = [timed(partial(_alone, pair, options)) for pair in pairs]
         yield name, np.array([taken for taken, _ in alone]), _distortions([one for _, one in alone])
-    homlib = optional_module("homlib")
-    if homlib is None:
+    peers = lomsac_estimators()
+    if not peers:
         print("homlib is not installed (pip install homlib): it is left out")
-        return
-    for name, function in PEERS.items():
-        runs = [_lomsac(homlib, function, pair) for pair in pairs]
-        yield name, np.array([taken for taken, _ in runs]), np.array([one for _, one in runs])
+    for peer in peers:
+        runs = [timed(partial(peer.run, pair.points1, pair.points2, pair.camera1.image_size)) for pair in pairs]
+        yield peer.name, np.array([taken for taken, _ in runs]), np.array([one.distortion for _, one in runs])
 
 
 def _alone(pair: PairMatches, options: EstimationOptions) -> rdstitch.RadialHomography:
     return estimate_radial_homographies([pair], options)[0]
-
-
-def _lomsac(homlib: Any, function: str, pair: PairMatches) -> tuple[float, float]:
-    """Seconds and λ of homlib's estimator of a pair, with the options that ours has."""
-    camera = pair.camera1
-    options = homlib.LORansacOptions()
-    options.squared_inlier_threshold = (3.0 / camera.scale) ** 2
-    options.success_probability = 0.999
-    options.max_num_iterations = 10_000
-    options.final_least_squares = True
-    x1, x2 = (np.asfortranarray(camera.normalize(points).T) for points in (pair.points1, pair.points2))
-    taken, (pose, _) = timed(lambda: getattr(homlib, function)(x1, x2, options))
-    return taken, float(pose.distortion_parameter)
 
 
 def _distortions(found: list[rdstitch.RadialHomography]) -> FloatArray:
@@ -106,7 +85,7 @@ def print_mosaic(name: str, folder: Path, sequence: Sequence | None = None) -> N
     line = _times(name, seconds, count, result.canvas.size)
     line += f"  λ {alignment.distortion:+.5f}  {used}/{count} images  {len(pairs)} pairs"
     if sequence is not None:
-        error = geometry(sequence, result, "similarity")
+        error = registration_error(alignment, sequence, "similarity")
         line += f"  error {error.median:.3f}, 95 % {error.percentile95:.3f} px"
     print(line)
     print("    " + ", ".join(f"{stage} {taken:.1f}" for stage, taken in stages.spent.items() if taken > 0.05))

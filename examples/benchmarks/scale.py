@@ -16,10 +16,9 @@ import numpy as np
 
 import rdstitch
 from examples.benchmarks.driver import StagePeaks, StageTimes, apart, costliest, processor_time, run
-from examples.judging import alignment_error
+from examples.judging import registration_error
 from rdstitch.camera import Camera
 from rdstitch.io.write import write_image
-from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
 
 COUNTS = (100, 300, 1000, 3000)
@@ -65,11 +64,7 @@ def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> di
     note("the rest", 0, 0)
     alignment = registration.alignment
     sequence, order = survey(count), frame_order(count, shuffled)
-    places = {
-        order[i]: partial(to_plane, alignment.cameras[i], alignment.homographies[i])
-        for i in np.flatnonzero(alignment.used).tolist()
-    }
-    error = alignment_error(sequence, places, model="similarity", points_per_side=_GRID)
+    error = registration_error(alignment, sequence, "similarity", order, _GRID)
     positions = sequence.poses.position / sequence.poses.height[0] * sequence.lens.focal
     path = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
     return {

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 import rdstitch
-from examples.benchmarks.driver import run
-from rdstitch.errors import InputError, RdstitchError
+from examples.benchmarks.driver import images_of, run
+from rdstitch.errors import RdstitchError
 from rdstitch.features.prepared_image import PixelArray
 from rdstitch.io.read import read_image
 
@@ -35,17 +35,6 @@ class Outcome:
     distortion: float
     deviation: float
     text: str  # why it was refused, or all messages
-
-
-def images_of(folder: Path) -> list[PixelArray]:
-    """The images of a folder, in the order of their names."""
-    found = []
-    for file in sorted(folder.iterdir()):
-        try:
-            found.append(read_image(file).pixels)
-        except InputError:
-            continue
-    return found
 
 
 def resized(image: PixelArray, scale: float) -> PixelArray:
@@ -72,7 +61,7 @@ def outcome_of(images: Sequence[PixelArray], *, calibrate: bool) -> Outcome:
 def main(folders: tuple[Path, ...], *, calibrate: bool = False, messages: bool = False) -> None:
     """Print a line for every folder and size."""
     for folder in folders:
-        images, first = images_of(folder), None
+        images, first = [read_image(file).pixels for file in images_of(folder)], None
         for scale in SCALES:
             start = time.process_time()
             found = outcome_of([resized(image, scale) for image in images], calibrate=calibrate)

@@ -116,17 +116,8 @@ def measure(name: str, stage: StageGrid, folder: Path, peer: str | None) -> None
         flush=True,
     )
     for which in ("m2stitch", "ashlar", "basicpy", "basicpy, true offset") if peer else ():
-        command = [
-            peer or "",
-            "-c",
-            _PEERS,
-            str(folder),
-            str(stage.rows),
-            str(stage.columns),
-            str(stage.overlap),
-            which,
-            str(stage.offset),
-        ]
+        about = map(str, (folder, stage.rows, stage.columns, stage.overlap, which, stage.offset))
+        command = [str(peer), "-c", _PEERS, *about]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             print(f"  {which}: {(done.stderr.strip().splitlines() or ['failed'])[-1]}", flush=True)

@@ -1,14 +1,18 @@
 """How well an estimated registration agrees with the truth, from its numbers: no image is looked at."""
 
 from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Many
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from examples.judging.fitting import FITS, apply, quantile
+from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic.rendering import Sequence
 
 Transfer = Callable[[FloatArray], FloatArray]
@@ -20,15 +24,11 @@ class AlignmentError:
 
     ``error``: in px of that image: distance from the point to where the true camera sees the place on the plane that
     the estimate gives to it; inf where the estimate gives none, or one that the true camera cannot see; shape (N,).
-    ``error_mosaic``: in px of the mosaic: distance between the estimated and the true place of the point; inf as above;
-    shape (N,).
     """
 
     transform: FloatArray  # mosaic px to texels; shape (3, 3)
     image: NDArray[np.intp]  # which image each point is in; shape (N,)
-    points: FloatArray  # measured px in that image; shape (N, 2)
     error: FloatArray
-    error_mosaic: FloatArray
 
     @property
     def median(self) -> float:
@@ -83,17 +83,26 @@ def alignment_error(
     seen = np.concatenate(
         [sequence.to_image(index, part) for index, part in zip(indices, np.split(on_plane, len(indices)), strict=True)]
     )
-    measured = np.tile(points, (len(indices), 1))
-    return AlignmentError(
-        transform=transform,
-        image=np.repeat(np.array(indices, dtype=np.intp), len(points)),
-        points=measured,
-        error=_distance(seen, measured),
-        error_mosaic=_distance(apply(np.linalg.inv(transform), true), estimated),
-    )
+    distance = np.linalg.norm(seen - np.tile(points, (len(indices), 1)), axis=1)
+    image = np.repeat(np.array(indices, dtype=np.intp), len(points))
+    return AlignmentError(transform, image, np.where(np.isfinite(distance), distance, np.inf))
 
 
-def _distance(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Distances of points; inf where one is missing."""
-    distance = np.linalg.norm(a - b, axis=1)
-    return np.where(np.isfinite(distance), distance, np.inf)
+def registration_error(
+    alignment: Alignment,
+    sequence: Sequence,
+    model: str | None = None,
+    order: Many[int] | None = None,
+    points_per_side: tuple[int, int] = (20, 15),
+) -> AlignmentError:
+    """:func:`alignment_error` of images that were aligned.
+
+    ``model``: what the plane may differ by; if not given, a rectified one by a similarity, the frame of an image by a
+    homography. ``order``: which image of the sequence each one is, if they are not in its order.
+    """
+    places = {
+        i if order is None else order[i]: partial(to_plane, alignment.cameras[i], alignment.homographies[i])
+        for i in np.flatnonzero(alignment.used).tolist()
+    }
+    model = model or ("homography" if alignment.poses is None else "similarity")
+    return alignment_error(sequence, places, model=model, points_per_side=points_per_side)

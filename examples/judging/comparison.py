@@ -29,8 +29,7 @@ class PlaneComparison:
 
     ``transform``: mosaic px to texels, of the kind asked for; NaN where the mosaic shows nothing of the plane; shape
     (3, 3). ``residual``: from where the transform puts the plane to where the mosaic shows it, px of the mosaic; NaN
-    for patches that do not look like the plane anywhere near; shape (P, 2). ``grey_rms``: root mean square difference
-    of the grey levels, 0-255, after the best gain and offset for the whole mosaic.
+    for patches that do not look like the plane anywhere near; shape (P, 2).
     """
 
     transform: FloatArray
@@ -38,8 +37,6 @@ class PlaneComparison:
     residual: FloatArray
     texels_per_pixel: float  # size of a mosaic px on the plane, in the middle of the mosaic
     coverage: float  # share of the reachable plane that the mosaic shows; NaN if what is reachable was not given
-    grey_rms: float
-    correlation: float  # of the grey levels of mosaic and plane
 
     @property
     def error(self) -> FloatArray:
@@ -57,11 +54,6 @@ class PlaneComparison:
         """95 % of the errors are not above this, px of the mosaic; inf if more than 5 % of the patches are wrong."""
         return quantile(self.error, 0.95) if len(self.center) else np.inf
 
-    @property
-    def found(self) -> float:
-        """Share of the patches that were found."""
-        return float(np.isfinite(self.error).mean()) if len(self.center) else 0.0
-
 
 def compare_with_plane(
     mosaic: NDArray[Any],
@@ -69,10 +61,7 @@ def compare_with_plane(
     *,
     model: str = "similarity",
     reachable: NDArray[np.bool_] | None = None,
-    valid: NDArray[np.bool_] | None = None,
     start: ArrayLike | None = None,
-    patch: int = 33,
-    spacing: int | None = None,
     search: int = 16,
 ) -> PlaneComparison:
     """Lay a mosaic on the true plane and measure how far each part of it is from where it belongs.
@@ -86,13 +75,11 @@ def compare_with_plane(
     ``mosaic``: uint8 or uint16; RGB with an optional alpha; shape (h, w), (h, w, 3) or (h, w, 4). ``plane``: held in
     memory once as a grey image. ``model``: "similarity" or "homography": what the mosaic may differ by from the plane.
     ``reachable``: which texels the images show, for the coverage; see :meth:`Sequence.reachable`. Two texels at its
-    border do not count. ``valid``: which px of the mosaic are filled; if not given, those whose alpha is not zero or,
-    without alpha, that are not black; shape (h, w). ``start``: mosaic px to texels, right to within ``search``; shape
-    (3, 3). ``patch``, ``spacing``, ``search``: see :func:`examples.judging.patches.patch_displacements`. Raises
-    :class:`ArgumentError` when the mosaic has another shape or type.
+    border do not count. ``start``: mosaic px to texels, right to within ``search``; shape (3, 3). ``search``: see
+    :func:`examples.judging.patches.patch_displacements`. Raises :class:`ArgumentError` when the mosaic has another
+    shape or type.
     """
     grey, filled = grey_and_filled(mosaic)
-    filled = filled if valid is None else valid
     width, height = plane.size
     truth = _grey(plane.region(0, 0, width, height))
     placed = _place_by_features(grey, filled, truth) if start is None else np.asarray(start, dtype=np.float64)
@@ -100,7 +87,7 @@ def compare_with_plane(
         return _nothing(0.0 if reachable is not None else np.nan)
     for turn in range(_ROUNDS):
         drawn, inside = _drawn_over(truth, placed, grey.shape)
-        moves = patch_displacements(grey, drawn, filled & inside, patch=patch, spacing=spacing, search=search)
+        moves = patch_displacements(grey, drawn, filled & inside, search)
         used = moves.found
         if turn == 0 and used.any():
             length = np.linalg.norm(np.nan_to_num(moves.displacement), axis=1)
@@ -116,17 +103,8 @@ def compare_with_plane(
             break
     residual = moves.center - apply(np.linalg.inv(transform), on_plane)
     residual[~moves.found] = np.nan
-    drawn, inside = _drawn_over(truth, transform, grey.shape)
-    rms, correlation = _grey_agreement(grey, drawn, filled & inside)
-    return PlaneComparison(
-        transform=transform,
-        center=moves.center,
-        residual=residual,
-        texels_per_pixel=_texels_per_pixel(transform, grey.shape),
-        coverage=np.nan if reachable is None else coverage(filled, transform, reachable),
-        grey_rms=rms,
-        correlation=correlation,
-    )
+    covered = np.nan if reachable is None else coverage(filled, transform, reachable)
+    return PlaneComparison(transform, moves.center, residual, _texels_per_pixel(transform, grey.shape), covered)
 
 
 def coverage(filled: NDArray[np.bool_], transform: ArrayLike, reachable: NDArray[np.bool_]) -> float:
@@ -199,21 +177,26 @@ def _place_by_features(grey: LinearPixels, filled: NDArray[np.bool_], truth: Lin
     Matches that agree only roughly take part on purpose: a mosaic that has drifted should be laid on the plane as a
     whole, not by the part of it that is right.
     """
-    found = [features(grey, filled), features(truth, None)]
-    if any(len(descriptors) < _MIN_MATCHES for _, descriptors in found):
+    a, b = matches(grey, filled, truth)
+    if len(a) < _MIN_MATCHES:
         return None
-    (points1, descriptors1), (points2, descriptors2) = found
-    best = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors1, descriptors2, k=2)
-    pairs = [(m[0].queryIdx, m[0].trainIdx) for m in best if m[0].distance < 0.75 * m[1].distance]
-    if len(pairs) < _MIN_MATCHES:
-        return None
-    a, b = points1[[i for i, _ in pairs]], points2[[j for _, j in pairs]]
     rough, mask = cv2.findHomography(a, b, cv2.RANSAC, 8.0, maxIters=5000, confidence=0.9999)
     if rough is None or mask.sum() < _MIN_MATCHES:
         return None
     distance = np.linalg.norm(apply(rough, a) - b, axis=1)
     agreed = distance < _ROUGH_AGREEMENT * max(grey.shape)
     return fit_similarity(a[agreed], b[agreed])
+
+
+def matches(grey: LinearPixels, filled: NDArray[np.bool_], truth: LinearPixels) -> tuple[FloatArray, FloatArray]:
+    """Places (N, 2) of a mosaic and of the truth that look alike."""
+    (points1, descriptors1), (points2, descriptors2) = features(grey, filled), features(truth, None)
+    if min(len(descriptors1), len(descriptors2)) < 2:
+        return np.empty((0, 2)), np.empty((0, 2))
+    best = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors1, descriptors2, k=2)
+    pairs = [(m[0].queryIdx, m[0].trainIdx) for m in best if m[0].distance < 0.75 * m[1].distance]
+    one, other = np.array(pairs, dtype=int).reshape(-1, 2).T
+    return points1[one], points2[other]
 
 
 def features(grey: LinearPixels, mask: NDArray[np.bool_] | None) -> tuple[FloatArray, NDArray[np.float32]]:
@@ -253,16 +236,7 @@ def _grey(image: LinearPixels) -> LinearPixels:
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.float32)
 
 
-def _grey_agreement(grey: LinearPixels, drawn: LinearPixels, where: NDArray[np.bool_]) -> tuple[float, float]:
-    """Root mean square difference in grey levels after the best gain and offset, and correlation."""
-    a, b = grey[where].astype(np.float64), drawn[where].astype(np.float64)
-    if len(a) < 2 or a.std() == 0.0 or b.std() == 0.0:
-        return np.nan, np.nan
-    correlation = float(np.corrcoef(a, b)[0, 1])
-    return float(255.0 * a.std() * np.sqrt(max(0.0, 1.0 - correlation**2))), correlation
-
-
 def _nothing(covered: float) -> PlaneComparison:
     """A mosaic in which nothing of the plane can be recognised."""
     none = np.empty((0, 2))
-    return PlaneComparison(np.full((3, 3), np.nan), none, none, np.nan, covered, np.nan, np.nan)
+    return PlaneComparison(np.full((3, 3), np.nan), none, none, np.nan, covered)

@@ -11,6 +11,7 @@ from rdstitch.synthetic.textures import LinearPixels
 
 _ITERATIONS = 5
 _PATCHES = 5000
+_PATCH = 33  # px, a side
 # Patches that are refined together, as one tall image: OpenCV wants it lower than 32,768 px.
 _BATCH = 256
 # A patch whose refinement leaves the peak it started from has lost its way.
@@ -24,13 +25,10 @@ class Displacements:
     """Patches with texture, and where they were found.
 
     ``displacement``: from there to where the other image shows the same, px; NaN where it was not found; shape (P, 2).
-    ``correlation``: normalized cross-correlation there; that of the best place, if too low, for patches that were not
-    found; shape (P,).
     """
 
     center: FloatArray  # centre of each patch, px; shape (P, 2)
     displacement: FloatArray
-    correlation: FloatArray
 
     @property
     def found(self) -> NDArray[np.bool_]:
@@ -40,13 +38,7 @@ class Displacements:
 
 
 def patch_displacements(
-    image: LinearPixels,
-    other: LinearPixels,
-    valid: NDArray[np.bool_],
-    *,
-    patch: int = 33,
-    search: int = 16,
-    spacing: int | None = None,
+    image: LinearPixels, other: LinearPixels, valid: NDArray[np.bool_], search: int
 ) -> Displacements:
     """Look for patches of an image in another one that shows nearly the same.
 
@@ -54,12 +46,10 @@ def patch_displacements(
     least squares over shift, gain and offset (Lucas and Kanade).
 
     ``image``, ``other``: in [0, 1]; shape (h, w). ``valid``: where ``image`` and ``other`` mean something; a patch must
-    lie inside with all its px; shape (h, w). ``patch``: side of a patch, px; odd. ``spacing``: distance between
-    patches, px; if not given, 24 or what makes some 5,000 patches. ``search``: largest displacement along each axis,
-    px.
+    lie inside with all its px; shape (h, w). ``search``: largest displacement along each axis, px.
     """
-    half = patch // 2
-    step = max(24, int(np.sqrt(image.size / _PATCHES))) if spacing is None else spacing
+    patch, half = _PATCH, _PATCH // 2
+    step = max(24, int(np.sqrt(image.size / _PATCHES)))
     inside = cv2.erode(valid.astype(np.uint8), np.ones((patch, patch), np.uint8), borderValue=(0.0,)) > 0
     height, width = image.shape
     y, x = (g.ravel() for g in np.mgrid[half : height - half : step, half : width - half : step])
@@ -86,7 +76,7 @@ def patch_displacements(
         displacement[part], correlation[part] = _refine(templates[part], layers, center[part], peak[part])
     lost = (np.abs(displacement - peak) > _FARTHEST_FROM_PEAK).any(axis=1) | ~(correlation >= _LEAST_CORRELATION)
     displacement[lost] = np.nan
-    return Displacements(center, displacement, correlation)
+    return Displacements(center, displacement)
 
 
 def _refine(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from examples.judging.comparison import features, grey_and_filled
+from examples.judging.comparison import grey_and_filled, matches
 from examples.judging.fitting import quantile
 from examples.judging.patches import patch_displacements
 from rdstitch.arrays import FloatArray
@@ -56,9 +56,7 @@ class _Placement:
     def directions(self, places: FloatArray) -> FloatArray:
         """Of the sphere (..., 3), that the panorama's places (..., 2) should show."""
         longitude, latitude = (places[..., 0] - self.column) / self.scale, (places[..., 1] - self.horizon) / self.scale
-        level = np.cos(latitude)
-        own = np.stack([np.sin(longitude) * level, np.sin(latitude), np.cos(longitude) * level], axis=-1)
-        return np.asarray(own @ self.turn.T)
+        return np.asarray(_ahead(longitude, latitude) @ self.turn.T)
 
     def places(self, directions: FloatArray) -> FloatArray:
         """The panorama's places (N, 2) of directions (N, 3), within half a turn of its middle column."""
@@ -77,7 +75,7 @@ def compare_with_sphere(panorama: NDArray[Any], sequence: TurningSequence, searc
     grey, filled = grey_and_filled(panorama)
     width, height = sequence.texture.size[0] // 2, sequence.texture.size[1]
     truth, _ = grey_and_filled(np.rint(255.0 * sequence.texture.region(0, 0, width, height)).astype(np.uint8))
-    shown, seen = _matches(grey, filled, truth)
+    shown, seen = matches(grey, filled, truth)
     column = (grey.shape[1] - 1) / 2
     start = _rough(shown, seen, width, column)
     if start is None:
@@ -87,7 +85,7 @@ def compare_with_sphere(panorama: NDArray[Any], sequence: TurningSequence, searc
         placed = _Placement.of(parameters, column)
         y, x = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(np.float64)
         drawn = _drawn(truth, placed.directions(np.stack([x, y], axis=-1)))
-        moves = patch_displacements(grey, drawn, filled, search=search)
+        moves = patch_displacements(grey, drawn, filled, search)
         if moves.found.sum() < _MIN_MATCHES:
             return SphereComparison(np.empty(0), 0.0)
         there = placed.directions(moves.center + moves.displacement)
@@ -96,15 +94,6 @@ def compare_with_sphere(panorama: NDArray[Any], sequence: TurningSequence, searc
     angles = np.linalg.norm(np.cross(placed.directions(moves.center), there), axis=1)
     error = np.where(moves.found, angles, np.inf)
     return SphereComparison(error, _coverage(placed, filled, sequence))
-
-
-def _matches(grey: LinearPixels, filled: NDArray[np.bool_], truth: LinearPixels) -> tuple[FloatArray, FloatArray]:
-    """Places (N, 2) of the panorama and of the sphere's texture that look alike."""
-    (points1, descriptors1), (points2, descriptors2) = features(grey, filled), features(truth, None)
-    best = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors1, descriptors2, k=2)
-    pairs = np.array([(m[0].queryIdx, m[0].trainIdx) for m in best if m[0].distance < 0.75 * m[1].distance])
-    pairs = pairs.reshape(-1, 2)
-    return points1[pairs[:, 0]], points2[pairs[:, 1]]
 
 
 def _rough(shown: FloatArray, seen: FloatArray, width: int, column: float) -> FloatArray | None:
@@ -136,9 +125,12 @@ def _fitted(
 
 def _sphere(texels: FloatArray, width: int) -> FloatArray:
     """Directions (N, 3) of texels (N, 2) of the sphere's texture."""
-    longitude, latitude = ((texels + 0.5) * (2.0 * np.pi / width) - (0.0, np.pi / 2)).T
+    return _ahead(*((texels + 0.5) * (2.0 * np.pi / width) - (0.0, np.pi / 2)).T)
+
+
+def _ahead(longitude: FloatArray, latitude: FloatArray) -> FloatArray:
     level = np.cos(latitude)
-    return np.stack([np.sin(longitude) * level, np.sin(latitude), np.cos(longitude) * level], axis=1)
+    return np.stack([np.sin(longitude) * level, np.sin(latitude), np.cos(longitude) * level], axis=-1)
 
 
 def _drawn(truth: LinearPixels, directions: FloatArray) -> LinearPixels:

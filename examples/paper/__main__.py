@@ -6,8 +6,7 @@ import time
 from importlib import import_module
 from pathlib import Path
 
-from examples.paper.common.report import save
-from examples.paper.common.settings import Effort, Settings
+from examples.paper.common.report import Effort, Settings, save
 
 FIGURES = {
     "runtime": "time per instance of the solvers",

@@ -4,11 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.common.contenders import known_tilt, unknown_tilt
-from examples.paper.common.peers import absent
-from examples.paper.common.plots import histograms
-from examples.paper.common.report import Report, Table
-from examples.paper.common.settings import Settings
+from examples.paper.common.contenders import absent, known_tilt, unknown_tilt
+from examples.paper.common.report import Report, Settings, Table, histograms
 from rdstitch.arrays import FloatArray
 from tests.instances import planar_instances
 

@@ -2,11 +2,8 @@
 
 import numpy as np
 
-from examples.paper.common.contenders import Contender, known_tilt, unknown_tilt
-from examples.paper.common.noise import WITNESSES, sweep
-from examples.paper.common.peers import absent
-from examples.paper.common.report import Report
-from examples.paper.common.settings import Settings
+from examples.paper.common.contenders import WITNESSES, Contender, absent, known_tilt, sweep, unknown_tilt
+from examples.paper.common.report import Report, Settings
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
@@ -24,15 +21,7 @@ def run(settings: Settings) -> Report:
 
     wrong = Contender(f"2 points, tilt wrong by {_WRONG_BY:g}°", 2, _two_point_wrong_tilt)
     found = sweep([*known_tilt(), wrong, *unknown_tilt()], draw)
-    tables = (
-        found.table(
-            f"Fig. 4: median error of λ of the solution nearest to the truth, no tilt, {count} instances a level",
-            "nearest",
-        ),
-        found.table(f"Fig. 4: median error of λ of the solution that {WITNESSES} more points choose", "chosen"),
-        found.table("Fig. 4: median error of H of the solution nearest to the truth", "homography"),
-    )
-    return Report(tables, found.draw, notes=absent("homlib"))
+    return Report(found.tables("Fig. 4", f"no tilt, {count} instances a level"), found.draw, notes=absent("homlib"))
 
 
 def _two_point_wrong_tilt(x1: FloatArray, x2: FloatArray, tilt: FloatArray) -> Solutions:

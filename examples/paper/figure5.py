@@ -1,9 +1,9 @@
 """Fig. 5: a pair through a fisheye lens, which is no division model, rectified and stitched; and a real pair."""
 
+from examples.judging import registration_error
 from examples.paper.common.matched import rendered_pair
-from examples.paper.common.report import Pixels, Report, Table
-from examples.paper.common.settings import Effort, Settings
-from examples.paper.common.stitched import registration_error, stitch_files, stitch_rendered
+from examples.paper.common.report import Effort, Pixels, Report, Settings, Table
+from examples.paper.common.stitched import stitch_files, stitch_rendered
 from rdstitch.camera import Camera
 from rdstitch.camera_files.lens_models import fit_lens
 from rdstitch.errors import RegistrationError
@@ -28,15 +28,9 @@ def run(settings: Settings) -> Report:
         rows.append(row)
         images[f"figure5_fisheye{k}.jpg"] = image
     header = (
-        "focal length, px",
-        "λ",
-        "λ of the best division model",
-        "its misfit, px",
-        "model",
-        "median error, px",
-        "95 %, px",
-        "warned",
-    )
+        "focal length, px", "λ", "λ of the best division model", "its misfit, px", "model",
+        "median error, px", "95 %, px", "warned",
+    )  # fmt: skip
     title = f"Fig. 5: rendered pairs through an equidistant fisheye, {size[0]}x{size[1]} px, errors on the true plane"
     tables, notes = [Table(title, header, tuple(rows))], []
     real: list[tuple[object, ...]] = []

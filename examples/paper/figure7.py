@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from examples.paper.common.contenders import absent
 from examples.paper.common.matched import MatchedPair, match_files, match_rendered, rendered_pair
-from examples.paper.common.peers import absent
 from examples.paper.common.plain_ransac import THRESHOLD, all_solvers, draw_samples
-from examples.paper.common.plots import curves
-from examples.paper.common.report import Report, Table
-from examples.paper.common.settings import Effort, Settings
+from examples.paper.common.report import Effort, Report, Settings, Table, curves
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.robust.measurements import Measurements

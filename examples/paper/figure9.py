@@ -12,8 +12,7 @@ import numpy as np
 from examples.judging.trajectories import compare_trajectories
 from examples.paper.common.drives import PATHS, Drive, drive, estimated_links
 from examples.paper.common.plain_ransac import all_solvers, best_of
-from examples.paper.common.report import Report, Table
-from examples.paper.common.settings import Settings
+from examples.paper.common.report import Report, Settings, Table
 from rdstitch.alignment import align
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, FreeParameters, Parameters
 from rdstitch.alignment.motion_models import RIGID, YAW, X, Y
@@ -164,32 +163,16 @@ def _table(name: str, d: Drive, paths: list[_Path]) -> Table:
     rows = []
     for path in paths:
         before, after = compare_trajectories(path.before, d.truth), compare_trajectories(path.after, d.truth)
-        rows.append(
-            (
-                path.solver,
-                100.0 * before.translation,
-                100.0 * after.translation,
-                float(np.degrees(before.rotation)),
-                float(np.degrees(after.rotation)),
-                100.0 * before.drift,
-                100.0 * after.drift,
-                abs(path.distortion_before - d.camera.distortion),
-                abs(path.distortion_after - d.camera.distortion),
-                path.iterations,
-            )
-        )
+        shares = [100.0 * error for error in (before.translation, after.translation)]
+        turns = [float(np.degrees(error)) for error in (before.rotation, after.rotation)]
+        drifts = [100.0 * error for error in (before.drift, after.drift)]
+        off = [abs(lam - d.camera.distortion) for lam in (path.distortion_before, path.distortion_after)]
+        rows.append((path.solver, *shares, *turns, *drifts, *off, path.iterations))
     header = (
-        "solver",
-        "translation, chained, %",
-        "adjusted, %",
-        "rotation, chained, °",
-        "adjusted, °",
-        "drift, chained, % of path",
-        "adjusted, % of path",
-        "λ error, median of pairs",
-        "λ error, adjusted",
+        "solver", "translation, chained, %", "adjusted, %", "rotation, chained, °", "adjusted, °",
+        "drift, chained, % of path", "adjusted, % of path", "λ error, median of pairs", "λ error, adjusted",
         "adjustment iterations",
-    )
+    )  # fmt: skip
     return Table(
         f"Fig. 9: {name}, {len(d.poses)} frames, 0.5 px of noise, λ = {d.camera.distortion:g}", header, tuple(rows)
     )

@@ -6,11 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from examples.paper.common.estimation_pairs import JudgedPair, rendered_pairs, scene_pairs
+from examples.paper.common.estimation_pairs import JudgedPair, made_scenes, read_scenes, rendered_pairs, scene_pairs
 from examples.paper.common.estimators import THRESHOLD, Estimator, Judgement, installed_estimators, judge
-from examples.paper.common.planar_scenes import made_scenes, read_scenes
-from examples.paper.common.report import Report, Table
-from examples.paper.common.settings import Settings
+from examples.paper.common.report import Report, Settings, Table
 from rdstitch.io.read import read_image
 
 LIMITS = (1.0, 3.0, 5.0)
@@ -89,13 +87,8 @@ def _table(name: str, results: dict[str, list[Judgement]]) -> Table:
         lam = None if "no λ" in estimator else float(np.median([judgement.distortion_error for judgement in found]))
         duration = float(np.median([judgement.seconds for judgement in found]))
         rows.append((estimator, *areas, float(np.median(errors)), lam, duration / unit))
-    header = (
-        "estimator",
-        *(f"AUC at {limit:g} px, %" for limit in LIMITS),
-        "median error, px",
-        "median error of λ",
-        "processor time, rdstitch's = 1",
-    )
+    curves = (f"AUC at {limit:g} px, %" for limit in LIMITS)
+    header = ("estimator", *curves, "median error, px", "median error of λ", "processor time, rdstitch's = 1")
     count = len(next(iter(results.values())))
     title = f"Homography estimation: {name}, {count} pairs, threshold {THRESHOLD:g} px, error in px of image 2"
     return Table(title, header, tuple(rows))

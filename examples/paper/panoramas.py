@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from examples.judging import compare_with_sphere
-from examples.paper.common.report import Pixels, Report
-from examples.paper.common.settings import Effort, Settings
+from examples.paper.common.report import Effort, Pixels, Report, Settings
 from examples.paper.common.stitchers import installed_panorama_stitchers
 from examples.paper.end_to_end import SEARCH, Measured, compare
 from rdstitch.camera import Camera

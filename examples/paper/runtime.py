@@ -5,10 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from examples.paper.common.contenders import HOMLIB, Contender, known_tilt, own_unknown_tilt
-from examples.paper.common.peers import absent, optional_module
-from examples.paper.common.report import Report, Table
-from examples.paper.common.settings import Settings
+from examples.paper.common.contenders import HOMLIB, Contender, absent, known_tilt, optional_module, own_unknown_tilt
+from examples.paper.common.report import Report, Settings, Table
 from tests.instances import PlanarInstances, planar_instances
 
 _SINGLES = 40

@@ -1,17 +1,24 @@
-"""``rdstitch mosaic``, run for real."""
+"""``rdstitch mosaic``: of several blocks, with images left out, and when it warns."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from examples.judging import alignment_error
+from rdstitch.camera import Camera
+from rdstitch.io import read_image, write_image
 from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.messages import Message
+from rdstitch.pipeline import accept
 from rdstitch.synthetic import Sequence
-from tests.cli.running import CACHED, DISTORTION, Run, finished, start, transfers
+from rdstitch.verification.findings import Finding
+from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, flight, start, transfers
 from tests.sampled import sampled
 
 
@@ -87,3 +94,123 @@ def test_every_image_finds_its_place_whatever_the_prescreen_does(
 ) -> None:
     monkeypatch.setattr(Pairing, "prescreen_pairs", glance)
     rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", "--strict", *CACHED)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three images of one floor, two of another, and one of nothing that they show."""
+    made = tmp_path_factory.mktemp("blocks")
+    for name, seed, count in (("a", 5, 3), ("b", 9, 2), ("c", 14, 1)):
+        for path in flight(seed, count, overlap=0.6).write(tmp_path_factory.mktemp(name)):
+            shutil.copy(path, made / f"{name}_{path.name}")
+    return made
+
+
+def test_each_block_has_a_file_and_is_named(rdstitch: Run, folder: Path, tmp_path: Path) -> None:
+    done = rdstitch("mosaic", folder, "-o", tmp_path / "floor.png", "--all-blocks", "--lambda", str(DISTORTION), *FAST)
+    lines = [line for line in (*done.err.splitlines(), done.made) if "pixels" in line]
+    for name, block, count, line in zip(("floor", "floor-2"), "ab", (3, 2), lines, strict=True):
+        record = json.loads((tmp_path / f"{name}.png.json").read_text(encoding="utf-8"))
+        used = [image["name"] for image in record["images"] if image["used"]]
+        assert len(used) == count
+        assert all(image[0] == block and image in line for image in used)
+    assert not (tmp_path / "floor-3.png").exists()
+    # What is in another block is not called left out; what is in none is, once.
+    assert [line.count(".png") for line in done.err.splitlines() if "left out" in line] == [1]
+    assert "left out" in done.err
+    assert "c_" in done.err
+
+
+@pytest.fixture
+def spoiled(tmp_path: Path) -> list[Path]:
+    """Five images in a row; the last shows other ground, but for a patch by which it is registered."""
+    frames = flight(3, 5).write(tmp_path, "frame_{}.png")
+    true = read_image(frames[4]).pixels
+    image = flight(29, 5).frame(4).copy()
+    height, width = image.shape[:2]
+    patch = np.s_[height // 3 : height // 3 + 80, width // 8 : width // 8 + 80]
+    image[patch] = true[patch]
+    write_image(frames[4], image)
+    return frames
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_an_image_that_fails_its_checks_is_left_out_by_name(
+    rdstitch: Run, spoiled: list[Path], tmp_path: Path, strict: bool
+) -> None:
+    extra = ("--strict",) if strict else ()
+    done = rdstitch("mosaic", *spoiled, "-o", tmp_path / "out.png", *CACHED, *extra, status=5 if strict else 0)
+    assert f"left out {spoiled[4]}" in done.err
+    assert not any(f"left out {path}" in done.err for path in spoiled[:4])
+    assert strict or abs(float(done.out) - DISTORTION) < 0.005
+
+
+def test_images_of_another_block_are_named_in_one_line(rdstitch: Run, tmp_path: Path) -> None:
+    own, others = flight(3, 3).write(tmp_path, "a{}.png"), flight(29, 2).write(tmp_path, "b{}.png")
+    done = rdstitch("mosaic", *own, *others, "-o", tmp_path / "out.png", *CACHED)
+    (line,) = [line for line in done.err.splitlines() if "left out" in line]
+    assert f"left out {others[0]}, {others[1].name}: in block 2 of 2, whose 2 images overlap with none" in line
+
+
+# Without a focal length, a path says that its lengths are guessed.
+GIVEN = (*CACHED, "--focal", "380")
+OUTPUTS = {"pano": "out.png", "mosaic": "out.png", "calibrate": "camera.json", "trajectory": "path.csv"}
+
+
+def _pretend(monkeypatch: pytest.MonkeyPatch, *found: Message) -> None:
+    findings = tuple(Finding("pretended", severity=message.severity) for message in found)
+    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: findings)
+    monkeypatch.setattr(accept, "messages_of", lambda *arguments: list(found))
+
+
+@pytest.mark.parametrize("command", OUTPUTS)
+def test_warnings_are_printed(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    _pretend(monkeypatch, Message("look at that seam"))
+    done = rdstitch(command, *frames, "-o", tmp_path / OUTPUTS[command], *GIVEN)
+    # What calibrate prints of the lens comes after it.
+    assert done.err.splitlines()[0] == "rdstitch: warning: look at that seam"
+
+
+@pytest.mark.parametrize("command", OUTPUTS)
+def test_what_fails_is_written_with_force_only_and_then_reported(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    _pretend(monkeypatch, Message("the images disagree", severity="failure"))
+    output = tmp_path / OUTPUTS[command]
+    rdstitch(command, *frames, "-o", output, *GIVEN, status=4, told="the images disagree")
+    assert not output.exists()
+    forced = rdstitch(command, *frames, "-o", output, *GIVEN, "--force")
+    assert forced.err.splitlines()[0] == "rdstitch: warning: not reliable: the images disagree"
+    assert output.exists()
+
+
+def test_two_images_of_two_lenses_are_noticed(rdstitch: Run, tmp_path: Path) -> None:
+    sequence = flight(3, 2)
+    assert isinstance(sequence.lens, Camera)
+    other = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
+    images = [sequence.write(tmp_path, "own_{}.png")[0], other.write(tmp_path, "other_{}.png")[1]]
+    done = rdstitch("pano", *images, "-o", tmp_path / "out.png", *CACHED, status=4)
+    found = re.search(
+        r"two lenses or zooms are mixed: (\w+\.png) \(λ about (-0\.\d+)\) and (\w+\.png) \((-0\.\d+)\)", done.line
+    )
+    seen = {found[1]: float(found[2]), found[3]: float(found[4])}
+    assert seen == {"own_0.png": pytest.approx(-0.2, abs=0.02), "other_1.png": pytest.approx(-0.12, abs=0.02)}
+    assert not (tmp_path / "out.png").exists()
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_images_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tmp_path: Path, strict: bool) -> None:
+    sequence = flight(3, 5)
+    assert isinstance(sequence.lens, Camera)
+    zoomed = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
+    own, others = sequence.write(tmp_path, "own_{:04d}.png")[:3], zoomed.write(tmp_path, "other_{:04d}.png")[3:]
+    extra = ("--strict",) if strict else ()
+    done = rdstitch("mosaic", *own, *others, "-o", tmp_path / "out.png", *extra, *CACHED, status=5 if strict else 0)
+    assert all(path.name in done.err for path in others)
+    assert not any(path.name in done.err for path in own)
+    assert re.search(
+        r"another lens or zoom setting \(λ about -0\.1[12]\d, that of the others -0\.(19|20)\d\)", done.err
+    )
+    assert strict or abs(float(done.out) - DISTORTION) < 0.002

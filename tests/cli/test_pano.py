@@ -38,7 +38,7 @@ def test_writes_image_sidecar_and_camera_and_prints_lambda(
     numbers = alignment_error(sequence, transfers(record), model="homography")
     assert numbers.median < 1.0
     seen = compare_with_plane(
-        written.pixels, sequence.texture, model="homography", valid=written.alpha > 0, start=numbers.transform
+        np.dstack([written.pixels, written.alpha]), sequence.texture, model="homography", start=numbers.transform
     )
     assert seen.median < 1.0
 

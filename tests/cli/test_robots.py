@@ -1,10 +1,12 @@
-"""What robots bring and take: time stamps, formats of trajectories, ROS bags."""
+"""Robots: a lens, a path, and floors."""
 
 import csv
+import json
 import re
 from functools import partial
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -14,8 +16,9 @@ from PIL import ExifTags, Image
 import rdstitch
 from examples.judging.trajectories import compare_trajectories
 from rdstitch.camera import Camera
+from rdstitch.camera_files import load_camera
 from rdstitch.io import read_image
-from rdstitch.synthetic import Photometry, drive_poses, ground, sequence_over
+from rdstitch.synthetic import Photometry, Sequence, drive_poses, ground, sequence_over
 from tests.cli.running import CACHED, DISTORTION, Run
 from tests.floor_drives import read_path, true_path
 from tests.videos import write_video
@@ -193,3 +196,61 @@ def test_python_gets_labels_too(frames: list[Path]) -> None:
     assert path.name == tuple(frame.name for frame in frames)
     assert path.source_frame.tolist() == [0, 1, 2]
     assert np.isnan(path.timestamp).all()
+
+
+def test_csv_holds_the_path(rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path) -> None:
+    known = ("--focal", str(sequence.lens.focal), "--plot", tmp_path / "path.svg")
+    done = rdstitch("trajectory", frames[0].parent, "-o", tmp_path / "path.csv", *known, *CACHED, err="")
+    assert abs(float(done.out) - DISTORTION) < 0.01
+    with (tmp_path / "path.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    place = np.array([[float(row["x"]), float(row["y"])] for row in rows])
+    steps = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    true = np.linalg.norm(np.diff(sequence.poses.position, axis=0), axis=1)
+    np.testing.assert_allclose(steps, true / sequence.poses.height[0], rtol=0.02)
+    assert ElementTree.parse(tmp_path / "path.svg").getroot().tag.endswith("svg")
+
+
+def test_height_scales_positions_and_tum_has_eight_columns(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    arguments = ("trajectory", *frames, "--format", "tum", *CACHED)
+    rdstitch(*arguments, "-o", tmp_path / "one.txt", told="lengths may be off")
+    rdstitch(*arguments, "-o", tmp_path / "two.txt", "--height", "2")
+    first, second = (np.loadtxt(tmp_path / name) for name in ("one.txt", "two.txt"))
+    assert first.shape == (3, 8)
+    np.testing.assert_allclose(second[:, 1:3], 2.0 * first[:, 1:3], atol=1e-6)
+    np.testing.assert_allclose(second[:, 4:], first[:, 4:], atol=1e-9)
+
+
+def test_writes_a_camera_that_pano_takes(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    file = tmp_path / "camera.json"
+    done = rdstitch("calibrate", frames[0].parent, "-o", file, *CACHED)
+    camera = Camera.load(file)
+    first, *others = done.err.splitlines()
+    assert first == f"rdstitch: λ = {camera.distortion:.6f} ± {camera.distortion_std:.6f}"
+    assert "rdstitch: second coefficient not needed" in others
+    assert not re.search("warning|pixels from the lens", done.err)
+    assert done.out == f"{camera.distortion:.6f}\n"
+    assert abs(camera.distortion - DISTORTION) < 0.01
+    assert camera.image_size == (400, 300)
+    assert [path.name for path in tmp_path.iterdir()] == ["camera.json"]
+
+    stitched = rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.jpg", "--camera", file, *CACHED)
+    assert (stitched.status, stitched.out) == (0, done.out)
+
+
+@pytest.mark.parametrize("name", ["camera.yml", "cameras.json", "lens.pto"])
+def test_camera_files_of_others(rdstitch: Run, frames: list[Path], tmp_path: Path, name: str) -> None:
+    done = rdstitch("calibrate", *frames[:2], "-o", tmp_path / name, *CACHED)
+    assert re.search(rf"{name}: its lens model is at most 0\.\d+ pixels from the lens", done.err)
+    assert f"{load_camera(tmp_path / name).distortion:.6f}\n" == done.out
+    rdstitch("undistort", frames[0], "--camera", tmp_path / name, "-o", tmp_path / "straight", err="")
+
+
+def test_the_residual_of_a_foreign_lens_is_reported(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    entry = {"projection_type": "perspective", "width": 400, "height": 300, "focal": 0.95, "k1": -0.2, "k2": 0.02}
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps({"lens": entry}), encoding="utf-8")
+    arguments = ("undistort", frames[0], "--camera", file, "-o", tmp_path / "straight", "--overwrite")
+    told = rdstitch(*arguments)
+    assert re.search(r"OpenDroneMap.* rms \d+\.\d\d pixels", told.line)
+    rdstitch(*arguments, "-q", err="")

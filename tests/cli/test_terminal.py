@@ -1,17 +1,25 @@
-"""What is seen on terminals: bars, the last line, help in groups, and encodings that know no λ."""
+"""Where a run stands: the terminal, the folder's surroundings, and interruptions."""
 
+import json
 import os
+import random
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+from rdstitch_cli.main import run
 from rdstitch_cli.parameter_types import UserPath
 from rdstitch_cli.terminal import Reporter, spell_out
 
 from rdstitch.io import read_image
-from tests.cli.running import CACHED, Run
+from rdstitch.synthetic import ground
+from tests.cli.running import CACHED, DISTORTION, FAST, Outcome, Run, finished, start, state_of
 from tests.sampled import sampled
 
 _RUN = "from rdstitch_cli.main import main; main()"
@@ -117,3 +125,126 @@ def test_tilde_is_the_home_folder_where_no_shell_saw_it(
     rdstitch("pano", *frames, "--output=~/pano.png", *CACHED)
     assert (tmp_path / "pano.png").exists()
     assert UserPath().convert("~no-such-user/x", None, None) == Path("~no-such-user/x")
+
+
+_PROGRAM = "from rdstitch_cli.main import main; main()"
+_CLOSED = "import os, sys; [os.close(n) for n in {}]; os.execv({!r}, [{!r}, '-c', {!r}, *sys.argv[1:]])"
+
+
+@pytest.mark.parametrize("closed", [(0, 1, 2), *(pytest.param((n,), marks=pytest.mark.slow) for n in range(3))])
+def test_closed_streams(here: Path, closed: tuple[int, ...]) -> None:
+    program = _CLOSED.format(closed, sys.executable, sys.executable, _PROGRAM)
+    done = finished(start("pano", "a.png", "b.png", "-o", "out.png", *CACHED, program=program))
+    assert (done.status, done.err) == (0, "")
+    assert 1 in closed or abs(float(done.out) - DISTORTION) < 0.02
+    # Nothing that is told goes into a file that has taken the place of a closed stream.
+    assert (here / "out.png").read_bytes().startswith(b"\x89PNG")
+    assert finished(start("mosaic", "-", "-o", "new.png", *CACHED, program=program)).status == 2
+    assert finished(start("mosaic", "missing", "-o", "new.png", *CACHED, program=program)).status == 3
+
+
+def test_full_streams(here: Path) -> None:
+    full = "import os, sys; os.dup2(os.open('/dev/full', os.O_WRONLY), {}); " + _PROGRAM
+    done = finished(start("pano", "a.png", "b.png", "-o", "out.png", *CACHED, program=full.format(1)))
+    assert done.status == 6
+    assert "standard output: cannot be written" in done.line
+    assert finished(start("mosaic", "missing", "-o", "new.png", *CACHED, program=full.format(2))).status == 3
+
+
+def test_a_current_folder_that_was_deleted(here: Path) -> None:
+    gone = "import os; os.mkdir('gone'); os.chdir('gone'); os.rmdir('../gone'); " + _PROGRAM
+    done = finished(start("mosaic", "more", "-o", "out.png", *CACHED, program=gone))
+    assert done.status == 3
+    assert "current folder" in done.line
+    done = finished(start("mosaic", here / "more", "-o", here / "out.png", *CACHED, program=gone))
+    assert (done.status, done.err) == (0, "")
+
+
+_IMAGES = 64  # enough for worker processes
+
+
+@pytest.fixture
+def strip(tmp_path: Path) -> Path:
+    folder = tmp_path / "strip"
+    folder.mkdir()
+    width, height, step = 200, 150, 60
+    whole = ground((width + step * _IMAGES, height + 40), 5, 1).region(0, 0, width + step * _IMAGES, height + 40)
+    for index in range(_IMAGES):
+        part = whole[10 + 5 * (index % 5) :, step * index :][:height, :width]
+        cv2.imwrite(str(folder / f"{index:02d}.png"), np.rint(part * 255.0).astype(np.uint8))
+    return folder
+
+
+def _children(process: int) -> list[int]:
+    """Processes that any thread of a process has started."""
+    threads = Path(f"/proc/{process}/task").iterdir()
+    return [int(child) for thread in threads for child in (thread / "children").read_text().split()]
+
+
+@pytest.mark.skipif(not Path(f"/proc/self/task/{os.getpid()}/children").exists(), reason="needs Linux's /proc")
+@pytest.mark.parametrize("continued", sampled([False, True]))
+def test_an_interrupted_run_ends_its_workers_and_can_be_continued(strip: Path, tmp_path: Path, continued: bool) -> None:
+    options = ("-j", "2", "--max-features", "200", "-v", "--cache", tmp_path / "cache")
+    arguments = ("calibrate", strip, "-o", tmp_path / "camera.json", *options)
+    process = start(*arguments)
+    while not process.stderr.readline().startswith(b"rdstitch: comparing"):
+        assert process.poll() is None
+    workers = _children(process.pid)
+    assert len(workers) == 2
+    process.send_signal(signal.SIGINT)
+    done = finished(process)
+    assert done.status == 130
+    assert done.line.endswith("interrupted; the same command goes on from the cache")
+    assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache" / "features").rglob("*") if path.is_file()}
+    assert len(kept) == _IMAGES
+    if continued:
+        assert finished(start(*arguments)).status == 0
+        assert {path: path.stat().st_mtime_ns for path in kept} == kept
+
+
+def test_debug_shows_where(capsys: pytest.CaptureFixture[str], place: Path) -> None:
+    status = run(["--debug", "pano", str(place / "a.png"), str(place / "missing.png"), "-o", str(place / "out.png")])
+    assert status == 3
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_nobody_reads_the_output(place: Path) -> None:
+    process = start("pano", place / "a.png", place / "b.png", "-o", place / "out.png", *FAST)
+    process.stdout.close()
+    said = process.stderr.read()
+    process.stderr.close()
+    assert process.wait() == 141
+    assert Outcome.of(0, "", said.decode()).err == ""
+    assert (place / "out.png").exists()
+
+
+@pytest.mark.parametrize("signal_number", sampled([signal.SIGTERM, signal.SIGINT]))
+def test_termination_leaves_nothing_behind(place: Path, signal_number: int) -> None:
+    before = state_of(place)
+    process = start("pano", place / "a.png", place / "b.png", "-o", place / "out.png", "-v", *FAST)
+    assert process.stderr.readline().startswith(b"rdstitch: detecting")
+    process.send_signal(signal_number)
+    done = finished(process)
+    assert done.status == 128 + signal_number
+    assert done.line.endswith("interrupted")
+    assert state_of(place) == before
+
+
+@pytest.mark.parametrize("attempt", sampled(range(int(os.environ.get("RDSTITCH_KILLS", "4")))))
+def test_killed_at_any_moment(place: Path, attempt: int) -> None:
+    command = ("pano", place / "a.png", place / "b.png", "-o", place / "out.png", "--overwrite", *FAST)
+    assert finished(start(*command, "--max-size", "100")).status == 0
+    old = (place / "out.png").read_bytes()
+    process = start(*command, "-v")
+    assert process.stderr.readline()
+    time.sleep(random.Random(attempt).uniform(0.0, 1.5))
+    process.kill()
+    finished(process)
+    if (place / "out.png").read_bytes() != old:
+        assert read_image(place / "out.png").pixels.size > 0
+    assert json.loads((place / "out.png.json").read_text(encoding="utf-8"))["verdict"]["ok"]
+    # What a killed run leaves is hidden, and no input of the next one.
+    done = finished(start("mosaic", place, "-o", place / "out.png", "--overwrite", *FAST))
+    assert (done.status, done.err) == (0, "")
+    assert read_image(place / "out.png").pixels.size > 0

@@ -1,6 +1,14 @@
-"""Messages as the user reads them."""
+"""Messages, and the guide that explains them."""
 
+import re
+from pathlib import Path
+
+from rdstitch_cli.help_pages import troubleshooting
+
+from rdstitch import errors
 from rdstitch.messages import Message, left_out, told_once
+from rdstitch.verification.messages import TEXTS
+from rdstitch.verification.verdict import RefusedError
 
 
 def test_images_left_out_for_one_reason_are_named_together() -> None:
@@ -22,3 +30,23 @@ def test_the_folder_is_named_where_it_changes() -> None:
 
 def test_the_temporary_folder_of_a_video_is_not_named() -> None:
     assert str(left_out("/tmp/rdstitch-x1.part/drive_0003.jpg", "is blurred")).startswith("left out drive_0003.jpg: ")
+
+
+_ROOT = Path(__file__).parents[2]
+
+
+def test_every_code_has_a_paragraph_and_every_paragraph_a_code() -> None:
+    headings = re.findall(r"(?m)^### (\S+)$", (_ROOT / "docs/troubleshooting.md").read_text(encoding="utf-8"))
+    of_errors = {kind.code for kind in vars(errors).values() if isinstance(kind, type) and hasattr(kind, "code")}
+    sources = [path.read_text(encoding="utf-8") for path in (_ROOT / "rdstitch").rglob("*.py")]
+    of_messages = {code for text in sources for code in re.findall(r'code ?= ?"([a-z-]+)"', text)}
+    of_messages |= {code for code, _ in TEXTS.values()}
+    assert {RefusedError.code, "relief", "lambda-not-observable"} <= of_messages
+    assert sorted(headings) == sorted((of_errors | of_messages) - {""})
+    assert sorted(troubleshooting()) == sorted(headings)
+
+
+def test_codes_end_the_line() -> None:
+    assert str(Message("hazy", code="relief")) == "hazy [relief]"
+    assert str(Message("hazy")) == "hazy"
+    assert str(left_out("a.jpg", "is damaged")) == "left out a.jpg: is damaged [left-out]"

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from examples.paper.common.contenders import optional_module
 from examples.paper.common.estimation_pairs import JudgedPair
-from examples.paper.common.peers import optional_module
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.radial_homography import RadialHomography, transfer
@@ -62,7 +62,7 @@ def installed_estimators() -> tuple[list[Estimator], tuple[str, ...]]:
     if homlib is None:
         notes.append("homlib is not installed and was left out")
     else:
-        found += [Estimator(name, _lomsac(homlib, function)) for name, function in _LOMSAC.items()]
+        found += lomsac_estimators()
     if poselib is None:
         notes.append("poselib is not installed and was left out")
     else:
@@ -70,6 +70,12 @@ def installed_estimators() -> tuple[list[Estimator], tuple[str, ...]]:
     if cv2 is not None:
         found.append(Estimator("OpenCV USAC_MAGSAC, no λ", _magsac(cv2)))
     return found, tuple(notes)
+
+
+def lomsac_estimators() -> list[Estimator]:
+    """Those of homlib; none where it is not installed."""
+    homlib = optional_module("homlib")
+    return [Estimator(name, _lomsac(homlib, function)) for name, function in _LOMSAC.items() if homlib]
 
 
 def judge(estimator: Estimator, pair: JudgedPair) -> Judgement:

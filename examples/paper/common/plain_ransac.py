@@ -6,8 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from examples.paper.common.contenders import HOMLIB
-from examples.paper.common.peers import homlib_solver
+from examples.paper.common.contenders import HOMLIB, homlib_solver
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.robust.measurements import Measurements

@@ -1,12 +1,50 @@
-"""What a figure gives: tables that read as text and as Markdown, a plot, images, and what had to be left out."""
+"""What a figure is given, and what it gives: tables that read as text and as Markdown, a plot, and images."""
 
-from collections.abc import Callable, Mapping
+import enum
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+
+
+class Effort(enum.Enum):
+    """TINY for tests, SMALL for a look (the default), FULL for the paper's counts."""
+
+    TINY = enum.auto()
+    SMALL = enum.auto()
+    FULL = enum.auto()
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What every figure is given.
+
+    ``peer_python``: Python that has the package stitching, which brings an OpenCV of its own; the one that runs if not
+    given.
+    """
+
+    effort: Effort
+    images: Path  # folder of the real sequences (``garfield_red``, ``copr``); figures do without those that are absent
+    peer_python: str | None = None
+    hpatches: Path | None = None  # folder of HPatches' sequences
+
+    def count(self, tiny: int, small: int, full: int) -> int:
+        """The one of three counts that the effort allows."""
+        return {Effort.TINY: tiny, Effort.SMALL: small, Effort.FULL: full}[self.effort]
+
+    def real_sequence(self, name: str) -> list[Path]:
+        """Files of a real sequence in the order of their names; none where it is absent."""
+        folder = self.images / name
+        if not folder.is_dir():
+            return []
+        return sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+
 
 Draw = Callable[[Any], None]
 """Draws on a matplotlib Figure."""
@@ -21,16 +59,6 @@ class Table:
     title: str
     header: tuple[str, ...]  # names of the columns, with their units
     rows: tuple[tuple[object, ...], ...]  # text and numbers; a number is printed with three digits, None as a dash
-
-    def column(self, name: str) -> list[Any]:
-        """Values of one column."""
-        index = self.header.index(name)
-        return [row[index] for row in self.rows]
-
-    def row(self, first: str) -> dict[str, Any]:
-        """The row whose first entry is ``first``, by column name."""
-        found = next(row for row in self.rows if row[0] == first)
-        return dict(zip(self.header, found, strict=True))
 
     def __str__(self) -> str:
         """As a Markdown table with aligned columns."""
@@ -83,7 +111,7 @@ def save(report: Report, name: str, folder: Path) -> list[str]:
 
 
 def _save_plot(draw: Draw, path: Path) -> str:
-    from examples.paper.common.plots import new_figure
+    from examples.paper.common.report import new_figure
 
     figure = new_figure()
     if figure is None:
@@ -91,3 +119,43 @@ def _save_plot(draw: Draw, path: Path) -> str:
     draw(figure)
     figure.savefig(path, dpi=120)
     return f"wrote {path}"
+
+
+_MARKED = 20
+
+
+def new_figure() -> Any | None:
+    """An empty Figure, or None where matplotlib is not installed."""
+    try:
+        module = import_module("matplotlib.figure")
+    except ModuleNotFoundError:
+        return None
+    return module.Figure(figsize=(9.6, 4.0), layout="constrained")
+
+
+def histograms(axes: Any, samples: Mapping[str, ArrayLike], label: str) -> None:
+    """Outlined histograms of log10 of positive samples; what is 0 or not finite is put at the edges."""
+    bins = np.linspace(-17.0, 1.0, 73)
+    for name, values in samples.items():
+        with np.errstate(divide="ignore"):
+            logs = np.clip(np.log10(np.asarray(values, dtype=np.float64)), bins[0], bins[-1])
+        axes.hist(logs, bins=bins, weights=np.full(len(logs), 1.0 / len(logs)), histtype="step", label=name)
+    axes.set_xlabel(label)
+    axes.set_ylabel("share of instances")
+    axes.set_yscale("log")
+    axes.legend(fontsize=7)
+
+
+def curves(
+    axes: Any, x: ArrayLike, series: Mapping[str, Sequence[float]], xlabel: str, ylabel: str, *, log: bool = False
+) -> None:
+    """One line a series over common abscissae; places are marked where there are few."""
+    marker = "." if np.size(x) <= _MARKED else ""
+    for name, values in series.items():
+        axes.plot(x, values, marker=marker, label=name)
+    if log:
+        axes.set_yscale("log")
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7)

@@ -7,40 +7,17 @@ The exit status is the stitcher's word on whether it succeeded.
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Any
 
 
-def rdstitch(output: str, images: Sequence[str]) -> int:
-    """``rdstitch mosaic`` without any setting."""
+def _rdstitch(output: str, images: Sequence[str], projection: str) -> int:
     errors, package = import_module("rdstitch.errors"), import_module("rdstitch")
-    try:
-        package.mosaic(images, output)
-    except errors.RdstitchError as error:
-        print(error, file=sys.stderr)
-        return int(error.exit_status)
-    return 0
-
-
-def rdstitch_sphere(output: str, images: Sequence[str]) -> int:
-    """``rdstitch mosaic --projection sphere``."""
-    errors, package = import_module("rdstitch.errors"), import_module("rdstitch")
-    options = package.StitchOptions(composite=package.CompositeOptions(projection="sphere"))
+    options = package.StitchOptions(composite=package.CompositeOptions(projection=projection))
     try:
         package.mosaic(images, output, options)
     except errors.RdstitchError as error:
         print(error, file=sys.stderr)
         return int(error.exit_status)
     return 0
-
-
-def opencv_panorama(output: str, images: Sequence[str]) -> int:
-    """OpenCV's Stitcher for a camera that turns."""
-    return _opencv(output, images, 0)
-
-
-def opencv_scans(output: str, images: Sequence[str]) -> int:
-    """OpenCV's Stitcher for a camera that moves over a plane, by affine transforms."""
-    return _opencv(output, images, 1)
 
 
 def _opencv(output: str, images: Sequence[str], mode: int) -> int:
@@ -51,16 +28,6 @@ def _opencv(output: str, images: Sequence[str], mode: int) -> int:
     return int(status)
 
 
-def stitching_rotation(output: str, images: Sequence[str]) -> int:
-    """``Stitcher`` of the package stitching, not cropped."""
-    return _stitching(output, images, "Stitcher")
-
-
-def stitching_affine(output: str, images: Sequence[str]) -> int:
-    """``AffineStitcher`` of the package stitching, not cropped."""
-    return _stitching(output, images, "AffineStitcher")
-
-
 def _stitching(output: str, images: Sequence[str], kind: str) -> int:
     package = import_module("stitching")
     mosaic = getattr(package, kind)(crop=False).stitch(list(images))
@@ -68,17 +35,22 @@ def _stitching(output: str, images: Sequence[str], kind: str) -> int:
     return 0
 
 
-WORKERS: dict[str, Callable[[str, Sequence[str]], int]] = {
-    worker.__name__: worker
-    for worker in (rdstitch, rdstitch_sphere, opencv_panorama, opencv_scans, stitching_rotation, stitching_affine)
+WORKERS: dict[str, tuple[Callable[..., int], object]] = {
+    "rdstitch": (_rdstitch, "auto"),
+    "rdstitch_sphere": (_rdstitch, "sphere"),
+    "opencv_panorama": (_opencv, 0),
+    "opencv_scans": (_opencv, 1),
+    "stitching_rotation": (_stitching, "Stitcher"),
+    "stitching_affine": (_stitching, "AffineStitcher"),
 }
+"""What runs a stitcher, and which one: OpenCV's for a camera that turns and for one that moves over a plane."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Run the worker that the arguments name."""
     name, output, *images = arguments
-    worker: Any = WORKERS[name]
-    return int(worker(output, images))
+    worker, which = WORKERS[name]
+    return worker(output, images, which)
 
 
 if __name__ == "__main__":

@@ -1,20 +1,16 @@
 """Sequences through rdstitch's own recipes, and how far the result is from the truth."""
 
 from collections.abc import Sequence as Many
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from examples.judging import AlignmentError, alignment_error
 from examples.paper.common.report import Pixels
-from rdstitch.alignment import Alignment
 from rdstitch.errors import RegistrationError
 from rdstitch.io.read import read_image
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.recipes import calibrate, mosaic
-from rdstitch.radial_homography import to_plane
 from rdstitch.registration import Registration
 from rdstitch.synthetic import Sequence
 
@@ -39,13 +35,3 @@ def register_files(files: Many[Path], options: StitchOptions) -> Registration | 
         return calibrate(files, options)
     except RegistrationError as error:
         return str(error)
-
-
-def registration_error(alignment: Alignment, sequence: Sequence) -> AlignmentError:
-    """How far each point of the used images is from where it belongs on the true plane.
-
-    A rectified plane may differ from the true one by a similarity only, the frame of an image by a homography.
-    """
-    used = np.flatnonzero(alignment.used)
-    transfers = {int(i): partial(to_plane, alignment.cameras[i], alignment.homographies[i]) for i in used}
-    return alignment_error(sequence, transfers, model="homography" if alignment.poses is None else "similarity")

@@ -1,4 +1,4 @@
-"""An output that is computed in blocks elsewhere is the one that is computed here."""
+"""What a composite needs is planned, made in blocks, and its coordinates tabulated."""
 
 import pickle
 from collections import Counter
@@ -10,14 +10,58 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rdstitch import Composer
 from rdstitch.cache import Cache, Stored
-from rdstitch.compositing import CompositeOptions, PlacedImage
+from rdstitch.compositing import PlacedImage
+from rdstitch.compositing import plan as planning
 from rdstitch.compositing.blocks import Block
 from rdstitch.compositing.compositor import compose
+from rdstitch.compositing.masked_pixels import OPACITY_BYTES
+from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.plan import CompositePlan, default_memory, plan_composite
+from rdstitch.compositing.tables import CompositeTables
 from rdstitch.compositing.tiles import OutputStrip
+from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.io import DecodedImage
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.apply_sidecar import apply
+from rdstitch.pipeline.recipes import pano
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import Scene, render
+from tests.compositing_scenes import Scene, grey, render
+
+
+def _planned(max_memory: int | None = None, *, masked: bool = False) -> CompositePlan:
+    scene = render(3, 1)
+    options = CompositeOptions(workers=2, max_memory=max_memory)
+    return plan_composite(scene.cameras, scene.canvas, options, masked=masked)
+
+
+@pytest.mark.parametrize(("available", "taken"), [(0, 400 * 2**20), (10**9, 400 * 2**20), (8 * 10**9, 2 * 10**9)])
+def test_the_default_is_a_quarter_of_what_is_available(
+    available: int, taken: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(planning, "available_memory", lambda: available)
+    assert default_memory() == taken
+    plan = _planned()
+    assert (plan.tile_size, plan.workers) == (512, 2)
+    assert plan.memory_bytes <= taken
+    assert plan.memory_bytes - len(render(3, 1).cameras) * 10**6 <= taken < plan.cache_bytes + plan.memory_bytes
+    assert _planned(40 * 2**20).cache_bytes < plan.cache_bytes
+
+
+def test_less_memory_means_smaller_tiles_on_fewer_threads() -> None:
+    plenty, tight = _planned(), _planned(40 * 2**20)
+    assert tight.tile_size * tight.workers < plenty.tile_size * plenty.workers
+    assert tight.memory_bytes <= 40 * 2**20 < plenty.memory_bytes + plenty.cache_bytes
+    with pytest.raises(LimitError, match="raise --max-memory"):
+        _planned(2**20)
+
+
+def test_images_with_transparent_parts_take_more() -> None:
+    plain, masked = (_planned(masked=some) for some in (False, True))
+    width, height = render(3, 1).cameras[0].image_size
+    # Two while one is prepared, and all three in the cache.
+    assert masked.memory_bytes - plain.memory_bytes == (2 + 3) * OPACITY_BYTES * width * height
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +125,66 @@ def test_no_image_is_read_for_more_than_two_blocks(columns: int, rows: int, tmp_
     compose(images, scene.canvas, CompositeOptions(tile_size=256, bands=2, workers=2), elsewhere=elsewhere)
     assert blocks > 2
     assert max(read.values()) <= 1 + 2
+
+
+FEATHERED = CompositeOptions(blend="feather", exposure="gain")
+
+
+@pytest.fixture(scope="module")
+def six() -> Scene:
+    return render(3, 2, photometry=Photometry(gain=np.array([1.0, 0.8, 1.2, 0.9, 1.1, 1.0])))
+
+
+def test_the_same_image_as_the_compositor_makes(six: Scene) -> None:
+    whole = compose(six.images, six.canvas, FEATHERED)
+    tables = CompositeTables.of(six.images, six.canvas, FEATHERED)
+    found = tables.compose(six.frames)
+    assert found.dtype == np.uint8
+    assert found.shape == whole.pixels.shape
+    np.testing.assert_array_equal(tables.alpha, whole.alpha)
+    difference = np.abs(found.astype(float) - whole.pixels)[tables.alpha > 0]
+    assert np.percentile(difference, 99.9) <= 2.0  # coordinates in fixed point, and one rounding less
+
+
+def test_other_images_from_the_same_places_lie_where_they_belong(six: Scene) -> None:
+    tables = CompositeTables.of(six.images, six.canvas, FEATHERED)
+    other = render(3, 2, channels=1, seed=0)
+    found = tables.compose([frame.astype(np.uint16) * 257 for frame in other.frames])
+    assert found.dtype == np.uint16
+    assert found.shape == tables.alpha.shape
+    whole = compose(other.images, other.canvas, CompositeOptions(blend="none", exposure="none"))
+    error = np.abs(grey(found) - grey(whole.pixels))[(tables.alpha > 0) & (whole.alpha > 0)]
+    assert np.percentile(error, 95) < 0.03
+
+
+def test_smaller_outputs_are_smoothed() -> None:
+    six = render(2, 1, scale=0.2)
+    tables = CompositeTables.of(six.images, six.canvas, FEATHERED)
+    error = np.abs(grey(tables.compose(six.frames)) - six.truth())[tables.alpha > 0]
+    assert np.median(error) < 0.02
+
+
+def test_what_does_not_fit_is_refused(six: Scene) -> None:
+    tables = CompositeTables.of(six.images, six.canvas, FEATHERED)
+    with pytest.raises(ArgumentError, match="expected 6 images, not 5"):
+        tables.compose(six.frames[1:])
+    with pytest.raises(ArgumentError, match="image 2 is of shape"):
+        tables.compose([six.frames[0], six.frames[1][:-1], *six.frames[2:]])
+    with pytest.raises(ArgumentError, match="image 1 has"):
+        tables.compose([frame.astype(np.int32) for frame in six.frames])
+
+
+def test_a_composer_by_a_result_and_by_its_sidecar(tmp_path: Path) -> None:
+    six = render(2, 1, seed=4)
+    images = [np.ascontiguousarray(frame[..., ::-1]) for frame in six.frames]
+    options = StitchOptions(composite=CompositeOptions(exposure="none", crop="auto"))
+    result = pano(images, tmp_path / "pano.png", options)
+    first = Composer(result)
+    found = first.compose(images)
+    assert first.names == ("image_0000", "image_0001")
+    assert found.shape == result.image.shape
+    assert np.abs(found.astype(float) - result.image)[first.alpha > 0].mean() < 3.0
+    again = Composer(apply(tmp_path / "pano.png.json", images, dry_run=True))
+    # The whole canvas, where the sidecar's one was cropped.
+    assert again.compose(images).shape[2] == 3
+    assert again.alpha.size >= first.alpha.size

@@ -1,10 +1,16 @@
-"""The canvas: size, scale, rotation, and refusal of what is absurd."""
+"""The canvas: its size, its boxes and what is cropped."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 
+from rdstitch.arrays import BoolArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import plan_canvas
+from rdstitch.compositing.boxes import Box, aligned, bounds, cut, encloses, grown, intersection, without
+from rdstitch.compositing.crop import crop_box, crop_rows, largest_rectangle
 from rdstitch.errors import ArgumentError, LimitError
 
 FLAT = Camera((400, 300))
@@ -103,3 +109,116 @@ def test_cropped_and_reduced_keep_the_geometry() -> None:
     assert half.size == (200, 150)
     # The centre of the first reduced px is the middle of four px.
     np.testing.assert_allclose((half.matrix @ np.append(FLAT.normalize((0.5, 0.5)), 1.0))[:2], [0, 0], atol=1e-9)
+
+
+SIDE = 12
+LIMITS = st.lists(st.integers(0, SIDE), min_size=2, max_size=2, unique=True).map(sorted)
+BOXES = st.tuples(LIMITS, LIMITS).map(lambda xy: (xy[0][0], xy[1][0], xy[0][1], xy[1][1]))
+
+
+def px(box: Box | None) -> NDArray[np.bool_]:
+    """Which px of a square a box holds."""
+    held = np.zeros((SIDE, SIDE), dtype=np.bool_)
+    if box is not None:
+        held[box[1] : box[3], box[0] : box[2]] = True
+    return held
+
+
+@given(BOXES, BOXES)
+def test_two_boxes(first: Box, second: Box) -> None:
+    common = intersection(first, second)
+    np.testing.assert_array_equal(px(common), px(first) & px(second))
+    assert (common is None) == (not px(common).any())
+    assert encloses(first, second) == (not (px(second) & ~px(first)).any())
+    if common is not None:
+        parts = without(first, common)
+        np.testing.assert_array_equal(sum(px(part).astype(int) for part in parts), px(first) & ~px(common))
+        values = np.arange(SIDE**2).reshape(SIDE, SIDE)
+        on_first = cut(values, (0, 0, SIDE, SIDE), first)
+        np.testing.assert_array_equal(cut(on_first, first, common).ravel(), values[px(common)])
+    assert without(first, None) == [first]
+
+
+@given(BOXES, st.sampled_from([1, 2, 4, 8]))
+def test_a_box_and_the_next_multiples(box: Box, unit: int) -> None:
+    whole = aligned(box, unit)
+    assert encloses(whole, box)
+    assert all(edge % unit == 0 for edge in whole)
+    assert max(np.subtract(box[:2], whole[:2]).max(), np.subtract(whole[2:], box[2:]).max()) < unit
+    assert grown(grown(box, 3), -3) == box
+
+
+@given(BOXES)
+def test_bounds_of_what_is_not_zero(box: Box) -> None:
+    corners = np.zeros((SIDE, SIDE))
+    corners[box[1], box[0]] = corners[box[3] - 1, box[2] - 1] = 0.5
+    assert bounds(corners, (0, 0, SIDE, SIDE)) == box
+    assert bounds(corners, (30, -5, 30 + SIDE, -5 + SIDE)) == (box[0] + 30, box[1] - 5, box[2] + 30, box[3] - 5)
+    assert bounds(np.zeros((SIDE, SIDE)), (0, 0, SIDE, SIDE)) is None
+
+
+def _covered(height: int, width: int, y: slice = slice(None), x: slice = slice(None)) -> BoolArray:
+    covered = np.zeros((height, width), dtype=np.bool_)
+    covered[y, x] = True
+    return covered
+
+
+@pytest.mark.parametrize(
+    ("y", "x", "box"),
+    [
+        (slice(2, 18), slice(5, 29), (18, 9, 84, 51)),  # one reduced pixel less on each side, of 3 pixels
+        (slice(None), slice(None), (3, 3, 87, 57)),
+    ],
+)
+def test_a_covered_box_is_kept_but_for_its_border(y: slice, x: slice, box: tuple[int, int, int, int]) -> None:
+    assert crop_box(_covered(20, 30, y, x), 3, (88, 58)) == (box, "")
+
+
+def test_large_coverage_is_looked_at_in_cells_that_are_covered_whole() -> None:
+    covered = _covered(4, 3100)
+    covered = np.repeat(covered, 30, axis=0)  # 120 x 3100: cells of 3 x 3
+    covered[40, 1500] = False
+    box, _ = crop_box(covered, 2, (6200, 240))
+    # Eroded by a pixel, (1499, 39) to (1501, 41) are holes: columns of cells 499 and 500, rows of cells 13.
+    assert box == (6, 84, 6198, 234)
+
+
+@pytest.mark.parametrize(("side", "kept"), [(11, "20 %"), (12, "24 %"), (13, None)])
+def test_a_rectangle_that_keeps_less_than_a_quarter_is_not_worth_it(side: int, kept: str | None) -> None:
+    """A square that loses its border, and stripes of one pixel, which lose everything."""
+    covered = _covered(60, 60, slice(0, side), slice(0, side))
+    covered[20:58:4, 5:33] = True  # 280 more
+    box, why = crop_box(covered, 1, (60, 60))
+    assert (box is None) is (kept is not None)
+    assert (kept or "") in why
+
+
+def test_rows_of_a_full_turn() -> None:
+    covered = _covered(40, 25, slice(5, 33))
+    covered[10, 7] = False
+    assert crop_rows(covered, 4, (100, 160), (3, 0, 97, 160)) == ((3, 48, 97, 128), "")
+    covered[10, 7], covered[20, 24] = True, False  # beyond the turn, which ends within column 24
+    assert crop_rows(covered, 4, (100, 160), (3, 0, 97, 160)) == ((3, 24, 97, 128), "")
+    covered[20, 0] = False  # as column 0 begins before it
+    assert crop_rows(covered, 4, (100, 160), (3, 0, 97, 160))[0] == (3, 24, 97, 128)
+    assert crop_rows(_covered(40, 25), 4, (100, 158), (0, 0, 100, 158)) == ((0, 0, 100, 158), "")
+
+
+def test_rows_that_keep_less_than_a_quarter_are_not_worth_it() -> None:
+    covered = _covered(40, 10)
+    covered[12:, 3] = False
+    assert crop_rows(covered, 1, (10, 40), (0, 0, 10, 40)) == ((0, 0, 10, 11), "")
+    covered[9:12, 3] = False
+    box, why = crop_rows(covered, 1, (10, 40), (0, 0, 10, 40))
+    assert box is None
+    assert "would keep 22 %" in why
+    covered[:, 3] = False
+    assert crop_rows(covered, 1, (10, 40), (0, 0, 10, 40)) == (
+        None,
+        "not cropped: the rows without holes would keep 0 % of the image",
+    )
+
+
+def test_the_largest_rectangle_of_nothing_is_empty() -> None:
+    assert largest_rectangle(np.zeros((3, 4), dtype=np.bool_)) == (0, 0, 0, 0)
+    assert largest_rectangle(np.eye(3, dtype=np.bool_)) == (0, 0, 1, 1)

@@ -1,26 +1,32 @@
-"""The cache of images: bounded, no more than is needed, and right all the same."""
+"""Images of a composite: decoded, kept, and masked."""
 
 import tempfile
+import tracemalloc
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from errno import ENOSPC
 from functools import partial
 from pathlib import Path
 from threading import Event, Timer
 from time import monotonic, sleep
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from rdstitch.camera import Camera
+from rdstitch.compositing import CompositeOptions, compose
 from rdstitch.compositing.image_cache import ImageCache
+from rdstitch.compositing.masked_pixels import filled
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.source_images import ImageOnDisk, ImageReader, prepare_image
 from rdstitch.errors import InputError
 from rdstitch.io import DecodedImage
 from rdstitch.io.read import reduced
-from tests.compositing_scenes import as_image, place_images
+from tests.compositing_scenes import Scene, as_image, place_images, render
 
 
 class DecodedImageCache:
@@ -169,3 +175,87 @@ def test_a_failed_prefetch_raises_where_the_image_is_read() -> None:
     _until(lambda: decoded_images.reads[2] == 1)
     with pytest.raises(InputError, match="image 2 has 200 x 50 pixels"):
         cache.get(1)
+
+
+def _counted(scene: Scene, decoded: Counter[int], *, masked: bool) -> list[PlacedImage]:
+    """The images of a scene; of masked ones a disc and a strip are transparent."""
+    images = []
+    for index, (frame, placed) in enumerate(zip(scene.frames, scene.images, strict=True)):
+        alpha = np.full(frame.shape[:2], 255, dtype=np.uint8)
+        cv2.circle(alpha, (80, 60 + 7 * index), 30, 0, -1)
+        alpha[:20] = 0
+        image = as_image(frame, alpha if masked and index % 3 else None)
+
+        def read(index: int = index, image: DecodedImage = image) -> DecodedImage:
+            decoded[index] += 1
+            return image
+
+        def preview(reduction: int, image: DecodedImage = image) -> DecodedImage:
+            return reduced(image, reduction)
+
+        images.append(replace(placed, read=read, preview=preview))
+    return images
+
+
+@pytest.mark.parametrize(
+    ("options", "masked"),
+    [
+        ({}, True),
+        ({"seam": "voronoi", "blend": "feather"}, False),
+        ({"seam": "none"}, True),
+        ({"seam": "none", "blend": "none", "exposure": "none"}, False),
+        ({"scale": 0.4, "workers": 2}, True),
+    ],
+    ids=str,
+)
+def test_whatever_the_memory(options: dict[str, Any], masked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = render(3, 2, size=(240, 180), rotate=37.0, scale=options.get("scale", 1.2))
+    chosen = CompositeOptions(tile_size=256, bands=4, **({"workers": 1} | options | {"scale": 1.0}))
+    # Exposure and seams are decided on small images, which are not read smaller from images as small as these.
+    most = 1 if options.get("exposure") == "none" else 2
+    decoded: Counter[int] = Counter()
+    plenty = compose(_counted(scene, decoded, masked=masked), scene.canvas, chosen)
+    assert max(decoded.values()) <= most
+    decoded.clear()
+
+    # The least that the plan allows: room for one image.
+    def tight(reader: ImageReader, shrinks: Sequence[float], limit: int, *, ahead: bool) -> ImageCache:
+        return ImageCache(reader, shrinks, 1, ahead=ahead)
+
+    monkeypatch.setattr("rdstitch.compositing.preparation.ImageCache", tight)
+    little = compose(_counted(scene, decoded, masked=masked), scene.canvas, chosen)
+    assert max(decoded.values()) <= most
+    np.testing.assert_array_equal(little.pixels, plenty.pixels)
+    np.testing.assert_array_equal(little.alpha, plenty.alpha)
+
+
+def test_what_is_transparent_has_the_samples_of_the_nearest_opaque_pixel() -> None:
+    rng = np.random.default_rng(0)
+    height, width = 60, 80
+    opaque = np.ones((height, width), dtype=np.bool_)
+    opaque[:, 55:] = False
+    opaque[10:25, 10:30] = rng.random((15, 20)) > 0.7
+    y, x = np.mgrid[:height, :width]
+    pixels = np.stack([x, y, np.zeros_like(x)], axis=-1).astype(np.uint8)
+    made = filled(pixels, opaque)
+    assert np.array_equal(made[opaque], pixels[opaque])
+    hidden, source = np.argwhere(~opaque), made[~opaque][:, 1::-1].astype(np.intp)
+    assert opaque[tuple(source.T)].all()
+    nearest = np.asarray(KDTree(np.argwhere(opaque)).query(hidden)[0])
+    assert (np.linalg.norm(source - hidden, axis=1) <= 1.05 * nearest).all()  # distances of 5 x 5 chamfers
+
+
+def test_where_nothing_is_opaque_there_is_nothing_to_fill_with() -> None:
+    pixels = np.full((600, 20, 3), 7, dtype=np.uint8)
+    assert np.array_equal(filled(pixels, np.zeros((600, 20), dtype=np.bool_)), pixels)
+
+
+def test_memory_beyond_the_result_is_that_of_some_rows() -> None:
+    opaque = np.zeros((3000, 1000), dtype=np.bool_)
+    opaque[1500:] = True
+    pixels = np.zeros((*opaque.shape, 3), dtype=np.uint8)
+    tracemalloc.start()
+    made = filled(pixels, opaque)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2.5 * made.nbytes

@@ -1,21 +1,81 @@
-"""The correction of samples is the formula, in every type of sample."""
+"""Overlaps, the light that they tell, the seams in them, and pixels that stay with the camera."""
 
+from functools import partial
+from itertools import combinations
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import gain_compensation
-from rdstitch.compositing.canvas import plan_canvas
+from rdstitch.compositing import CompositeOptions, compose, gain_compensation, overlap_cells, plan_canvas
+from rdstitch.compositing.boxes import intersection, overlapping_pairs
 from rdstitch.compositing.overlap_cells import compare_overlaps
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
+from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.source_images import ImageReader
-from rdstitch.compositing.survey import survey_images
+from rdstitch.compositing.static_pixels import static_pixels
+from rdstitch.compositing.survey import Survey, survey_images
 from rdstitch.compositing.warp import locate, plan_warp
+from rdstitch.synthetic import ground
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import place_images, render
+from tests.compositing_scenes import as_image, place_images, render
+
+
+@pytest.mark.parametrize("shape", [(300, 80), (80, 300)])
+def test_all_pairs_of_boxes_with_pixels_in_common(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(3)
+    corners = rng.integers(0, shape, (60, 2))
+    boxes = [None if k % 9 == 4 else (int(x), int(y), int(x) + 30, int(y) + 20) for k, (x, y) in enumerate(corners)]
+    expected = sorted(
+        (j, i)
+        for (i, a), (j, b) in combinations(enumerate(boxes), 2)
+        if a is not None and b is not None and intersection(a, b) is not None
+    )
+    assert [tuple(pair) for pair in overlapping_pairs(boxes, most=60).tolist()] == expected
+    assert len(overlapping_pairs([None, boxes[0]])) == len(overlapping_pairs([])) == 0
+
+
+def test_of_images_in_two_places_each_keeps_few_neighbours_and_the_places_stay_connected() -> None:
+    stacks = [(x + k % 3, k // 3, x + k % 3 + 100, k // 3 + 100) for x in (0, 96) for k in range(60)]
+    pairs = overlapping_pairs(stacks, most=5)
+    assert len(pairs) <= 120 * 5 + 119
+    assert ((pairs[:, 0] >= 60) & (pairs[:, 1] < 60)).any()
+
+
+def _row(count: int) -> tuple[Survey, list[PlacedImage]]:
+    """Tiny images side by side, each half over the next, and by turns darker and brighter."""
+    lens = Camera((32, 24), distortion=0.0, focal=32.0)
+    frames = [np.full((24, 32, 3), 100 + 20 * (k % 2), dtype=np.uint8) for k in range(count)]
+    step = 16 / lens.scale
+    places = np.array([[[1, 0, k * step], [0, 1, 0], [0, 0, 1]] for k in range(count)], dtype=np.float64)
+    cameras = [lens] * count
+    images = place_images([partial(as_image, frame) for frame in frames], cameras, places)
+    return survey_images(ImageReader(images), images, plan_canvas(cameras, places)), images
+
+
+def test_what_is_compared_is_linear_in_the_number_of_images() -> None:
+    """Two neighbours an image in a row."""
+    count = 200
+    survey, images = _row(count)
+    cells = compare_overlaps(survey)
+    assert cells.overlap.nnz == 2 * (count - 1)
+    exposure = gain_compensation.estimate_exposure(survey, images)
+    means = np.exp(exposure.log_gain + exposure.fields.mean(axis=(1, 2))).mean(axis=1)
+    assert (means[1::2] > means[::2]).all()
+
+
+def test_gains_of_thousands_of_overlaps_take_a_few_cells_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    survey, images = _row(60)
+    of_all = gain_compensation.estimate_exposure(survey, images, "gain").log_gain
+    monkeypatch.setattr(overlap_cells, "_MAX_CELLS", 600)
+    cells = compare_overlaps(survey)
+    assert 59 <= len(cells.pair) <= 600
+    np.testing.assert_allclose(gain_compensation.estimate_exposure(survey, images, "gain").log_gain, of_all, atol=1e-3)
+
 
 OFFSET, LOG_GAIN, VIGNETTING = 0.04, np.array([[0.0, 0.0, 0.0], [0.2, -0.1, 0.05]]), np.array([-0.3, 0.1, -0.05])
 LENS = Camera((1600, 1200), distortion=-0.2)
@@ -73,3 +133,122 @@ def test_an_image_without_overlap_has_the_gain_that_its_camera_wrote_down() -> N
     gains = [gain_compensation._fit(differences, images)[0].log_gain for images in sets]
     assert np.abs(gains[0][2]).max() < 0.01
     np.testing.assert_allclose(gains[1][2] - gains[1][:2].mean(axis=0), np.log(2.0) / 2.4, atol=0.02)
+
+
+SIZE = (300, 200)
+SHIFT = 100  # pixels by which the second image lies further right, or down
+LEFT, ALIKE, RIGHT = 60, 128, 200
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize("place", [180, 200, 220])
+def test_a_seam_runs_where_two_images_look_alike(place: int, swapped: bool) -> None:
+    """Two plain images of unequal grey that look alike in one column of the overlap alone."""
+    column = np.arange(SIZE[0] + SHIFT)
+    frames = []
+    for grey, start in ((LEFT, 0), (RIGHT, SHIFT)):
+        row = np.where(np.abs(column - place) <= 4, ALIKE, grey)[start : start + SIZE[0]].astype(np.uint8)
+        frames.append(np.tile(row[None, :, None], (SIZE[1], 1, 3)))
+    lens = Camera(SIZE)
+    move = np.eye(3)
+    move[0, 2] = SHIFT / lens.scale
+    homographies = np.stack([np.eye(3), move])
+    if swapped:  # whichever is added last
+        frames, homographies = frames[::-1], homographies[::-1]
+    canvas = plan_canvas([lens, lens], homographies)
+    options = CompositeOptions(exposure="none", seam="graphcut", blend="none")
+    found = compose(
+        place_images([partial(as_image, frame) for frame in frames], [lens, lens], homographies), canvas, options
+    )
+    assert canvas.size == (SIZE[0] + SHIFT, SIZE[1])
+    assert (found.pixels[:, : place - 6] == LEFT).all()
+    assert (found.pixels[:, place + 7 :] == RIGHT).all()
+
+
+def test_a_seam_avoids_fine_detail_that_is_off_by_a_pixel() -> None:
+    """Grain that is the same in both images in a winding path alone; it is even grey in small ones."""
+    rng, (width, height, shift) = np.random.default_rng(2), (1200, 900, 400)
+    grain = np.repeat(rng.integers(88, 168, (height, width + shift, 1)), 3, axis=2).astype(np.uint8)
+    column = np.arange(width + shift)[None, :]
+    path = 800 + 60 * np.sin(np.arange(height) / 120)[:, None]
+    off = np.where((np.abs(column - path) < 30)[..., None], grain, np.roll(grain, 1, axis=1))
+    frames, lens, move = [grain[:, :width], off[:, shift:]], Camera((width, height)), np.eye(3)
+    move[0, 2] = shift / lens.scale
+    homographies = np.stack([np.eye(3), move])
+    canvas = plan_canvas([lens, lens], homographies)
+    images = place_images([partial(as_image, frame) for frame in frames], [lens, lens], homographies)
+    found = compose(images, canvas, CompositeOptions(exposure="none", blend="none")).pixels
+    left, right = column < path - 30, column > path + 30
+    assert (found == grain).all(axis=-1)[left].mean() > 0.99
+    assert (found == off).all(axis=-1)[right].mean() > 0.99
+
+
+_WIDTH, _HEIGHT, _COUNT = 200, 150, 5
+
+
+def _images() -> NDArray[np.float32]:
+    """Images (5, h, w) of a plane, each of another place."""
+    texture = ground((_WIDTH + 400, _HEIGHT), 3)
+    places = [texture.region(90 * k, 0, 90 * k + _WIDTH, _HEIGHT)[:, :, 0] for k in range(_COUNT)]
+    noise = np.random.default_rng(1).normal(0.0, 0.01, (_COUNT, _HEIGHT, _WIDTH))
+    return np.clip(np.stack(places) + noise, 0.05, 1.0).astype(np.float32)
+
+
+def test_nothing_stays_where_the_camera_moves() -> None:
+    assert static_pixels(list(_images())) is None
+
+
+def test_a_line_along_the_motion_is_not_static() -> None:
+    images = _images()
+    images[:, 60:64] = 1.0
+    images[:, 90:110] *= 0.4
+    assert static_pixels(list(images)) is None
+
+
+@pytest.mark.parametrize("shape", ["body", "border"])
+def test_a_body_and_a_black_border_are_found(shape: str) -> None:
+    images = _images()
+    region = np.zeros((_HEIGHT, _WIDTH), dtype=np.bool_)
+    if shape == "body":
+        region[100:, 60:] = True
+        body = ground((_WIDTH, _HEIGHT), 9).region(0, 0, _WIDTH, _HEIGHT)[:, :, 0]
+        images = np.where(region, body, images)
+    else:
+        v, u = np.ogrid[:_HEIGHT, :_WIDTH]
+        region = np.hypot(u - 100, v - 75) > 85
+        images[:, region] = 0.0
+    found = static_pixels(list((images * 255).astype(np.uint8)))
+    assert found[region].mean() > 0.95
+    assert found[~region].mean() < 0.06
+
+
+@pytest.mark.parametrize("band", [0, 255, None], ids=["black", "white", "none"])
+def test_of_a_caption_nothing_is_left(band: int | None) -> None:
+    """Text at the left and a scale bar at the right, in a band or on the image itself."""
+    images = (_images() * 255).astype(np.uint8)
+    region, ink = np.zeros((_HEIGHT, _WIDTH), dtype=np.uint8), 0 if band == 255 else 255
+    for image in images:
+        if band is not None:
+            image[128:] = band
+        cv2.putText(image, "15 kV 2 kx SE", (6, 145), cv2.FONT_HERSHEY_SIMPLEX, 0.5, ink, 1)
+        image[136:140, 118:190] = ink
+    cv2.putText(region, "15 kV 2 kx SE", (6, 145), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1, 1)
+    region[136:140, 118:190] = 1
+    if band is not None:
+        region[128:] = 1
+    found = static_pixels(list(images))
+    assert found[region > 0].mean() > 0.95
+    assert not found[:115].any()
+
+
+def test_the_white_margins_of_a_page_with_a_header_that_stays_are_kept() -> None:
+    images = (_images() * 255).astype(np.uint8)
+    images[:, :, :30] = images[:, :, -30:] = 255
+    images[:, :24] = (ground((_WIDTH, 24), 9).region(0, 0, _WIDTH, 24)[:, :, 0] * 255).astype(np.uint8)
+    found = static_pixels(list(images))
+    assert found[:24].mean() > 0.9
+    assert not found[40:].any()
+
+
+def test_a_camera_that_hardly_moves_masks_nothing() -> None:
+    assert static_pixels([_images()[0]] * 5) is None

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from examples.paper.common.settings import Effort, Settings
+from examples.paper.common.report import Effort, Settings
 
 TINY = Settings(Effort.TINY, Path("no real images"))
 SLOW = ("figure10", "homography_estimation", "panoramas", "end_to_end")

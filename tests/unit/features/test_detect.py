@@ -1,4 +1,4 @@
-"""Features lie where they should, keep clear of masks, and do not depend on threads."""
+"""Detection: how many features, where, in tiles, of crossings, and after contrast is raised."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -8,11 +8,16 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.features import FeatureOptions, Features, View, detect, detect_view, match
+from rdstitch.features import FeatureOptions, Features, PackedFeatures, View, detect, detect_view, match
+from rdstitch.features.crossings import find_crossings
 from rdstitch.features.detect import spread, strongest
-from rdstitch.features.prepared_image import halving
+from rdstitch.features.opencv import OpenCVDetection
+from rdstitch.features.prepared_image import halving, prepare
+from rdstitch.features.sift_tiles import SiftTilesDetection
 from rdstitch.synthetic import ground
 
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze")
@@ -217,3 +222,129 @@ def test_spreading_fills_the_corners(image: NDArray[np.uint8]) -> None:
         outside = np.hypot(*(points - [WIDTH / 2, HEIGHT / 2]).T) > 0.75 * np.hypot(WIDTH / 2, HEIGHT / 2)
         share[wanted] = outside.mean()
     assert share[True] > 1.5 * share[False]
+
+
+@pytest.mark.parametrize(("count", "share"), [(1, 4.0), (2, 4.0), (4, 2.0), (5, 1.6), (8, 1.0), (9, 1.0), (300, 1.0)])
+def test_few_images_share_what_eight_would_have(count: int, share: float) -> None:
+    features, megapixels = FeatureOptions().for_images(count).limits
+    assert features == round(2000 * min(share, 2.0))
+    assert abs(megapixels - 0.6 * share) < 1e-9
+
+
+def test_what_is_given_is_kept() -> None:
+    assert FeatureOptions(max_features=700).for_images(2).limits == (700, 2.4)
+    assert FeatureOptions(work_megapixels=None).for_images(2).limits == (4000, None)
+    assert FeatureOptions(work_megapixels=0.3).for_images(2).limits == (4000, 0.3)
+
+
+def test_numbers_stay_what_they_are() -> None:
+    """A run on seven of two images' options is that on two."""
+    two = FeatureOptions().for_images(2)
+    assert two.for_images(7) == two
+
+
+OPTIONS = FeatureOptions()
+
+
+@pytest.fixture(scope="module")
+def grey() -> NDArray[np.uint8]:
+    """Ground, as sharp as a lens leaves it, of two tiles by two."""
+    texture = np.asarray(cv2.GaussianBlur(ground((1280, 800), 5, 1).region(0, 0, 1280, 800), (0, 0), 1.0))
+    return np.asarray(np.clip(np.rint(texture.reshape(800, 1280) * 255), 0, 255), np.uint8)
+
+
+def test_fine_keypoints_are_the_same(grey: NDArray[np.uint8]) -> None:
+    """No keypoint is lost, or found twice, where tiles meet; and each is described as in the whole."""
+    whole, tiles = OpenCVDetection.find(grey, OPTIONS), SiftTilesDetection.find(grey, OPTIONS)
+    fine, small = (np.flatnonzero(found.scale < 6.5) for found in (whole, tiles))
+    assert len(fine) == len(small) > 3000
+    distance, partner = map(np.asarray, cKDTree(tiles.points[small]).query(whole.points[fine]))
+    assert distance.max() < 0.01
+    some = np.arange(0, len(fine), 40)
+    one, two = whole.describe(fine[some]), tiles.describe(np.unique(small[partner[some]]))
+    # Several keypoints at one place differ in their orientation.
+    place = [np.column_stack([f.points, 10 * np.cos(f.angle), 10 * np.sin(f.angle)]) for f in (one, two)]
+    distance, partner = map(np.asarray, cKDTree(place[1]).query(place[0]))
+    same = distance < 0.01
+    assert same.mean() > 0.7
+    assert (np.abs(one.descriptors[same] - two.descriptors[partner[same]]).max(axis=1) <= 3).mean() > 0.99
+
+
+def test_coarse_keypoints_are_as_many_and_as_strong(grey: NDArray[np.uint8]) -> None:
+    whole, tiles = OpenCVDetection.find(grey, OPTIONS), SiftTilesDetection.find(grey, OPTIONS)
+    for low, high in ((8.0, 16.0), (16.0, 64.0)):
+        one, two = (found.response[(found.scale >= low) & (found.scale < high)] for found in (whole, tiles))
+        assert len(two) == pytest.approx(len(one), rel=0.15)
+        assert np.median(two) == pytest.approx(np.median(one), rel=0.1)
+
+
+_SQUARES, _SUBPIXELS = 8, 6
+
+
+def _oblique_board(tilt: float, size: tuple[int, int] = (400, 300)) -> tuple[NDArray[np.uint8], FloatArray]:
+    """A board of 8 x 8 squares of 30 pixels in its middle, and its inner corners, pixels."""
+    to_board = np.array([[0.05 / 1.5, 0.004, 0.0], [-0.006, 0.05 / 1.5, 0.0], [tilt * 1e-3, tilt * 5e-4, 1.0]])
+    middle = np.array([199.3, 150.2])
+    u, v = ((np.arange(side * _SUBPIXELS) + 0.5) / _SUBPIXELS - 0.5 for side in size)
+    points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2) - middle
+    seen = np.column_stack([points, np.ones(len(points))]) @ to_board.T
+    x, y = (seen[:, :2] / seen[:, 2:] + _SQUARES / 2).T
+    inside = (x > 0) & (x < _SQUARES) & (y > 0) & (y < _SQUARES)
+    grey = np.where(inside, 40.0 + 160.0 * ((np.floor(x) + np.floor(y)) % 2), 120.0)
+    grey = grey.reshape(size[1], _SUBPIXELS, size[0], _SUBPIXELS).mean(axis=(1, 3))
+    grey = grey + np.random.default_rng(0).normal(0.0, 2.0, grey.shape)
+    inner = np.stack(np.meshgrid(*[np.arange(1, _SQUARES) - _SQUARES / 2] * 2), axis=-1).reshape(-1, 2)
+    corners = np.column_stack([inner, np.ones(len(inner))]) @ np.linalg.inv(to_board).T
+    return np.rint(grey).astype(np.uint8), corners[:, :2] / corners[:, 2:] + middle
+
+
+@pytest.mark.parametrize("tilt", [0.0, 2.0])
+def test_the_corners_of_a_board_are_found(tilt: float) -> None:
+    grey, corners = _oblique_board(tilt)
+    found = find_crossings(prepare(View(grey), None))
+    distance = np.linalg.norm(found[:, None] - corners, axis=2).min(axis=0)
+    assert distance.max() < 0.15
+    assert np.sqrt(np.mean(distance**2)) < 0.05
+    assert len(found) < 2 * len(corners)
+
+
+def test_what_is_masked_has_none() -> None:
+    grey, corners = _oblique_board(0.0)
+    mask = np.ones(grey.shape, dtype=np.bool_)
+    mask[:, :200] = False
+    found = find_crossings(prepare(View(grey, mask), None))
+    assert len(found) >= np.sum(corners[:, 0] > 206)
+    assert found[:, 0].min() > 200
+
+
+def test_an_image_of_nothing_has_none() -> None:
+    assert find_crossings(prepare(View(np.full((60, 80), 90, dtype=np.uint8)), None)).shape == (0, 2)
+
+
+@pytest.mark.parametrize(("kind", "bytes_each"), [("rootsift", (1, 2)), ("sift", (1,)), ("orb", (1,)), ("surf", (2,))])
+def test_packed_features_match_as_before(kind: str, bytes_each: tuple[int, ...]) -> None:
+    colour = ground((320, 240), 11, 1).region(0, 0, 320, 240)
+    image = np.rint(cv2.GaussianBlur(colour, (0, 0), 1.0).reshape(240, 320) * 255).astype(np.uint8)
+    options = FeatureOptions(kind=kind, max_features=500)
+    features = [detect(image, options), detect(np.ascontiguousarray(image[:, 40:]), options)]
+    packed = [PackedFeatures.pack(found) for found in features]
+    again = [found.unpack() for found in packed]
+    assert packed[0].descriptors.itemsize in bytes_each
+    assert again[0].binary is features[0].binary
+    before, after = (match(first, second) for first, second in (features, again))
+    if kind in ("rootsift", "sift", "orb"):
+        np.testing.assert_array_equal(again[0].descriptors, features[0].descriptors)
+    common = set(map(tuple, before.indices.tolist())) & set(map(tuple, after.indices.tolist()))
+    assert len(common) >= 0.98 * len(before) > 50
+
+
+def test_integers_beyond_a_byte_and_numbers_beyond_half_precision_are_kept() -> None:
+    one = detect(np.zeros((1, 1), np.uint8), FeatureOptions())
+    values = np.zeros((3, 8), np.float32)
+    for largest, kind in ((255.0, np.uint8), (400.0, np.float16), (1e6, np.float32), (0.5, np.float16)):
+        values[1, 2] = largest
+        numbers = np.arange(3.0)
+        features = type(one)(np.zeros((3, 2)), values, numbers, numbers, numbers, None, "made up")
+        packed = PackedFeatures.pack(features)
+        assert packed.descriptors.dtype == kind
+        np.testing.assert_array_equal(packed.unpack().descriptors, values)

@@ -1,4 +1,4 @@
-"""Matching gives what the definition says, whatever the blocks."""
+"""Matching descriptors: all of them, those a guess leaves, and those of an overlap."""
 
 from dataclasses import replace
 
@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.features import Features, match
+from rdstitch.features import Correspondences, Features, match, match_near, match_overlap
 from rdstitch.features.keypoints import Descriptors
+from rdstitch.features.match import overlapping
 
 
 def features(descriptors: Descriptors, points: NDArray[np.float64] | None = None, kind: str = "sift") -> Features:
@@ -164,3 +166,143 @@ def test_bad_arguments_are_refused() -> None:
         replace(one, descriptors=one.descriptors[1:])
     with pytest.raises(ArgumentError, match="finite"):
         replace(one, points=one.points * np.nan)
+
+
+def _features(points: FloatArray, descriptors: FloatArray, signs: FloatArray | None = None) -> Features:
+    one = np.ones(len(points))
+    sign = None if signs is None else signs.astype(np.int8)
+    return Features(points, descriptors.astype(np.float32), one, one, one, sign, "surf", (640, 480))
+
+
+def _repeating(seed: int) -> tuple[Features, Features, FloatArray]:
+    """A grid of points that look alike in groups, in two images; and the shift between these."""
+    rng = np.random.default_rng(seed)
+    grid = np.stack(np.meshgrid(np.arange(20.0, 400.0, 20.0), np.arange(20.0, 300.0, 20.0)), axis=-1).reshape(-1, 2)
+    looks = rng.normal(size=(5, 64))[rng.integers(0, 5, len(grid))]
+    shift = np.array([33.0, 21.0])
+    first, second = (looks + rng.normal(scale=0.05, size=looks.shape) for _ in range(2))
+    order = rng.permutation(len(grid))
+    return _features(grid, first), _features((grid + shift)[order], second[order]), shift
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_repeating_points_are_distinguished(seed: int) -> None:
+    features1, features2, shift = _repeating(seed)
+    alone = match(features1, features2)
+    truth = [np.argmin(np.abs(features2.points - point - shift).sum(axis=1)) for point in features1.points]
+    known = np.column_stack([np.arange(40), truth[:40]])
+    near = match_near(features1, features2, features1.points + shift + 1.0, 5.0, known)
+    assert len(near) > 0.8 * len(features1) > len(alone)
+    assert np.allclose(near.points2 - near.points1, shift)
+    assert len(np.unique(near.indices[:, 0])) == len(np.unique(near.indices[:, 1])) == len(near)
+
+
+def test_only_what_is_alike_and_near_matches() -> None:
+    rng = np.random.default_rng(0)
+    points, looks = rng.uniform(0, 400, (50, 2)), rng.normal(size=(50, 64))
+    other = rng.normal(size=(50, 64))
+    features1 = _features(points, looks)
+    known = np.array([[0, 0]])
+    changed = _features(points, np.concatenate([looks[:10], other[10:]]))
+    assert match_near(features1, changed, points, 3.0, known).indices[:, 0].tolist() == list(range(10))
+    assert len(match_near(features1, features1, points + 200.0, 3.0, known)) < 5
+    nowhere = np.full_like(points, np.nan)
+    assert len(match_near(features1, features1, nowhere, 3.0, known)) == 0
+    assert len(match_near(features1, features1.take(np.zeros(0, np.intp)), points, 3.0, known[:0])) == 0
+
+
+def test_a_rival_within_the_radius_counts_one_at_the_same_place_does_not() -> None:
+    points, looks = np.array([[100.0, 100.0]]), np.eye(1, 64)
+    near_it = np.array([[100.0, 100.0], [102.0, 100.0]])
+    here = np.array([[100.0, 100.0], [100.0, 100.0]])
+    alike = np.concatenate([looks + 1e-2, looks + 1.05e-2])
+    known = np.array([[0, 0]])
+    assert len(match_near(_features(points, looks), _features(near_it, alike), points, 5.0, known)) == 0
+    found = match_near(_features(points, looks), _features(here, alike), points, 5.0, known)
+    assert found.indices.tolist() == [[0, 0]]
+
+
+def test_signs_must_be_equal_and_the_ratio_in_range() -> None:
+    points, looks = np.array([[10.0, 10.0]]), np.eye(1, 64)
+    up, down = (_features(points, looks, np.array([sign])) for sign in (1, -1))
+    known = np.array([[0, 0]])
+    assert len(match_near(up, up, points, 5.0, known)) == 1
+    assert len(match_near(up, down, points, 5.0, known)) == 0
+    with pytest.raises(ArgumentError, match="ratio"):
+        match_near(up, up, points, 5.0, known, ratio=1.5)
+
+
+SIZE = (800, 600)
+SHIFT = np.array([560.0, 0.0])  # three tenths of the first image are in the second
+
+
+def _sift(points: FloatArray, descriptors: FloatArray) -> Features:
+    ones = np.ones(len(points))
+    return Features(points, descriptors.astype(np.float32), ones, 0 * ones, ones, None, "sift", SIZE)
+
+
+@pytest.fixture(scope="module")
+def images() -> tuple[Features, Features]:
+    """A strip of the plane, and the same farther to the right."""
+    rng = np.random.default_rng(5)
+    points = rng.uniform((0, 0), (1360, 600), (3000, 2))
+    descriptors = rng.uniform(0, 120, (3000, 128)).round()
+    left, right = points[:, 0] < SIZE[0], points[:, 0] >= SHIFT[0]
+    return _sift(points[left], descriptors[left]), _sift(points[right] - SHIFT, descriptors[right])
+
+
+def _some(found: Correspondences, count: int) -> Correspondences:
+    """Every so-manieth match."""
+    kept = np.linspace(0, len(found) - 1, count).astype(np.intp)
+    return Correspondences(found.indices[kept], found.points1[kept], found.points2[kept], found.ratio[kept])
+
+
+def _joined(first: Correspondences, second: Correspondences) -> Correspondences:
+    return Correspondences(
+        np.concatenate([first.indices, second.indices]),
+        np.concatenate([first.points1, second.points1]),
+        np.concatenate([first.points2, second.points2]),
+        np.concatenate([first.ratio, second.ratio]),
+    )
+
+
+def _chance(features1: Features, features2: Features, count: int) -> Correspondences:
+    """Matches that mean nothing."""
+    rng = np.random.default_rng(1)
+    indices = np.column_stack([rng.choice(len(f), count, replace=False) for f in (features1, features2)])
+    return Correspondences.of(features1, features2, indices, np.full(count, 0.8))
+
+
+def test_what_overlaps_is_kept_and_most_of_the_rest_is_not(images: tuple[Features, Features]) -> None:
+    everything = match(*images)
+    parts = overlapping(*images, _some(everything, 80))
+    for side, (part, features) in enumerate(zip(parts, images, strict=True)):
+        assert np.isin(everything.indices[:, side], part).all()
+        assert len(part) < 0.6 * len(features)
+
+
+def test_matches_in_the_overlap_are_those_of_the_whole(images: tuple[Features, Features]) -> None:
+    everything = match(*images)
+    found = match_overlap(match, *images, _some(everything, 80))
+    for name in ("indices", "points1", "points2"):
+        np.testing.assert_array_equal(np.sort(getattr(found, name), axis=0), np.sort(getattr(everything, name), axis=0))
+    np.testing.assert_array_equal(found.points1, images[0].points[found.indices[:, 0]])
+    np.testing.assert_array_equal(found.points2, images[1].points[found.indices[:, 1]])
+
+
+def test_a_few_matches_by_chance_do_not_widen_it(images: tuple[Features, Features]) -> None:
+    some = _some(match(*images), 80)
+    alone, beside = overlapping(*images, some), overlapping(*images, _joined(some, _chance(*images, 6)))
+    for clean, disturbed in zip(alone, beside, strict=True):
+        assert len(np.setdiff1d(disturbed, clean)) < 0.1 * len(clean)
+
+
+def test_many_that_stand_alone_tell_nothing(images: tuple[Features, Features]) -> None:
+    assert overlapping(*images, _joined(_some(match(*images), 80), _chance(*images, 30))) is None
+
+
+def test_few_tell_nothing(images: tuple[Features, Features]) -> None:
+    everything = match(*images)
+    assert overlapping(*images, _some(everything, 40)) is None
+    found = match_overlap(match, *images, _some(everything, 40))
+    np.testing.assert_array_equal(found.indices, everything.indices)

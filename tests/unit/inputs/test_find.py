@@ -1,13 +1,17 @@
-"""What is not taken of folders, and videos among images."""
+"""Finding the inputs, and choosing among them."""
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from rdstitch.errors import InputError
+from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import find_images
+from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.rosbag import _grey_of_compressed
+from rdstitch.inputs.selection import selected
 from tests.videos import write_video
 
 
@@ -63,3 +67,54 @@ def test_a_video_among_images_is_used_only_when_asked_for(tmp_path: Path) -> Non
     assert len(find_images([clip], frames_folder=folder).frames) > 0
     with pytest.raises(InputError, match=r"clip\.avi: is a video beside one image"):
         find_images([clip, paths[0]], frames_folder=folder)
+
+
+FRAMES = [Frame(Path("flight") / name, index) for index, name in enumerate(("a1.jpg", "a2.jpg", "b1.jpg", "b[2].jpg"))]
+
+
+def _names(exclude: tuple[str, ...] = (), include_only: tuple[str, ...] = ()) -> list[str]:
+    return [frame.path.name for frame in selected(FRAMES, exclude, include_only)]
+
+
+@pytest.mark.parametrize(
+    ("exclude", "include_only", "left"),
+    [
+        ((), (), ["a1.jpg", "a2.jpg", "b1.jpg", "b[2].jpg"]),
+        (("a1.jpg",), (), ["a2.jpg", "b1.jpg", "b[2].jpg"]),
+        (("a*", "b1.jpg"), (), ["b[2].jpg"]),
+        (("flight/a?.jpg",), (), ["b1.jpg", "b[2].jpg"]),
+        ((), ("a*", "b1*"), ["a1.jpg", "a2.jpg", "b1.jpg"]),
+        (("a1*",), ("a*",), ["a2.jpg"]),
+        (("b[2].jpg",), (), ["a1.jpg", "a2.jpg", "b1.jpg"]),
+    ],
+)
+def test_images_are_chosen_by_name(exclude: tuple[str, ...], include_only: tuple[str, ...], left: list[str]) -> None:
+    assert _names(exclude, include_only) == left
+
+
+@pytest.mark.parametrize("option", ["exclude", "include-only"])
+def test_a_name_that_is_none_is_refused(option: str) -> None:
+    wanted = (("c.jpg",), ()) if option == "exclude" else ((), ("c.jpg",))
+    with pytest.raises(ArgumentError, match=f"--{option} c.jpg: none of the 4 images"):
+        selected(FRAMES, *wanted)
+
+
+_NOISE = np.random.default_rng(0).integers(0, 65536, (60, 80), dtype=np.uint16)
+SMOOTH = np.asarray(cv2.GaussianBlur(_NOISE, (0, 0), 3), dtype=np.uint16)
+
+
+def test_compressed_images_are_decoded() -> None:
+    grey = (SMOOTH >> 8).astype(np.uint8)
+    for suffix, samples, off in ((".png", grey, 0), (".png", SMOOTH, 0), (".jpg", grey, 4)):
+        found = _grey_of_compressed(cv2.imencode(suffix, samples)[1])
+        assert np.abs(found.astype(int) - grey).max() <= off
+
+
+def test_damaged_images_are_black_or_what_is_left_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
+    for suffix in (".jpg", ".png"):
+        data = cv2.imencode(suffix, (SMOOTH >> 8).astype(np.uint8))[1].copy()
+        _grey_of_compressed(data[: len(data) // 2])
+        data[len(data) // 2 : len(data) // 2 + 9] = 7
+        _grey_of_compressed(data)
+    assert (_grey_of_compressed(np.frombuffer(b"no image", np.uint8)) == 0).all()
+    assert capfd.readouterr().err == ""

@@ -1,11 +1,16 @@
-"""GPS positions as metres east and north."""
+"""Positions of images: of EXIF, and of files in all their forms."""
 
+import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from rdstitch.camera import Camera
+from rdstitch.crs import Crs
+from rdstitch.errors import InputError
 from rdstitch.inputs.measurements import positions_of
+from rdstitch.inputs.positions import with_ground_control, with_positions
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition, Metadata
 
@@ -30,3 +35,134 @@ def test_an_image_without_gps_is_nowhere() -> None:
     assert np.isnan(places[0]).all()
     assert np.isfinite(places[1]).all()
     assert positions_of([]).shape == (0, 2)
+
+
+NAMES = ("a.jpg", "b.jpg", "c.jpg")
+START = 1_700_000_000.0  # 2023-11-14 22:13:20 UTC
+
+
+def _sources() -> list[Source]:
+    return [
+        Source(
+            Path("flight") / name,
+            Metadata((640, 480), gps=GpsPosition(1.0, 1.0), timestamp=START + 10.0 * k),
+            Camera((640, 480)),
+        )
+        for k, name in enumerate(NAMES)
+    ]
+
+
+def _read(folder: Path, text: str, epsg: int | None = None, offset: float = 0.0) -> list[GpsPosition | None]:
+    (folder / "positions").write_text(text, encoding="utf-8")
+    return [source.metadata.gps for source in with_positions(_sources(), folder / "positions", epsg, offset)]
+
+
+# As `exiftool -csv -gpslatitude -gpslongitude -gpsaltitude` writes them, without and with -n, and others.
+@pytest.mark.parametrize(
+    "text",
+    [
+        'SourceFile,GPSAltitude,GPSLatitude,GPSLongitude\n./a.jpg,35.5 m Above Sea Level,"48 deg 51\' 29.60"" N",'
+        '"2 deg 17\' 40.20"" W"\nx/b.jpg,-,"48 deg 51\' 29.60"" S","2 deg 17\' 40.20"" E"\nc.jpg,,,\n',
+        "SourceFile,GPSAltitude,GPSLatitude,GPSLongitude\na.jpg,35.5,48.8582222222,-2.2945\nb.jpg,,-48.8582222222,2.2945\n",
+        "SourceFile,GPSLatitudeRef,GPSLatitude,GPSLongitudeRef,GPSLongitude,GPSAltitude\n"
+        "a.jpg,North,48.8582222222,West,2.2945,35.5\nb.jpg,S,48.8582222222,E,2.2945,\n",
+        "# Name;Lat [deg];Lon [deg];Alt (m)\n"
+        "C:\\flight\\a.jpg;48,8582222222;-2,2945;35,5\nb.jpg;-48,8582222222;2,2945\n",
+        "EPSG:4326\na.jpg -2.2945 48.8582222222 35.5 0 0 0\n\nb.jpg 2.2945 -48.8582222222\n",
+    ],
+)
+def test_tables(tmp_path: Path, text: str) -> None:
+    one, two, three = _read(tmp_path, text)
+    assert three is None
+    assert (one.latitude, one.longitude, one.altitude) == pytest.approx((48.8582222222, -2.2945, 35.5), abs=1e-9)
+    np.testing.assert_allclose((two.latitude, two.longitude), (-48.8582222222, 2.2945), atol=1e-9)
+    assert two.altitude is None
+
+
+def test_json_with_groups_takes_the_value_with_a_sign(tmp_path: Path) -> None:
+    record = {"SourceFile": "b.jpg", "EXIF:GPSLatitude": 33.9, "Composite:GPSLatitude": -33.9, "GPSLongitude": 18.5}
+    place = _read(tmp_path, json.dumps([record]))[1]
+    assert place == GpsPosition(-33.9, 18.5)
+
+
+@pytest.mark.parametrize("head", ["name,x,y,z", "EPSG:32734"])
+def test_projected_coordinates(tmp_path: Path, head: str) -> None:
+    rows = ["a.jpg,268832.2996,6246117.7881,12", "b.jpg,268932.2996,6246117.7881,12"]
+    if head.startswith("EPSG"):
+        rows = [row.replace(",", " ") for row in rows]
+    one, two, _ = _read(tmp_path, "\n".join([head, *rows]), None if head.startswith("EPSG") else 32734)
+    assert (one.latitude, one.longitude, one.altitude) == pytest.approx((-33.9, 18.5, 12.0), abs=1e-7)
+    np.testing.assert_allclose(Crs(32734).project([two.latitude], [two.longitude])[0, 0], 268932.2996, atol=1e-3)
+
+
+GPX = """<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>
+<trkpt lat="10.0" lon="179.999"><ele>100</ele><time>2023-11-14T22:13:10Z</time></trkpt>
+<trkpt lat="10.002" lon="-179.999"><ele>120</ele><time>2023-11-14T23:13:30+01:00</time></trkpt>
+</trkseg></trk></gpx>"""
+
+
+def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> None:
+    one, two, three = _read(tmp_path, GPX)
+    assert (one.latitude, one.altitude) == pytest.approx((10.001, 110.0))
+    assert abs(abs(one.longitude) - 180.0) < 1e-9
+    assert (two.latitude, two.longitude, two.altitude) == pytest.approx((10.002, -179.999, 120.0))
+    assert three is None
+    shifted = _read(tmp_path, GPX, offset=-20.0)
+    assert [place is not None for place in shifted] == [False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "names no columns like name,lat,lon"),
+        ("name,lat,lon\nz.jpg,1,2\n", "has no position of a.jpg"),
+        ("name,lat,lon\na.jpg,1,2\na.jpg,1,2\n", "line 3: a.jpg is here twice"),
+        ("name,lat,lon\na.jpg,91,2\n", "line 2: expected latitude and longitude in degrees, not 91 and 2"),
+        ("name,x,y\na.jpg,500000,91\n", "line 2: in which coordinate system x and y are is not known; give --crs"),
+        ("EPSG:32633\na.jpg 1e12 1e12\n", "EPSG:32633 has no such places"),
+        ('{"a": 1}', "expected a list of objects"),
+        ("<gpx></gpx>", "has no points with a time"),
+        ("<gpx>", "is not XML"),
+        ("<!DOCTYPE a [<!ENTITY b 'c'>]><gpx/>", "defines entities"),
+        (GPX.replace("2023", "2022"), "the track goes from 2022-11-14T22:13:10 to 2022-11-14T22:13:30 UTC, the images"),
+        (GPX.replace('lat="10.0"', 'lat="x"'), "cannot be read"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match="positions: ") as caught:
+        _read(tmp_path, text)
+    assert message in str(caught.value)
+
+
+def test_control_points(tmp_path: Path) -> None:
+    file = tmp_path / "gcp_list.txt"
+    file.write_text(
+        "WGS84 UTM 34S\n268832.2996 6246117.7881 12.1 300.5 200 a.jpg P1\n"
+        "268832.2996 6246117.7881 12.1 10 20 b.jpg P1\n"
+        "268900 6246200 12 1 2 elsewhere.jpg\n268900 6246200 12 1 2 c.jpg\n",
+        encoding="utf-8",
+    )
+    one, two, three = (source.control for source in with_ground_control(_sources(), file))
+    assert [(c.name, c.epsg, c.pixel) for c in (*one, *two)] == [
+        ("P1", 32734, (300.5, 200.0)),
+        ("P1", 32734, (10.0, 20.0)),
+    ]
+    np.testing.assert_allclose((one[0].place.latitude, one[0].place.longitude), (-33.9, 18.5), atol=1e-7)
+    assert three[0].name == "268900 6246200"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 2 3 4 5 a.jpg", "line 1: expected a coordinate system"),
+        ("EPSG:4326\n1 2 3 4 a.jpg", "line 2: expected X Y Z PX PY IMAGE"),
+        ("EPSG:4326\n1 2 3 640 5 a.jpg", "line 2: is not within the 640 x 480 pixels of a.jpg"),
+        ("EPSG:4326\n1 2 3 nan 5 a.jpg", "line 2: is not within the 640 x 480 pixels of a.jpg"),
+        ("EPSG:4326\n1 2 3 4 5 z.jpg", "has no ground control point in any of the images"),
+    ],
+)
+def test_wrong_control_points_are_named(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "gcp").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        with_ground_control(_sources(), tmp_path / "gcp")
+    assert message in str(caught.value)

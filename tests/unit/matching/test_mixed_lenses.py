@@ -1,13 +1,64 @@
-"""Images of two lenses among one another, told apart by what the pairs see of λ."""
+"""Votes of pairs on λ: the lens they agree on, lenses that are mixed, and what too few votes say."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 
+from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.features import Correspondences
+from rdstitch.matching.distortion_consensus import vote
+from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.lens_votes import Votes
 from rdstitch.matching.mixed_lenses import TwoLenses, two_lenses
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.robust import estimate_radial_homography
+
+LENS = Camera((640, 480), -0.2, focal=520.0)
+
+
+@pytest.mark.parametrize(("count", "votes"), [(20, 0), (29, 0), (30, 1), (120, 1)])
+def test_few_inliers_have_no_vote(count: int, votes: int) -> None:
+    points1 = np.random.default_rng(count).uniform((150.0, 100.0), (490.0, 380.0), (count, 2))
+    flat = LENS.undistort(points1)
+    points2 = LENS.distort(flat @ np.array([[0.96, 0.28], [-0.28, 0.96]]).T + (-130.0, 110.0))
+    relation = estimate_radial_homography(points1, points2, LENS.image_size, focal=520.0)
+    assert relation.inliers.all()
+    indices = np.repeat(np.arange(count)[:, None], 2, axis=1)
+    pair = PairRegistration(
+        0, 1, StoredMatches.of(Correspondences(indices, points1, points2, np.ones(count))), relation
+    )
+    assert len(Votes.of([pair], 3.0)) == votes
+
+
+def _votes(distortion: list[list[float]], covariance: FloatArray) -> Votes:
+    count = len(distortion)
+    chain = np.arange(count)
+    return Votes(chain, chain + 1, np.array(distortion), np.tile(covariance, (count, 1, 1)))
+
+
+OWN = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
+
+
+def test_what_both_images_have_in_common_counts_little() -> None:
+    alike, unlike = _votes([[-0.15, -0.15]], OWN), _votes([[-0.15, -0.25]], OWN)
+    assert 2.0 * alike.mahalanobis_residuals(-0.2)[0] < unlike.mahalanobis_residuals(-0.2)[0]
+
+
+def test_lenses_are_fitted_to_their_votes_by_least_sums_of_distances() -> None:
+    rng = np.random.default_rng(0)
+    first, second = -0.2 + 0.004 * rng.normal(size=(2, 60))
+    votes = _votes(np.stack([first, second + 0.1], axis=1).tolist(), 1e-5 * np.eye(2))
+    which = np.tile([0, 1], (60, 1))
+    found = votes.fitted(which, np.array([0.0, 0.0, 0.7]))
+    assert found[1] - found[0] == pytest.approx(0.1, abs=0.003)
+    assert found[2] == 0.7  # no vote: it stays
+    # One vote far off hardly moves the lenses: distances count, not their squares.
+    spoiled = _votes([*votes.distortion[:59].tolist(), [0.9, -0.9]], 1e-5 * np.eye(2))
+    assert np.abs(spoiled.fitted(which, np.array([0.0, 0.0])) - found[:2]).max() < 0.01
+
 
 _CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4)]
 _ALL = list(itertools.combinations(range(6), 2))
@@ -96,3 +147,50 @@ def test_lenses_that_differ_by_less_than_a_result_shows_are_one() -> None:
 def test_pairs_that_see_nothing_say_nothing() -> None:
     assert two_lenses([Camera((640, 480))] * 3, Votes.of([], 3.0)) is None
     assert _divided(_CHAIN[:1], [-0.2, -0.1], std=0.05) is None
+
+
+def test_agreement_of_votes_of_different_weight() -> None:
+    rng = np.random.default_rng(0)
+    std = rng.choice([0.002, 0.05], 60)
+    found = vote(-0.2 + std * rng.normal(size=60), std)
+    assert abs(found.distortion + 0.2) < 4 * found.std < 0.005
+    assert found.agreeing >= 55
+    assert found.histogram.sum() == pytest.approx(1.0)
+    assert len(found.edges) == len(found.histogram) + 1
+
+
+def test_bad_pairs_do_not_move_the_consensus() -> None:
+    rng = np.random.default_rng(1)
+    votes = np.concatenate([-0.2 + 0.003 * rng.normal(size=40), rng.uniform(-0.9, 0.3, 12)])
+    found = vote(votes, np.full(52, 0.003))
+    assert abs(found.distortion + 0.2) < 0.004
+    assert found.agreeing < 46
+
+
+def test_scatter_that_covariances_do_not_explain_is_added() -> None:
+    rng = np.random.default_rng(2)
+    found = vote(-0.2 + 0.03 * rng.normal(size=200), np.full(200, 0.001))
+    assert found.scatter == pytest.approx(0.03, rel=0.25)
+    assert found.std == pytest.approx(0.03 / math.sqrt(200), rel=0.3)
+
+
+def test_pairs_that_cannot_see_it_have_no_vote() -> None:
+    found = vote([-0.2, 0.7, np.nan], [0.01, np.inf, 0.01])
+    assert found.votes == 1
+    assert found.distortion == pytest.approx(-0.2)
+    none = vote([0.1, 0.2], [np.inf, np.inf])
+    assert math.isnan(none.distortion)
+    assert math.isinf(none.std)
+    assert "none of 2 pairs" in none.reason
+
+
+@pytest.mark.parametrize(("offset", "agreeing", "distortion"), [(0.029, 2, -0.1855), (0.031, 1, -0.2)])
+def test_votes_agree_within_three_standard_deviations(offset: float, agreeing: int, distortion: float) -> None:
+    found = vote([-0.2, -0.2 + offset], [0.01, 0.01])
+    assert found.agreeing == agreeing
+    assert found.distortion == pytest.approx(distortion)
+
+
+def test_the_middle_of_votes_that_do_not_agree_is_their_median() -> None:
+    assert vote([-0.5, -0.2, 0.1], [0.001] * 3).distortion == pytest.approx(-0.2, abs=0.01)
+    assert vote([0.1, -0.6, -0.2, -0.5, 0.2], [0.001] * 5).distortion == pytest.approx(-0.2, abs=0.01)

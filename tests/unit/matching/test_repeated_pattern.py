@@ -1,5 +1,6 @@
-"""A board before the camera: no keypoint is distinctive, but the whole is."""
+"""Grounds that mislead matching: rough ones, ones that stay with the camera, and repeated patterns."""
 
+from dataclasses import replace
 from functools import partial
 
 import cv2
@@ -7,10 +8,169 @@ import numpy as np
 import pytest
 
 import rdstitch
+from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
-from rdstitch.features import FeatureOptions, Features, detect
+from rdstitch.features import Correspondences, FeatureOptions, Features, detect
+from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
+from rdstitch.matching.rough_ground import over_rough_ground
+from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features, show_motion
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.radial_homography import RadialHomography
 from rdstitch.synthetic import ImageTexture, Sequence, grid_poses, ground, sequence_over
+
+CAMERA = Camera((640, 480), -0.2)
+POINTS = np.random.default_rng(0).uniform((5.0, 5.0), (634.0, 474.0), (300, 2))
+RIGHT = np.arange(300) < 240  # the others are matched with anything
+PLANE = POINTS[:, 0] < 250.0
+
+
+def _pair(parallax: FloatArray, plane: BoolArray = PLANE) -> PairRegistration:
+    """A pair whose plane has no motion, of which ``plane`` are inliers."""
+    points2 = POINTS + np.column_stack([parallax, np.zeros(300)])
+    points2[~RIGHT] = np.random.default_rng(1).uniform((0.0, 0.0), (639.0, 479.0), (60, 2))
+    index = np.column_stack([np.arange(300)] * 2)
+    matches = Correspondences(index, POINTS, points2, np.zeros(300))
+    relation = RadialHomography(np.eye(3), CAMERA, CAMERA, plane & RIGHT, distortion_std=0.01)
+    return PairRegistration(0, 1, StoredMatches.of(matches), relation)
+
+
+def test_the_other_flank_of_a_valley_belongs_to_the_ground() -> None:
+    pair = _pair(np.maximum(POINTS[:, 0] - 250.0, 0.0) * 0.08)
+    failed = replace(pair, image2=2, relation=RadialHomography.failed("little in common", CAMERA, CAMERA, 300))
+    rough, same = over_rough_ground([pair, failed], 3.0)
+    assert same is failed
+    relation = rough.relation
+    assert relation.inliers[RIGHT].mean() > 0.98
+    assert relation.inliers[~RIGHT].mean() < 0.1
+    matched = rough.correspondences
+    errors = np.linalg.norm(relation.transfer(matched.points1) - matched.points2, axis=1)[RIGHT]
+    assert np.sqrt(np.mean(errors**2)) < 8.0  # 31 pixels at the far side, by the plane of the near one
+    assert (relation.distortion, relation.distortion_std) == (-0.2, 0.01)
+    (again,) = over_rough_ground([rough], 3.0)
+    assert again is rough
+
+
+@pytest.mark.parametrize("step", [0.0, 25.0])
+def test_flat_ground_and_what_moves_on_it_stay_as_they_are(step: float) -> None:
+    """A vehicle over half of what both show ends with a step."""
+    pair = _pair(np.where(PLANE, 0.0, step), PLANE if step else RIGHT)
+    (found,) = over_rough_ground([pair], 3.0)
+    assert found is pair
+
+
+THRESHOLD = 3.0
+LENS = Camera((640, 480))
+
+
+def _still(moved: FloatArray, image1: int = 0, image2: int = 1) -> PairRegistration:
+    """A registered pair whose matches all agree, each moved to the right by so many pixels."""
+    count = len(moved)
+    points = np.random.default_rng(0).uniform((0.0, 0.0), (600.0, 479.0), (count, 2))
+    indices = np.stack([np.arange(count), np.arange(count)[::-1]], axis=1)
+    matched = Correspondences(indices, points, points + np.stack([moved, np.zeros(count)], axis=1), np.ones(count))
+    relation = RadialHomography(np.eye(3), LENS, LENS, np.ones(count, np.bool_))
+    return PairRegistration(image1, image2, StoredMatches.of(matched), relation)
+
+
+def _failed(image1: int, image2: int) -> PairRegistration:
+    pair = _still(np.zeros(10), image1, image2)
+    return PairRegistration(image1, image2, pair.matches, RadialHomography.failed("no", LENS, LENS, 10))
+
+
+@pytest.mark.parametrize(("moved", "static"), [(0.0, True), (0.9, True), (1.1, False), (2.0, False), (40.0, False)])
+def test_a_pair_is_static_where_most_inliers_move_by_less_than_a_third_of_the_threshold(
+    moved: float, static: bool
+) -> None:
+    assert is_static_pair(_still(np.full(40, moved)), THRESHOLD) is static
+    # Most decide, not the mean and not all.
+    assert is_static_pair(_still(np.append(np.full(31, moved), np.full(9, 90.0))), THRESHOLD) is static
+
+
+def test_only_inliers_decide_and_no_failed_pair_is_static() -> None:
+    pair = _still(np.append(np.full(10, 20.0), np.zeros(30)))
+    pair.relation.inliers[10:] = False
+    assert not is_static_pair(pair, THRESHOLD)
+    assert not is_static_pair(_failed(0, 1), THRESHOLD)
+
+
+def test_what_moves_by_less_than_the_threshold_is_taken_out_of_static_pairs_only() -> None:
+    count = 40
+    one = np.ones(count)
+    numbers = np.arange(count, dtype=np.float64)
+    features = [
+        Features(np.zeros((count, 2)), np.zeros((count, 8), np.float32), numbers, one, one, None, "made up")
+    ] * 3
+    # Of the static pair, ten matches move by more than the threshold.
+    moved = np.append(np.zeros(28), [2.9, 2.9, *[3.1] * 5, *[50.0] * 5])
+    pairs = [_still(moved), _still(np.full(count, 30.0), 1, 2), _failed(0, 2)]
+    left = [found.scale.tolist() for found in moving_features(FeatureStore.of(features), pairs, THRESHOLD)]
+    assert left == [list(range(30, 40)), list(range(10)), list(range(40))]
+
+
+def test_most_pairs_are_static_by_their_majority() -> None:
+    rest, move = _still(np.zeros(40)), _still(np.full(40, 30.0))
+    assert has_static_background([rest, rest, move], THRESHOLD)
+    assert not has_static_background([rest, move], THRESHOLD)
+    assert not has_static_background([rest, move, _failed(0, 1)], THRESHOLD)
+
+
+@pytest.mark.parametrize(
+    ("links", "count", "shown"),
+    [
+        ([(0, 1), (1, 2)], 3, True),
+        ([(0, 1)], 2, False),  # two images may do so by chance
+        ([(0, 1), (1, 2)], 6, True),
+        ([(0, 1), (1, 2)], 7, False),  # less than half
+        ([(0, 1), (2, 3), (4, 5)], 6, False),  # not connected
+    ],
+)
+def test_motion_is_shown_by_a_connected_good_part(links: list[tuple[int, int]], count: int, shown: bool) -> None:
+    pairs = [_still(np.full(40, 30.0), *link) for link in links]
+    pairs += [_still(np.zeros(40), 0, other) for other in range(1, count)]
+    assert show_motion(pairs, count, THRESHOLD) is shown
+
+
+def _overlaid(static: int, image1: int = 0, image2: int = 1) -> PairRegistration:
+    """A pair that moves, with some static matches that are no inliers."""
+    pair = _still(np.append(np.full(40, 30.0), np.zeros(static)), image1, image2)
+    pair.relation.inliers[40:] = False
+    return pair
+
+
+def test_static_matches_besides_motion_are_a_background_where_several_pairs_have_them() -> None:
+    move = _still(np.full(40, 30.0))
+    assert has_static_background([_overlaid(8), _overlaid(8), move], THRESHOLD)
+    assert not has_static_background([_overlaid(7), _overlaid(7), move], THRESHOLD)
+    assert not has_static_background([_overlaid(8), move, move], THRESHOLD)
+    assert not has_static_background([_overlaid(8), _overlaid(8), *[move] * 9], THRESHOLD)
+
+
+def _with_overlay(static: int, image1: int = 0, image2: int = 1, *, seed: int = 0) -> PairRegistration:
+    """A pair that moves by 30 pixels, with so many static outliers at the same places of every such pair."""
+    pair = _still(np.append(np.full(40, 30.0), np.full(static, 0.2)), image1, image2)
+    pair.relation.inliers[40:] = False
+    pair.correspondences.points1[:40] += np.random.default_rng(seed).uniform(0.0, 100.0, (40, 2))
+    return pair
+
+
+def test_of_a_pair_that_moves_only_static_outliers_are_taken_out() -> None:
+    one, numbers = np.ones(48), np.arange(48.0)
+    features = [Features(np.zeros((48, 2)), np.zeros((48, 8), np.float32), numbers, one, one, None, "made up")] * 2
+    first, second = moving_features(FeatureStore.of(features), [_with_overlay(8)], THRESHOLD)
+    assert first.scale.tolist() == list(range(40))
+    assert second.scale.tolist() == list(range(8, 48))
+
+
+@pytest.mark.parametrize(("pairs", "left"), [(3, 40), (2, 48)])
+def test_a_place_is_static_from_three_static_matches_on(pairs: int, left: int) -> None:
+    """Of an image of which no pair was estimated."""
+    seen = [_with_overlay(8, 0, 1 + k, seed=k) for k in range(pairs)]
+    one, points = np.ones(48), seen[0].correspondences.points1.copy()
+    points[40:] += (0.6, 0.7)  # nearer than a static match moves
+    features = [Features(points, np.zeros((48, 8), np.float32), one, one, one, None, "made up")] * 6
+    assert len(moving_features(FeatureStore.of(features), seen, THRESHOLD)[5]) == left
+
 
 _SIDE = 40
 _LENS = Camera((400, 300), distortion=-0.25, focal=380.0)

@@ -1,12 +1,20 @@
-"""Minimal solvers as RANSAC sees them: exact samples give the truth, in the half-diagonal frame."""
+"""Minimal samples: which solver, in what order, and what its solutions are kept by."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import rdstitch
+from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.camera import Camera
 from rdstitch.planar_motion import rigid_in_plane, rotation_from_tilt
 from rdstitch.radial_homography import transfer
+from rdstitch.robust import SolverName, estimate_radial_homography
+from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import minimal_solvers
+from rdstitch.robust.own_lenses import OwnLenses, own_lenses
+from rdstitch.robust.sampling import Sampler
 from tests.correspondences import correspondences
 
 FOCAL = 1.4
@@ -76,3 +84,154 @@ def test_sampled_distortions_are_near_every_usual_lens() -> None:
             off = np.linalg.norm(result.transfer(matches.points1) - matches.points2, axis=1)[matches.inliers]
             found += bool(np.median(off) < 4.0)
     assert found >= 3
+
+
+def _draw(sampler: Sampler, count: int, batch: int, *, start: int = 0, ordered: bool = False) -> IntArray:
+    picks: IntArray = sampler.draw(np.array([start]), batch, np.array([count]), np.array([ordered]))[0]
+    return picks
+
+
+@pytest.mark.parametrize("ordered", [False, True])
+def test_samples_are_distinct_and_in_range(ordered: bool) -> None:
+    picks = _draw(Sampler(5, 1000, 3), 40, 2000, ordered=ordered)
+    assert picks.min() == 0
+    assert picks.max() == 39
+    assert (np.diff(np.sort(picks, axis=1), axis=1) > 0).all()
+
+
+def test_uniform_samples_use_every_match_equally() -> None:
+    picks = _draw(Sampler(4, 1000, 0), 20, 20000)
+    shares = np.bincount(picks.ravel(), minlength=20) / picks.size
+    np.testing.assert_allclose(shares, 0.05, rtol=0.06)
+
+
+def test_the_best_come_first_and_all_come_in_the_end() -> None:
+    sampler = Sampler(3, 4000, 1)
+    first = _draw(sampler, 100, 32, ordered=True)[::2]
+    assert (first < 20).mean() > 0.9
+    last = _draw(sampler, 100, 400, start=8000, ordered=True)[::2]
+    assert (last < 20).mean() < 0.3
+
+
+def test_every_other_sample_is_uniform_whatever_the_order() -> None:
+    picks = _draw(Sampler(3, 4000, 1), 100, 400, ordered=True)[1::2]
+    assert 0.1 < (picks < 20).mean() < 0.3
+
+
+def test_same_seed_same_samples_whatever_the_batches_and_the_other_pairs() -> None:
+    together = Sampler(3, 1000, 7).draw(np.zeros(2, dtype=np.intp), 64, np.array([50, 80]), np.array([True, False]))
+    sampler = Sampler(3, 1000, 7)
+    parts = [_draw(sampler, 50, 32, start=start, ordered=True) for start in (0, 32)]
+    assert np.array_equal(together[0], np.concatenate(parts))
+    assert np.array_equal(together[1], _draw(Sampler(3, 1000, 7), 80, 64))
+    assert not np.array_equal(together[1], _draw(Sampler(3, 1000, 8), 80, 64))
+
+
+def test_as_many_matches_as_a_sample_needs() -> None:
+    picks = _draw(Sampler(3, 10, 0), 3, 4, ordered=True)
+    assert np.array_equal(np.sort(picks, axis=1), np.tile([0, 1, 2], (4, 1)))
+
+
+@pytest.mark.parametrize(("solver", "size"), [("three_point", 3), ("four_point", 4), ("five_point", 5)])
+def test_sampling_goes_on_until_a_sample_without_outliers_is_likely(solver: SolverName, size: int) -> None:
+    """Fischler and Bolles: a share w of inliers needs log(1 - confidence) / log(1 - w^size) samples."""
+    matches = correspondences(300, seed=1, outliers=0.6)
+    found = rdstitch.estimate_radial_homography(
+        matches.points1,
+        matches.points2,
+        matches.truth.camera.image_size,
+        focal=matches.truth.camera.focal,
+        solver=solver,
+    )
+    assert found
+    # Without the exponent, less than a hundred.
+    enough = np.log(1e-3) / np.log1p(-(found.inliers.mean() ** size))
+    assert enough < found.iterations < 8 * enough
+    assert "stopped at its limit" not in found.reason
+
+
+def test_more_confidence_takes_more_samples() -> None:
+    matches = correspondences(300, seed=1, outliers=0.6)
+    drawn = [
+        rdstitch.estimate_radial_homography(
+            matches.points1,
+            matches.points2,
+            matches.truth.camera.image_size,
+            solver="five_point",
+            confidence=confidence,
+        ).iterations
+        for confidence in (0.9, 0.999999)
+    ]
+    assert drawn[1] > 2 * drawn[0]
+
+
+def test_the_least_free_model_is_chosen() -> None:
+    """A freer one always fits a little better; without a price for freedom it would nearly always be chosen."""
+    chosen = []
+    for seed in range(12):
+        for motion in ("rigid", "similarity", "homography"):
+            matches = correspondences(200, seed=seed, outliers=0.2, motion=motion)
+            camera = matches.truth.camera
+            found = rdstitch.estimate_radial_homography(
+                matches.points1, matches.points2, camera.image_size, focal=camera.focal
+            )
+            chosen.append(found.model == motion)
+    assert np.mean(chosen) > 0.9
+
+
+_THRESHOLD = 3.0
+
+
+def _seen(first: Camera | None, second: Camera | None, seed: int, motion: str = "similarity") -> OwnLenses:
+    """What own lenses come to where images of one lens were taken with others instead."""
+    matches = correspondences(400, seed=seed, motion=motion, noise=0.3)
+    lens = matches.truth.camera
+
+    def taken(points: FloatArray, other: Camera | None) -> FloatArray:
+        return points if other is None else other.distort(lens.undistort(points))
+
+    points1, points2 = taken(matches.points1, first), taken(matches.points2, second)
+    kept = np.isfinite(points1).all(axis=1) & np.isfinite(points2).all(axis=1)
+    points1, points2 = points1[kept], points2[kept]
+    relation = estimate_radial_homography(points1, points2, lens.image_size)
+    data = Measurements.from_pixels(points1, points2, relation.camera, relation.camera2)
+    return own_lenses([relation], data, _THRESHOLD)[0]
+
+
+def _difference(found: OwnLenses) -> tuple[float, float]:
+    """λ of the second image less that of the first, and its standard deviation."""
+    sign = np.array([-1.0, 1.0])
+    return float(sign @ found.distortion), float(np.sqrt(sign @ found.covariance @ sign))
+
+
+@pytest.mark.parametrize("motion", ["rigid", "homography"])
+@pytest.mark.parametrize("other", [-0.15, -0.05])
+def test_two_lenses_are_seen_for_what_they_are(other: float, motion: str) -> None:
+    for seed in range(4):
+        found = _seen(None, Camera((1000, 800), other), seed, motion)
+        difference, std = _difference(found)
+        assert abs(difference) > 10.0 * std
+        np.testing.assert_allclose(difference, other + 0.25, atol=min(0.02, 5.0 * std))
+        missed = np.abs(found.distortion - (-0.25, other)) / np.sqrt(np.diag(found.covariance))
+        assert missed.max() < 5.0
+
+
+@pytest.mark.parametrize(
+    "other", [None, Camera((1000, 800), -0.25, center=(525.0, 385.0)), Camera((1000, 800), -0.25, distortion2=0.05)]
+)
+def test_one_lens_is_one_wherever_its_centre_is(other: Camera | None) -> None:
+    for seed in range(6):
+        difference, std = _difference(_seen(other, other, seed))
+        assert abs(difference) < 5.0 * std
+
+
+def test_rotation_about_the_axis_does_not_show_the_lens() -> None:
+    rng = np.random.default_rng(3)
+    lens = Camera((640, 480), -0.2)
+    points1 = rng.uniform((0, 0), (639, 479), (300, 2))
+    c, s = np.cos(0.3), np.sin(0.3)
+    points2 = (points1 - lens.center) @ np.array([[c, s], [-s, c]]) + lens.center + 0.3 * rng.standard_normal((300, 2))
+    relation = estimate_radial_homography(points1, points2, lens.image_size)
+    data = Measurements.from_pixels(points1, points2, lens, lens)
+    found = own_lenses([replace(relation, camera=lens, camera2=lens)], data, _THRESHOLD)[0]
+    assert np.sqrt(np.diag(found.covariance)).min() > 0.1

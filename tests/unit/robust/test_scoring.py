@@ -1,13 +1,61 @@
-"""Scores of hypotheses: transfer errors in pixels, truncated; which hypotheses are possible at all."""
+"""What the matches of a pair are worth: measurements, scores, and the verification of a model."""
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
+from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.errors import ArgumentError
 from rdstitch.radial_homography import transfer
-from rdstitch.robust.measurements import Measurements
+from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
+from rdstitch.robust.verification import MIN_PLACES, binomial_tail, places, rejection_reason
 from rdstitch.solvers.solutions import Solutions
+
+SMALL, LARGE = Camera((300, 400)), Camera((600, 800))
+
+
+def _two_pairs() -> Measurements:
+    rng = np.random.default_rng(0)
+    points = [(rng.uniform(0, 299, (n, 2)), rng.uniform(0, 299, (n, 2))) for n in (20, 9)]
+    return Measurements.of_pairs(points, [(SMALL, LARGE), (LARGE, SMALL)])
+
+
+def test_points_are_in_half_diagonals_of_their_own_image() -> None:
+    data = _two_pairs()
+    assert data.x1.shape == (2, 2, padded_length(20))
+    assert data.count.tolist() == [20, 9]
+    assert data.present.sum(axis=1).tolist() == [20, 9]
+    assert data.present[1, :9].all()
+    assert data.px.tolist() == [500.0, 250.0]
+    assert data.px_ratio.tolist() == [2.0, 0.5]
+    one = Measurements.from_pixels([[149.5, 199.5]], [[299.5 + 500.0, 399.5]], SMALL, LARGE)
+    assert (one.x1[0, :, 0].tolist(), one.x2[0, :, 0].tolist()) == ([0.0, 0.0], [1.0, 0.0])
+    np.testing.assert_allclose(data.radius2, (data.x1**2).sum(axis=1))
+
+
+def test_matches_that_are_left_out_stay_out() -> None:
+    data = _two_pairs()
+    few = data.only(np.arange(data.present.shape[1])[None] < np.array([[5], [30]]))
+    assert few.present.sum(axis=1).tolist() == [5, 9]
+    # What was left out before is not let in again.
+    assert few.only(np.ones_like(few.present)).present.sum(axis=1).tolist() == [5, 9]
+
+
+@pytest.mark.parametrize(
+    ("points1", "points2", "says"),
+    [
+        (np.zeros((3, 3)), np.zeros((3, 2)), "points1 must have shape"),
+        (np.zeros((3, 2)), np.zeros(6), "points2 must have shape"),
+        (np.zeros((3, 2)), np.full((3, 2), np.nan), "points2 has values that are not finite"),
+        (np.zeros((3, 2)), np.zeros((4, 2)), "differ in length: 3 and 4"),
+    ],
+)
+def test_wrong_matches_are_refused(points1: np.ndarray, points2: np.ndarray, says: str) -> None:
+    with pytest.raises(ArgumentError, match=says):
+        checked_matches(points1, points2)
+
 
 SIZES = (640, 480), (320, 240)
 CAMERAS = Camera(SIZES[0]), Camera(SIZES[1])
@@ -68,3 +116,65 @@ def test_images_of_a_plane_are_possible(matrix: np.ndarray, distortion: float, p
 def test_the_lens_is_judged_at_the_corner() -> None:
     found = Solutions(np.zeros(1, dtype=np.intp), np.eye(3)[None], np.array([-0.5]))
     assert [bool(plausible(found, radius)[0]) for radius in (1.0, 1.4, 1.5)] == [True, True, False]
+
+
+SIZE = (1000, 800)
+CELL = np.hypot(*SIZE) / 32
+
+
+def _apart(count: int) -> FloatArray:
+    """Points in as many different cells."""
+    column, row = np.arange(count) % 24, np.arange(count) // 24
+    return np.asarray((np.stack([column, row], axis=1) + 0.5) * CELL)
+
+
+@pytest.mark.parametrize(("matches", "threshold"), [(60, 3.0), (400, 3.0), (400, 30.0)])
+def test_chance_is_that_of_a_wrong_match_near_its_place(matches: int, threshold: float) -> None:
+    """With ``p = π t² / area + 0.01``; four matches make the model, and agree by construction."""
+    p = np.pi * threshold**2 / (SIZE[0] * SIZE[1]) + 0.01
+    tail = binom.sf(np.arange(matches - 4) - 1, matches - 4, p)  # of as many or more
+    enough = int(np.argmax(tail <= 1e-4)) + 4
+    points = _apart(matches)
+    for count, reliable in ((enough, True), (enough - 1, False)):
+        reason = rejection_reason(points, points, np.arange(matches) < count, SIZE, threshold)
+        if count >= MIN_PLACES:
+            assert (reason is None) is reliable, count
+
+
+def test_few_matches_that_all_agree_are_no_chance() -> None:
+    points = _apart(MIN_PLACES)
+    assert rejection_reason(points, points, np.ones(len(points), dtype=np.bool_), SIZE, 3.0) is None
+
+
+def test_a_wide_threshold_is_taken_for_even_odds_at_most() -> None:
+    points = _apart(100)
+    wide = 1e4
+    enough = int(np.argmax(binom.sf(np.arange(96) - 1, 96, 0.5) <= 1e-4)) + 4
+    reasons = [rejection_reason(points, points, np.arange(100) < n, SIZE, wide) for n in (enough - 1, enough)]
+    assert [reason is None for reason in reasons] == [False, True]
+
+
+def test_neighbouring_matches_count_once() -> None:
+    points = np.repeat(_apart(MIN_PLACES - 1), 50, axis=0)
+    everything = np.ones(len(points), dtype=np.bool_)
+    assert (
+        rejection_reason(points, points, everything, SIZE, 3.0)
+        == "350 of 350 matches agree, but they lie in 7 places of the image only"
+    )
+    one_more = np.vstack([points, _apart(MIN_PLACES)[-1:]])
+    assert rejection_reason(one_more, one_more, np.ones(len(one_more), dtype=np.bool_), SIZE, 3.0) is None
+
+
+def test_places_are_those_of_the_image_with_fewer() -> None:
+    assert places(_apart(30), _apart(30), SIZE) == 30
+    assert places(_apart(30), np.full((30, 2), 7.0), SIZE) == 1
+    assert places(_apart(30)[:0], _apart(30)[:0], SIZE) == 0
+
+
+@pytest.mark.parametrize(
+    ("least", "trials", "probability"), [(0, 5, 0.3), (3, 3, 0.2), (40, 4000, 0.011), (2500, 4000, 0.6)]
+)
+def test_the_tail_is_that_of_the_binomial_distribution(least: int, trials: int, probability: float) -> None:
+    assert binomial_tail(least, trials, probability) == pytest.approx(
+        binom.sf(least - 1, trials, probability), rel=1e-9
+    )

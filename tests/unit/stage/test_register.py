@@ -1,14 +1,140 @@
-"""All places of tiles on a stage against the truth."""
+"""Images of a motorized stage: positions, flat field and registration."""
+
+import json
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from rdstitch.arrays import FloatArray
-from rdstitch.stage import TileGrid, TileRegistration, register_tiles
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.inputs.source import read_sources
+from rdstitch.io.flat_field import FlatField, read_flat_field
+from rdstitch.pipeline.read_inputs import with_flat_field
+from rdstitch.stage import TileRegistration, register_tiles
 from rdstitch.stage.correlation import correlate
+from rdstitch.stage.flat_field import estimate_illumination
+from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.overlap import Overlap
+from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table, oriented
 from tests.stage_grid import Specimen, StageGrid
+
+
+@pytest.mark.parametrize(
+    ("specimen", "rows", "tile", "seed"),
+    [("fluorescence", 7, 256, 1), ("brightfield", 7, 256, 1), ("fluorescence", 5, 512, 301)],
+)
+def test_shading_of_a_third_is_found_to_a_percent(specimen: Specimen, rows: int, tile: int, seed: int) -> None:
+    stage = StageGrid(rows=rows, columns=rows, tile=tile, specimen=specimen, content=0.5, seed=seed)
+    shown = estimate_illumination(stage.render, len(stage))
+    off = shown.field.gain / stage.flat_field - 1.0
+    assert np.sqrt((off**2).mean()) < 0.01
+    if specimen == "fluorescence":
+        assert shown.dark[0] == pytest.approx(100.0, abs=6.0)
+
+
+def test_few_tiles_that_show_other_things_have_no_flat_field() -> None:
+    stage = StageGrid(rows=1, columns=2, tile=256, content=0.5, seed=3)
+    assert estimate_illumination(stage.render, 2).field is None
+
+
+def test_what_is_read_before_the_flat_field_is_known_is_corrected_too(tmp_path: Path) -> None:
+    stage = StageGrid(rows=3, columns=4, tile=256, content=0.5, seed=1)
+    sources, _ = read_sources(stage.write(tmp_path), skip_bad=False)
+    raw = [source.read(keep=True).pixels for source in sources]
+    corrected, _ = with_flat_field(sources, "auto")
+    field = corrected[0].flat_field
+    for before, source in zip(raw, corrected, strict=True):
+        assert np.array_equal(source.read(keep=True).pixels, field.corrected(before))
+
+
+def test_the_dark_level_stays_and_files_hold_both(tmp_path: Path) -> None:
+    gain = np.linspace(0.5, 1.5, 12, dtype=np.float32).reshape(3, 4, 1)
+    field = FlatField(gain, np.full((1, 1, 1), 10.0, np.float32))
+    light = np.full((3, 4), 200.0)
+    measured = np.rint(light * gain[..., 0] + 10.0).astype(np.uint16)
+    assert np.abs(field.corrected(measured).astype(int) - 210).max() <= 1
+    file = tmp_path / "flat.tif"
+    field.write(file)
+    again = read_flat_field(file, (4, 3), 1)
+    np.testing.assert_allclose(again.corrected(measured), field.corrected(measured))
+    with pytest.raises(InputError, match="4 x 3"):
+        read_flat_field(file, (5, 3), 1)
+
+
+SIZE = (100, 80)
+
+
+def test_names_give_rows_and_columns() -> None:
+    names = ["s_r03c10.tif", "s_r03c11.tif", "s_r04c10.tif"]
+    grid = grid_from_names(names, "r{row}c{col}", 0.1, SIZE)
+    np.testing.assert_allclose(grid.places, [(0, 0), (90, 0), (0, 72)])
+    assert (grid.rows.tolist(), grid.columns.tolist()) == ([0, 0, 1], [0, 1, 0])
+    assert sorted(map(tuple, grid.neighbours(4.0).tolist())) == [(0, 1), (0, 2)]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "names"), [("r{row}", ["r1"]), ("r{row}c{col}", ["r1c1", "x"]), ("r{row}c{col}", ["r1c1_a", "r1c1_b"])]
+)
+def test_a_pattern_that_does_not_tell_tiles_apart_is_refused(pattern: str, names: list[str]) -> None:
+    with pytest.raises(ArgumentError):
+        grid_from_names(names, pattern, 0.1, SIZE)
+
+
+def test_a_table_in_micrometres_needs_the_size_of_a_pixel(tmp_path: Path) -> None:
+    table = tmp_path / "stage.csv"
+    table.write_text("Name,X_um,Y_um\nb.tif,50,5\na.tif,5,5\n", encoding="utf-8")
+    grid = grid_from_table(["a.tif", "b.tif"], table, SIZE, 0.5)
+    np.testing.assert_allclose(grid.places, [(0, 0), (90, 0)])
+    with pytest.raises(InputError, match="--pixel-size"):
+        grid_from_table(["a.tif", "b.tif"], table, SIZE, None)
+    with pytest.raises(InputError, match=r"has no line for c\.tif"):
+        grid_from_table(["c.tif"], table, SIZE, 0.5)
+
+
+def test_ome_tiff_says_where_it_was_taken(tmp_path: Path) -> None:
+    files = [tmp_path / f"{k}.ome.tif" for k in range(2)]
+    for k, file in enumerate(files):
+        metadata = {
+            "axes": "YX",
+            "PhysicalSizeX": 0.25,
+            "PhysicalSizeXUnit": "µm",
+            "Plane": {"PositionX": 0.0225 * k, "PositionXUnit": "mm", "PositionY": 1.0, "PositionYUnit": "mm"},
+        }
+        tifffile.imwrite(file, np.zeros((80, 100), np.uint16), ome=True, metadata=metadata)
+    grid = grid_from_files(files, SIZE, None)
+    np.testing.assert_allclose(grid.places, [(0, 0), (90, 0)])
+    assert grid.pixel_size == 0.25
+
+
+def test_micro_manager_says_it_beside_the_files(tmp_path: Path) -> None:
+    entries = {
+        f"Metadata-Pos{k}/img.tif": {
+            "FileName": f"Pos{k}/img_{k}.tif",
+            "XPositionUm": -10.0 - 45.0 * k,
+            "YPositionUm": 3.0,
+            "PixelSizeUm": 0.5,
+        }
+        for k in range(2)
+    }
+    (tmp_path / "metadata.txt").write_text(json.dumps(entries), encoding="utf-8")
+    files = [tmp_path / f"img_{k}.tif" for k in range(2)]
+    for file in files:
+        tifffile.imwrite(file, np.zeros((80, 100), np.uint16))
+    np.testing.assert_allclose(grid_from_files(files, SIZE, None).places, [(90, 0), (0, 0)])
+    (tmp_path / "metadata.txt").unlink()
+    with pytest.raises(InputError, match="--grid"):
+        grid_from_files(files, SIZE, None)
+
+
+def test_axes_of_the_stage_are_turned_only_where_the_tiles_say_so() -> None:
+    grid = TileGrid(np.array([(0.0, 0.0), (90.0, 0.0), (0.0, 72.0)]), SIZE)
+    mirrored = np.array([(90.0, 0.0), (0.0, 0.0), (90.0, 72.0)])
+    assert oriented(grid, lambda _: 1.0) is grid
+    found = oriented(grid, lambda g: 5.0 if np.allclose(g.places, mirrored) else 1.0)
+    np.testing.assert_allclose(found.places, mirrored)
 
 
 def _registered(stage: StageGrid) -> TileRegistration:

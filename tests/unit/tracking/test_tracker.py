@@ -1,4 +1,4 @@
-"""Frames placed one after the other: near the truth, in bounded memory, and never silently on the wrong map."""
+"""Tracking: poses frame by frame, placement in the mosaic, and the preview."""
 
 import math
 from functools import partial
@@ -13,9 +13,10 @@ from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, Features, detect, match
 from rdstitch.features.prepared_image import View, prepare
 from rdstitch.inputs.corner_flow import CornerFlow, fitted_affine
+from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, drive_poses, sequence_over
-from rdstitch.tracking import Tracked, Tracker, TrackingOptions
+from rdstitch.tracking import CameraPose, Placement, PlaneSimilarity, Preview, Tracked, Tracker, TrackingOptions
 from rdstitch.tracking import tracker as module
 from tests.floor_drives import floor_drive, true_path
 
@@ -213,3 +214,104 @@ def test_a_cut_is_no_motion(video: tuple[Sequence, list[NDArray[np.uint8]]]) -> 
         assert inliers.mean() < 0.5
     flow.begin(prepare(View(np.full((*SIZE[::-1], 3), 128, dtype=np.uint8)), None))
     assert flow.follow(prepare(View(images[0]), None)) is None
+
+
+def _placed(x: float, y: float, yaw: float, height: float, tilt: tuple[float, float] = (0.1, -0.2)) -> Placement:
+    """``P = diag(f, f, 1) R Rz(φ) diag(1, 1, h) T(t)``, up to scale."""
+    c, s, f = math.cos(yaw), math.sin(yaw), 1.3
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    rows = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, height]])
+    projection = np.diag([f, f, 1.0]) @ rotation_from_tilt(tilt) @ turn @ rows
+    return Placement(Camera((640, 480), -0.2), 3.0 * np.linalg.inv(projection), f)
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0, 1.0), (1.5, -2.0, 2.5, 0.8), (-3.0, 0.2, -3.0, 1.4)])
+def test_the_pose_of_a_homography_is_the_one_it_was_made_of(pose: tuple[float, float, float, float]) -> None:
+    found = _placed(*pose).pose
+    np.testing.assert_allclose([found.x, found.y, found.yaw, found.height], pose, atol=1e-9)
+
+
+def test_without_focal_length_or_homography_there_is_no_pose() -> None:
+    placed = _placed(0.0, 0.0, 0.0, 1.0)
+    assert Placement(placed.camera, placed.homography, None).pose is None
+    assert Placement(placed.camera, np.full((3, 3), np.nan), 1.0).pose is None
+
+
+def test_a_similarity_moves_a_placement_and_its_pose_alike() -> None:
+    first, second = _placed(1.0, 2.0, 0.3, 0.9), _placed(2.0, 1.0, 1.1, 1.2)
+    move = PlaneSimilarity.to_origin(first.pose)
+    origin, other = move.applied(first).pose, move.applied(second).pose
+    np.testing.assert_allclose([origin.x, origin.y, origin.yaw, origin.height], [0.0, 0.0, 0.0, 1.0], atol=1e-9)
+    turned = np.array([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]]) @ [1.0, -1.0] / 0.9
+    np.testing.assert_allclose([other.x, other.y, other.yaw, other.height], [*turned, 0.8, 1.2 / 0.9], atol=1e-9)
+
+
+def test_planes_are_brought_together_by_the_images_that_both_have() -> None:
+    placed = [_placed(0.0, 0.0, 0.2, 1.0), _placed(1.0, 0.5, -0.4, 1.1)]
+    move = PlaneSimilarity(0.7 * complex(math.cos(1.0), math.sin(1.0)), 2.0 - 3.0j)
+    found = PlaneSimilarity.between(placed, [move.applied(one) for one in placed])
+    assert found.turn == pytest.approx(move.turn)
+    assert found.shift == pytest.approx(move.shift)
+
+
+def test_a_fit_may_keep_the_size() -> None:
+    points = np.random.default_rng(0).normal(size=(20, 2))
+    kept = PlaneSimilarity.fitted(points, 2.0 * points + 1.0, keep_size=True)
+    assert abs(kept.turn) == pytest.approx(1.0)
+    assert PlaneSimilarity.fitted(points, 2.0 * points + 1.0).turn == pytest.approx(2.0)
+    assert CameraPose(0.0, 0.0, 0.0, 1.0) == CameraPose(0.0, 0.0, 0.0, 1.0)
+
+
+_CAMERA = Camera((160, 120))
+
+
+def _at(x: float, y: float) -> Placement:
+    """An image straight from above, one unit of the plane for half its diagonal."""
+    return Placement(_CAMERA, np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]]), 1.0)
+
+
+def _image(level: int) -> NDArray[np.uint8]:
+    image = np.full((120, 160, 3), level, dtype=np.uint8)
+    image[:60] //= 2  # darker above
+    return image
+
+
+def test_frames_lie_beside_one_another_the_right_way_up() -> None:
+    preview = Preview()
+    preview.paint(_image(200), _at(0.0, 0.0))
+    preview.paint(_image(100), _at(1.6, 0.0))
+    height, width = preview.pixels.shape[:2]
+    assert width / height == pytest.approx(160 * 2 / 120, rel=0.02)
+    assert preview.pixels.any(axis=2).mean() > 0.97
+    above, below = preview.pixels[height // 4], preview.pixels[3 * height // 4]
+    assert above[width // 4].tolist() == [100] * 3
+    assert below[width // 4].tolist() == [200] * 3
+    assert below[3 * width // 4].tolist() == [100] * 3
+
+
+def test_it_grows_in_all_directions_and_stays_within_its_bound() -> None:
+    preview = Preview(side=300)
+    rng = np.random.default_rng(0)
+    for place in rng.uniform(-6.0, 6.0, (40, 2)):
+        preview.paint(_image(200), _at(*place))
+    preview.paint(_image(240), _at(0.0, 0.0))
+    assert max(preview.pixels.shape[:2]) <= 300
+    assert max(preview.pixels.shape[:2]) > 150
+    assert preview.pixels.any(axis=2).mean() > 0.3
+
+
+def test_what_is_beyond_the_horizon_or_far_too_large_is_left_out() -> None:
+    preview = Preview(side=300)
+    preview.paint(_image(200), _at(0.0, 0.0))
+    before = preview.pixels.copy()
+    horizon = Placement(_CAMERA, np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [2.0, 0.0, 1.0]]), 1.0)
+    preview.paint(_image(50), horizon)
+    preview.paint(_image(50), Placement(_CAMERA, np.diag([100.0, 100.0, 1.0]), 1.0))
+    assert np.array_equal(preview.pixels, before)
+
+
+@pytest.mark.parametrize(("dtype", "full"), [("uint8", 255), ("uint16", 65535), ("float32", 1.0)])
+def test_grey_and_deep_frames_are_painted_in_eight_bits(dtype: str, full: float) -> None:
+    preview = Preview()
+    preview.paint(np.full((120, 160), full, dtype=dtype), _at(0.0, 0.0))
+    assert preview.pixels[preview.pixels.any(axis=2)].min() == 255

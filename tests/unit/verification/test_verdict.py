@@ -1,4 +1,4 @@
-"""What the verdict fails: a registration that the pixels, the matches or the images themselves speak against."""
+"""The verdict on registered images, and what parallax tells it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment.result import LinkFit
+from rdstitch.camera import Camera
 from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import read_sources
@@ -16,8 +17,10 @@ from rdstitch.io import write_image
 from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
+from rdstitch.pipeline.recipes import pano
 from rdstitch.pipeline.register import register
 from rdstitch.registration import Registration
+from rdstitch.synthetic import Photometry, camera_rotations, turning_sequence
 from rdstitch.verification import evidence, verdict
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
@@ -27,6 +30,7 @@ from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.second_motion import MotionComparison, SecondMotion
 from rdstitch.verification.self_similarity import Ambiguity
 from tests.cli.running import flight
+from tests.sampled import sampled
 
 THRESHOLD = 3.0
 
@@ -223,3 +227,41 @@ def test_two_images_that_are_left_of_one_lens_may_be_of_a_curved_wall(good: Regi
     (message,) = judge(two, THRESHOLD)
     assert message.severity == "warning"
     assert message.images == tuple(str(source.path) for source in good.sources[:2])
+
+
+LENS = Camera((320, 240), -0.2, focal=260.0, focal_source="option")
+HEADINGS = np.radians([-35.0, 0.0, 35.0])
+
+
+def _warnings(folder: Path, radius: float) -> tuple[str, list[Message]]:
+    """Model and warnings of a camera that is held so far before the axis it turns about, in radii of the scene."""
+    ahead = np.stack([np.sin(HEADINGS), np.zeros(3), np.cos(HEADINGS)], axis=1)
+    between = np.radians([-17.0, 17.0])
+    near = np.stack([np.sin(between), [0.02, -0.03], np.cos(between), [0.4, 0.4]], axis=1) * 0.45
+    sequence = turning_sequence(
+        LENS,
+        camera_rotations(HEADINGS, [0.03, -0.02, 0.01]),
+        seed=7,
+        photometry=Photometry(noise=0.005),
+        position=radius * ahead,
+        near=near,
+    )
+    registration = pano(sequence.write(folder), options=StitchOptions()).registration
+    return registration.alignment.model, list(registration.messages)
+
+
+@pytest.mark.parametrize("radius", sampled([0.05, 0.1]))
+def test_a_turn_by_hand_is_warned_of_with_the_pair_and_the_size(tmp_path: Path, radius: float) -> None:
+    model, messages = _warnings(tmp_path, radius)
+    assert model == "rotation"
+    (warning,) = [message for message in messages if message.code == "parallax"]
+    assert len(warning.images) == 2
+    assert (
+        "between frame_0000.png and frame_0001.png" in warning.text or "frame_0001.png and frame_0002" in warning.text
+    )
+
+
+def test_a_pure_turn_is_not_warned_of(tmp_path: Path) -> None:
+    model, messages = _warnings(tmp_path, 0.0)
+    assert model == "rotation"
+    assert not messages
