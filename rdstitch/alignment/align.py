@@ -17,7 +17,7 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
-from rdstitch.alignment.lens_uncertainty import weigh_lens
+from rdstitch.alignment.lens_uncertainty import weigh_lens, with_uncertainty
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, noise_of_links
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.options import AlignmentOptions
@@ -171,6 +171,7 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
     problem, fit = adjust_over_relief(problem, choice)
     problem, fit = with_third_coefficient(problem, fit) if options.lens_chosen else (problem, fit)
     problem, fit, disagreement = hold_positions(problem, fit)
+    fit = with_uncertainty(problem, fit)
     fit = weigh_lens(problem, fit) if chosen.observable else fit
     return replace(
         chosen,

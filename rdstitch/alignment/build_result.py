@@ -11,7 +11,7 @@ from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
-from rdstitch.alignment.lens_uncertainty import considered_covariance, sandwich_covariance
+from rdstitch.alignment.lens_uncertainty import considered_covariance
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise import EXACTNESS, coherence, judge_relief
@@ -68,14 +68,12 @@ class AdjustedImages:
 def build_alignment(found: AdjustedImages, *, draft: bool = False) -> Alignment:
     """The alignment, in the frame of the reference image.
 
-    A ``draft`` has no test of its shape, and the covariances of independent errors.
+    A ``draft`` has no test of its shape, and nothing of what was not estimated in its deviations.
     """
     problem, fit = found.problem, found.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
     shared, lens = fit.model.physical_parameters(adjusted.parameters.shared)[0], adjusted.parameters.lens
     covariance = adjusted.covariance
-    if covariance.size and not draft:
-        covariance = sandwich_covariance(problem.adjuster_of(fit), adjusted)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (
         *fit.model.shared_names,

@@ -24,6 +24,9 @@ from rdstitch.alignment.select import Posterior
 from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal
 from rdstitch.arrays import FloatArray
 
+_ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 40
+"""Matches in all, and of each link at least, that say how high and how wide the hills are."""
+
 _SINGULAR = 1e-12
 """Least eigenvalue of a correlation matrix of parameters."""
 
@@ -40,10 +43,29 @@ def sandwich_covariance(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResu
     errors = 2 * int((response.weight > 0.0).sum())
     absorbed = errors / max(errors - count, 0.25 * errors)
     noise = absorbed * _by_keypoints(observations, influence)
-    found = _at_least(priors + noise + ReliefField(response).covariance(), by_images)
+    found = _at_least(priors + noise + _by_relief(adjuster, adjusted), by_images)
     derivative = adjuster.named_parameters(adjusted.parameters.shared)[1]
     independent = replace(adjuster, overdispersion=1.0).covariance(adjusted)
     return _at_least(independent, derivative @ found @ derivative.T)
+
+
+def _by_relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> FloatArray:
+    """Covariance (S, S) of the shared parameters by relief, of as many matches of each link as show its waves."""
+    observations = adjuster.observations
+    few = observations.thinned(max(_ENOUGH // max(len(observations), 1), _MIN_MATCHES_PER_LINK))
+    share = len(few.points1) / max(len(observations.points1), 1)
+    if share < 1.0:  # each counts for several beside the priors
+        adjuster = replace(adjuster, observations=few, overdispersion=adjuster.overdispersion * share)
+        adjusted = replace(adjusted, squared=adjuster.squared(adjusted.parameters))
+    return ReliefField(LinearResponse.of(adjuster, adjusted)).covariance()
+
+
+def with_uncertainty(problem: Problem, fit: Fit) -> Fit:
+    """The fit with the covariance of its parameters."""
+    if not fit.adjusted.covariance.size:
+        return fit
+    covariance = sandwich_covariance(problem.adjuster_of(fit), fit.adjusted)
+    return replace(fit, adjusted=replace(fit.adjusted, covariance=covariance))
 
 
 def _influence(response: LinearResponse) -> tuple[FloatArray, FloatArray]:
@@ -148,7 +170,7 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rou
 
 
 def weigh_lens(problem: Problem, fit: Fit) -> Fit:
-    """λ where its prior and its errors, correlated as they are, put it, and everything else adjusted to that.
+    """λ where its prior and its uncertainty put it, and everything else adjusted to that.
 
     The adjustment takes errors for independent, and so its data for surer than they are: where two images show depth,
     they would be believed a fisheye. A lens of more parameters is only chosen where images show it.
@@ -157,7 +179,7 @@ def weigh_lens(problem: Problem, fit: Fit) -> Fit:
         return fit
     parameters = fit.adjusted.parameters
     value = float(parameters.lens[0])
-    std = math.sqrt(float(sandwich_covariance(problem.adjuster_of(fit), fit.adjusted)[-1, -1]))
+    std = math.sqrt(float(fit.adjusted.covariance[-1, -1]))
     weight, mean, scatter = np.array(LENS[0].parts).T
     # Of the mixture's parts the one that it comes from the most likely; each is normal, and so is what is seen.
     spread = np.hypot(scatter, std)
