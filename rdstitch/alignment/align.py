@@ -9,15 +9,14 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import (
     Problem,
     homography_apart,
+    relations_at,
     thin_for_selection,
 )
 from rdstitch.alignment.attitude_check import check_attitudes
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
-from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
-from rdstitch.alignment.lens_uncertainty import weigh_lens, with_uncertainty
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, noise_of_links
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.options import AlignmentOptions
@@ -26,6 +25,7 @@ from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
+from rdstitch.alignment.uncertainty import weigh_lens, with_uncertainty
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD, Camera
 from rdstitch.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION

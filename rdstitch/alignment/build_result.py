@@ -9,18 +9,17 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import link_medians
+from rdstitch.alignment.frames import levelled
 from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
-from rdstitch.alignment.lens_uncertainty import considered_covariance
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise import EXACTNESS, coherence, judge_relief
 from rdstitch.alignment.options import AlignmentOptions
-from rdstitch.alignment.pose_covariance import pose_covariances
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
-from rdstitch.alignment.rotation_frame import levelled
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.alignment.shape_test import judge_shape
+from rdstitch.alignment.uncertainty import considered_covariance, pose_covariances
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.errors import ImpossibleCameraError

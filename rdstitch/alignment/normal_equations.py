@@ -5,7 +5,7 @@ parameters. Which poses the links couple is the pattern of the matrix, the same 
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -140,14 +140,12 @@ class SparseNormalEquations:
         diagonal = self.poses[self.blocks.diagonal]
         floor = max(float(diagonal.max()), 1e-300) * 1e-14
         damped = self.blocks.with_diagonal(self.poses, damping * diagonal + floor)
-        solved = symmetric_factor(self.blocks.matrix(damped)).solve(right)
+        options = {"SymmetricMode": True}
+        factor = sparse_linalg.splu(
+            self.blocks.matrix(damped), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
+        )
+        solved = factor.solve(right)
         return self.shared - self.coupling.T @ solved[:, : self.coupling.shape[1]], solved
-
-
-def symmetric_factor(matrix: "sparse.csc_array") -> Any:
-    """Factorize a positive definite matrix; the result has the method ``solve``."""
-    options = {"SymmetricMode": True}
-    return sparse_linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
 
 def _solve_scaled(matrix: FloatArray, right: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from rdstitch.alignment.lens_selection import left_coherence
 from rdstitch.alignment.link_equations import linearized_errors
 from rdstitch.alignment.motion_models import SIMILARITY, TILTING, PlanarModel
 from rdstitch.alignment.noise import judge_relief, noise_of_links
-from rdstitch.alignment.parallax import Parallax
+from rdstitch.alignment.relief_field import Parallax
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.arrays import FloatArray
 

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.alignment.normal_equations import symmetric_factor
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.late_imports import sparse
+from rdstitch.late_imports import sparse, sparse_linalg
 from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_shape, node_points
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches
 
@@ -120,8 +119,9 @@ def _solve(
 ) -> FloatArray:
     """All coordinates (nodes, D) of the fields."""
     weighted = sparse.csr_array(design.T * weight)
-    solution: FloatArray = symmetric_factor(sparse.csc_array(weighted @ design + prior)).solve(weighted @ residual)
-    return solution
+    matrix, options = sparse.csc_array(weighted @ design + prior), {"SymmetricMode": True}
+    factor = sparse_linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return np.asarray(factor.solve(weighted @ residual), dtype=np.float64)
 
 
 def _expected(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rdstitch.alignment.adjustment_problem import independent_pairs, relations_at
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links, triangles
-from rdstitch.alignment.initialization import independent_pairs, relations_at
 from rdstitch.alignment.motion_models import HOMOGRAPHY, Y
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors

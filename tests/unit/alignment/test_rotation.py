@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment import align
+from rdstitch.alignment.frames import level_frame
 from rdstitch.alignment.motion_models.rotation import ROTATION, rotation_from_vector
-from rdstitch.alignment.rotation_frame import level_frame
 from rdstitch.camera import Camera
 from rdstitch.matching.links import Link
 from rdstitch.planar_motion import nearest_rotation

@@ -7,11 +7,11 @@ import pytest
 
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
-from rdstitch.alignment.lens_uncertainty import sandwich_covariance
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.noise import coherence
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Prior, Priors
+from rdstitch.alignment.uncertainty import sandwich_covariance
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_STD, Camera
 from rdstitch.radial_homography import project
