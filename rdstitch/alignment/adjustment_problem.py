@@ -45,8 +45,8 @@ def relations_at(observations: Observations, relations: Sequence[RadialHomograph
         if abs(relation.distortion - distortion) < 1e-9 and not center.any() and relation.camera.higher == higher:
             continue
         points1 = observations.points1[observations.start[link] : observations.start[link + 1]]
-        own = transfer(relation.homography, relation.distortion, points1, relation.camera.higher)
-        x1, x2 = (undistort(points - center, distortion, higher) for points in (points1, own))
+        transferred = transfer(relation.homography, relation.distortion, points1, relation.camera.higher)
+        x1, x2 = (undistort(points - center, distortion, higher) for points in (points1, transferred))
         valid = np.isfinite(x1).all(axis=1) & np.isfinite(x2).all(axis=1)
         if valid.sum() >= 4:
             result[link] = direct_linear(x1[valid], x2[valid])
@@ -140,12 +140,12 @@ class Problem:
         number = np.full(self.count + 1, -1, dtype=np.intp)
         number[images] = np.arange(len(images))
         links = np.flatnonzero(kept & (number[o.image1] >= 0) & (number[o.image2] >= 0))
-        own, reference = o.subset(links, number), int(number[self.reference])
+        observations, reference = o.subset(links, number), int(number[self.reference])
         if reference < 0:
-            reference = spanning_tree(len(images), own.image1, own.image2, self.trust[links]).root
+            reference = spanning_tree(len(images), observations.image1, observations.image2, self.trust[links]).root
         part = replace(
             self,
-            observations=own,
+            observations=observations,
             homographies=self.homographies[links],
             trust=self.trust[links],
             count=len(images),
@@ -287,9 +287,9 @@ class Problem:
         known, links = self.camera_priors, len(self.observations)
         priors = known.priors(model, self.count, _TILT_SPREAD_START)
         few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
-        sample, own = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
+        sample, homographies = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
         trials = [
-            independent_pairs(model, sample, own, shared, self.lens, self.free_lens, priors, known.attitudes)
+            independent_pairs(model, sample, homographies, shared, self.lens, self.free_lens, priors, known.attitudes)
             for shared in model.shared_starts(known.log_focal, known.tilt, tilt_known=known.tilt_known)
         ]
         squared = [adjuster.squared(start) for adjuster, start in trials]

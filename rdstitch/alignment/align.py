@@ -103,18 +103,18 @@ class AlignmentTask:
 def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> AdjustedImages:
     """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
     known = options.camera_priors(cameras)
-    everything, own = _observations(links, cameras, _matches_of_a_link(len(links), options))
+    everything, read = _observations(links, cameras, _matches_of_a_link(len(links), options))
     few = everything.thinned(thin_for_selection(len(links)))
     votes = vote([k.relation.distortion for k in links], [k.relation.distortion_std for k in links])
     lens, free_lens = _lens_start(cameras, options, votes)
-    relations = relations_at(few, own, lens)
+    relations = relations_at(few, read, lens)
     apart = homography_apart(few, relations, lens, free_lens, known)
     observable = options.lens_known or _observable(apart)
     given, none = _lens_of(cameras[0]), np.zeros_like(free_lens)
     may_be_depth = observable and not options.lens_known and len(np.unique([few.image1, few.image2])) <= _FEW_VIEWS
     held = apart
     if may_be_depth or not observable:
-        held = homography_apart(few, relations_at(few, own, given), given, none, known)
+        held = homography_apart(few, relations_at(few, read, given), given, none, known)
     depth = may_be_depth and _is_depth(few, apart, held)
     observable &= not depth
     chosen = choose_lens(few, apart if observable else held, options.lenses if observable else (), known)

@@ -62,10 +62,10 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
     stated = options.attitudes_std if options.attitudes is not None else 0.0
     scores = [shown.likelihood(given @ change.T) for change in _SIGNED_ORDERS]
     none = shown.likelihood(np.zeros_like(given))
-    (own, scatter), best = scores[0], int(np.argmax([score for score, _ in scores]))
-    if own - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
+    (likelihood, scatter), best = scores[0], int(np.argmax([score for score, _ in scores]))
+    if likelihood - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
         return None
-    if max(scores[best][0], none[0]) < own + _LOG_ODDS:
+    if max(scores[best][0], none[0]) < likelihood + _LOG_ODDS:
         if options.attitudes is None:
             return None
         text = f"the attitudes agree with the images to {math.degrees(scatter):.2g} degrees, which is taken for their "

@@ -64,12 +64,12 @@ class AdjustedImages:
     messages: tuple[Message, ...] = ()  # on what was given
 
 
-def build_alignment(found: AdjustedImages, *, draft: bool = False) -> Alignment:
+def build_alignment(adjustment: AdjustedImages, *, draft: bool = False) -> Alignment:
     """The alignment, in the frame of the reference image.
 
     A ``draft`` has no test of its shape, and nothing of what was not estimated in its deviations.
     """
-    problem, fit = found.problem, found.choice.fit
+    problem, fit = adjustment.problem, adjustment.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
     shared, lens = fit.model.physical_parameters(adjusted.parameters.shared)[0], adjusted.parameters.lens
     covariance = adjusted.covariance
@@ -90,60 +90,60 @@ def build_alignment(found: AdjustedImages, *, draft: bool = False) -> Alignment:
     agreeing = squared <= (ALIGNMENT_WIDTH * math.hypot(sigma, EXACTNESS)) ** 2
     relief = judge_relief(coherence(observations, errors, inliers), fit.model.name, len(observations))
     considered = lens_covariance
-    if found.observable and problem.free_lens[0] and not draft:
+    if adjustment.observable and problem.free_lens[0] and not draft:
         considered = considered_covariance(problem, fit, rough=relief.found)
     tilt, tilt_std = ((float(values[0]), float(values[1])) if planar else None for values in (shared, std))
     focal_std = None if focal is None else float(std[names.index("log_focal")]) * focal
 
     def adjusted_camera(camera: Camera) -> Camera:
-        result = _with_lens(found, camera, lens, (lens_covariance, considered))
+        result = _with_lens(adjustment, camera, lens, (lens_covariance, considered))
         if focal is not None and focal_std is not None:
             size = camera.scale
             result = result.with_focal(focal * size, "estimate", focal_std * size)
         return replace(result, tilt=tilt, tilt_std=tilt_std)
 
     # Most images are of one camera.
-    adjusted_cameras = {camera: adjusted_camera(camera) for camera in dict.fromkeys(found.cameras)}
-    cameras = tuple(adjusted_cameras[camera] for camera in found.cameras)
-    own = cameras[int(found.images[problem.reference])]
-    groups = _groups(found)
-    used = np.zeros(len(found.cameras), dtype=np.bool_)
-    used[found.images] = True
-    homographies, poses = _in_frame_of_reference(found, draft=draft)
+    adjusted_cameras = {camera: adjusted_camera(camera) for camera in dict.fromkeys(adjustment.cameras)}
+    cameras = tuple(adjusted_cameras[camera] for camera in adjustment.cameras)
+    reference_camera = cameras[int(adjustment.images[problem.reference])]
+    groups = _groups(adjustment)
+    used = np.zeros(len(adjustment.cameras), dtype=np.bool_)
+    used[adjustment.images] = True
+    homographies, poses = _in_frame_of_reference(adjustment, draft=draft)
     return Alignment(
         cameras=cameras,
         homographies=homographies,
         used=used,
         components=groups,
-        reference=int(found.images[problem.reference]),
+        reference=int(adjustment.images[problem.reference]),
         model=fit.model.name,
-        model_reason=found.choice.reason,
+        model_reason=adjustment.choice.reason,
         poses=poses,
         tilt=tilt,
         tilt_spread=fit.tilt_spread,
         focal=focal,
         focal_std=focal_std,
-        distortion=own.nearest_distortion,
-        distortion_std=0.0 if own.distortion_std is None else own.distortion_std,
-        lens=found.lens.name,
-        lens_reason=found.lens.reason,
+        distortion=reference_camera.nearest_distortion,
+        distortion_std=0.0 if reference_camera.distortion_std is None else reference_camera.distortion_std,
+        lens=adjustment.lens.name,
+        lens_reason=adjustment.lens.reason,
         parameters=names,
         covariance=covariance,
         rms=float(np.sqrt(squared[agreeing].mean())) if agreeing.any() else math.nan,
-        links=_link_fits(found, squared, agreeing),
+        links=_link_fits(adjustment, squared, agreeing),
         relief=relief,
-        shape=None if draft else _shape(found),
-        messages=(*_warnings(found, own, considered), *found.messages),
+        shape=None if draft else _shape(adjustment),
+        messages=(*_warnings(adjustment, reference_camera, considered), *adjustment.messages),
     )
 
 
-def _shape(found: AdjustedImages) -> ShapeTest | None:
+def _shape(adjustment: AdjustedImages) -> ShapeTest | None:
     """Whether the whole may be bent, with the image's index among all."""
-    fit = found.choice.fit
-    if fit.model.on_sphere or not found.observable:
+    fit = adjustment.choice.fit
+    if fit.model.on_sphere or not adjustment.observable:
         return None
-    images = found.images
-    judged = judge_shape(found.problem, fit, [found.cameras[k] for k in images])
+    images = adjustment.images
+    judged = judge_shape(adjustment.problem, fit, [adjustment.cameras[k] for k in images])
     return replace(judged, image=int(images[judged.image]))
 
 
@@ -157,7 +157,7 @@ def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray
 
 
 def _with_lens(
-    found: AdjustedImages, camera: Camera, lens: FloatArray, covariances: tuple[FloatArray, FloatArray]
+    adjustment: AdjustedImages, camera: Camera, lens: FloatArray, covariances: tuple[FloatArray, FloatArray]
 ) -> Camera:
     """The camera of an image with the lens that was found; covariances of what was estimated, and of all of a lens."""
     covariance, considered = covariances
@@ -173,7 +173,7 @@ def _with_lens(
     )
     if estimated and result.sees_beyond_horizon:
         raise ImpossibleCameraError(f"with λ = {result.distortion:.3g} the corners would see behind the camera")
-    std = _nearest_distortion_std(result, considered) if found.observable else math.inf
+    std = _nearest_distortion_std(result, considered) if adjustment.observable else math.inf
     return replace(result, distortion_std=std)
 
 
@@ -187,24 +187,28 @@ def _nearest_distortion_std(camera: Camera, covariance: FloatArray) -> float:
     return math.sqrt(max(float(gradient @ covariance @ gradient), 0.0))
 
 
-def _in_frame_of_reference(found: AdjustedImages, *, draft: bool) -> tuple[FloatArray, PlanarPoses | None]:
+def _in_frame_of_reference(adjustment: AdjustedImages, *, draft: bool) -> tuple[FloatArray, PlanarPoses | None]:
     """Image-to-plane homographies of all images, and their poses where the model has them.
 
     The adjustment may have held the reference image anywhere; here it comes to the origin, with yaw zero and, as
     the unit of length, height one.
     """
-    fit, reference, parameters = found.choice.fit, found.problem.reference, found.choice.fit.adjusted.parameters
+    fit, reference, parameters = (
+        adjustment.choice.fit,
+        adjustment.problem.reference,
+        adjustment.choice.fit.adjusted.parameters,
+    )
     matrices = fit.adjusted.matrices.matrices
 
     def of_all(values: FloatArray) -> FloatArray:
         """Of all images, NaN for those that are not aligned."""
-        result = np.full((len(found.cameras), *values.shape[1:]), np.nan)
-        result[found.images] = values
+        result = np.full((len(adjustment.cameras), *values.shape[1:]), np.nan)
+        result[adjustment.images] = values
         return result
 
     if fit.model.on_sphere:
-        given = found.options.gravity
-        gravity = None if given is None else np.asarray(given, dtype=np.float64)[found.images]
+        given = adjustment.options.gravity
+        gravity = None if given is None else np.asarray(given, dtype=np.float64)[adjustment.images]
         return of_all(levelled(matrices, reference, gravity)), None
     if not isinstance(fit.model, PlanarModel):
         return of_all(matrices[reference] @ np.linalg.inv(matrices)), None
@@ -217,48 +221,48 @@ def _in_frame_of_reference(found: AdjustedImages, *, draft: bool) -> tuple[Float
     )
     frame = rigid_in_plane(yaw[reference], position[reference], height[reference])
     poses = PlanarPoses(yaw, position, height, tilt).relative_to(reference)
-    covariances = pose_covariances(found.problem, fit) if found.options.pose_covariance and not draft else ()
-    own = (poses.yaw, poses.position, poses.height, poses.tilt, *covariances)
-    return of_all(frame @ np.linalg.inv(matrices)), PlanarPoses(*map(of_all, own))
+    covariances = pose_covariances(adjustment.problem, fit) if adjustment.options.pose_covariance and not draft else ()
+    aligned_poses = (poses.yaw, poses.position, poses.height, poses.tilt, *covariances)
+    return of_all(frame @ np.linalg.inv(matrices)), PlanarPoses(*map(of_all, aligned_poses))
 
 
-def _groups(found: AdjustedImages) -> tuple[tuple[int, ...], ...]:
+def _groups(adjustment: AdjustedImages) -> tuple[tuple[int, ...], ...]:
     """Connected groups of images by the links not taken for wrong, the aligned one first."""
-    right = [link for link, right in zip(found.links, found.right, strict=True) if right]
-    groups = connected_components(len(found.cameras), [k.image1 for k in right], [k.image2 for k in right])
-    aligned = set(found.images.tolist())
+    right = [link for link, right in zip(adjustment.links, adjustment.right, strict=True) if right]
+    groups = connected_components(len(adjustment.cameras), [k.image1 for k in right], [k.image2 for k in right])
+    aligned = set(adjustment.images.tolist())
     ordered = sorted(groups, key=lambda group: group[0] not in aligned)
     return tuple(tuple(group) for group in ordered)
 
 
-def _link_fits(found: AdjustedImages, squared: FloatArray, agreeing: BoolArray) -> tuple[LinkFit, ...]:
+def _link_fits(adjustment: AdjustedImages, squared: FloatArray, agreeing: BoolArray) -> tuple[LinkFit, ...]:
     """How well each link agrees, in the order of the links given."""
-    observations = found.problem.observations
+    observations = adjustment.problem.observations
     medians = link_medians(squared, observations)
-    images = found.images
+    images = adjustment.images
     rows = {
         frozenset((int(images[i]), int(images[j]))): row
         for row, (i, j) in enumerate(zip(observations.image1, observations.image2, strict=True))
     }
     result = []
-    for link, right in zip(found.links, found.right, strict=True):
+    for link, right in zip(adjustment.links, adjustment.right, strict=True):
         row = rows.get(frozenset((link.image1, link.image2)))
         if row is None or not right:
             why = "belongs to another group of images" if right else CONTRADICTS
             result.append(LinkFit(link.image1, link.image2, len(link), 0, math.nan, False, why))
             continue
-        own = slice(observations.start[row], observations.start[row + 1])
-        good = squared[own][agreeing[own]]
-        share = len(good) / max(len(agreeing[own]), 1)
+        rows_of_link = slice(observations.start[row], observations.start[row + 1])
+        good = squared[rows_of_link][agreeing[rows_of_link]]
+        share = len(good) / max(len(agreeing[rows_of_link]), 1)
         rms = float(np.sqrt(good.mean())) if len(good) else float(medians[row])
         result.append(LinkFit(link.image1, link.image2, len(link), round(share * len(link)), rms, True))
     return tuple(result)
 
 
-def _overruled_focal(found: AdjustedImages, camera: Camera) -> str | None:
+def _overruled_focal(adjustment: AdjustedImages, camera: Camera) -> str | None:
     """That the images show another focal length than EXIF says, where they do."""
-    given = found.problem.camera_priors
-    if given.focal_source != "exif" or not found.choice.fit.model.one_camera or camera.focal is None:
+    given = adjustment.problem.camera_priors
+    if given.focal_source != "exif" or not adjustment.choice.fit.model.one_camera or camera.focal is None:
         return None
     ratio = camera.focal / camera.scale / math.exp(given.log_focal)
     if abs(math.log(ratio)) < math.log(_OVERRULED):
@@ -267,33 +271,33 @@ def _overruled_focal(found: AdjustedImages, camera: Camera) -> str | None:
     return f"the images show a focal length that is {times} in EXIF, which was not used; --focal gives the right one"
 
 
-def _warnings(found: AdjustedImages, camera: Camera, considered: FloatArray) -> tuple[Message, ...]:
+def _warnings(adjustment: AdjustedImages, camera: Camera, considered: FloatArray) -> tuple[Message, ...]:
     """What the user should know of the whole, with the covariance (5, 5) of all parameters of a lens."""
     result: list[Message] = []
     # An image can be right whatever the lens is.
-    image_only = found.options.layout_matters
-    if found.depth or not found.observable:
+    image_only = adjustment.options.layout_matters
+    if adjustment.depth or not adjustment.observable:
         cause, remedy = "the images hardly move, or only turn about the optical axis", "images that overlap by less"
-        if found.depth:
+        if adjustment.depth:
             cause, remedy = "what the images show has depth, which looks like a lens in so few of them", "more images"
         text = f"λ is not observable: {cause}; give λ, a camera file, or {remedy}"
-        severity: Severity = "detail" if image_only else "failure" if found.depth else "warning"
+        severity: Severity = "detail" if image_only else "failure" if adjustment.depth else "warning"
         result.append(Message(text, severity=severity, code="lambda-not-observable"))
-    elif len(found.images) < ENOUGH_IMAGES and found.problem.free_lens.any():
+    elif len(adjustment.images) < ENOUGH_IMAGES and adjustment.problem.free_lens.any():
         every = replace(camera, lens_covariance=tuple(map(tuple, considered.tolist())))
         off = _CONFIDENT * float(radius_std(every, _RADII)[-1])
         if off > _WORTH_SAYING:
             text = (
-                f"from {len(found.images)} images the lens distortion is known to about {off:.2g} pixels at the "
+                f"from {len(adjustment.images)} images the lens distortion is known to about {off:.2g} pixels at the "
                 f"corners; {ENOUGH_IMAGES} or more images, or --camera, make it surer"
             )
             result.append(Message(text, severity="detail" if image_only else "warning", code="few-images"))
-    if (overruled := _overruled_focal(found, camera)) is not None:
+    if (overruled := _overruled_focal(adjustment, camera)) is not None:
         result.append(Message(overruled))
-    if not found.choice.fit.adjusted.converged:
+    if not adjustment.choice.fit.adjusted.converged:
         text = "the adjustment did not converge; judge the result with care"
         # Of seven on adverse sets two results were off (python -m examples.benchmarks.trust --kind adverse).
         result.append(Message(text, severity="detail", code="not-converged"))
-    if found.positions_disagree:
-        result.append(Message(found.positions_disagree))
+    if adjustment.positions_disagree:
+        result.append(Message(adjustment.positions_disagree))
     return tuple(result)

@@ -178,13 +178,17 @@ class BundleAdjuster:
             predicted = -(normal.gradient_poses @ flat + normal.gradient_shared @ step_shared)
             if not np.isfinite(predicted) or predicted <= MIN_GAIN * max(state.cost, 1e-12):
                 return state, used, True
-            moved = state.parameters.retract(self.model, step_poses, step_shared, self.free.lens)
+            parameters_moved = state.parameters.retract(self.model, step_poses, step_shared, self.free.lens)
             used += 1
-            there = None if folds(moved.lens, self.observations.reach) else self._evaluate(moved, sigma, width)
-            after = np.inf if there is None else self._cost(there, state.equations.whitening, sigma, width)
+            moved_state = (
+                None
+                if folds(parameters_moved.lens, self.observations.reach)
+                else self._evaluate(parameters_moved, sigma, width)
+            )
+            after = np.inf if moved_state is None else self._cost(moved_state, state.equations.whitening, sigma, width)
             damping, failures = damping_by_gain(damping, failures, float((state.cost - after) / predicted))
-            if there is not None and after < state.cost:
-                state = there
+            if moved_state is not None and after < state.cost:
+                state = moved_state
             elif damping > MAX_DAMPING:
                 return state, used, True
         return state, used, False

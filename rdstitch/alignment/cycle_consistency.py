@@ -32,17 +32,17 @@ def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:
     low, high = np.minimum(image1, image2), np.maximum(image1, image2)
     number = sparse.coo_array((np.arange(1, len(low) + 1), (low, high)), shape=(count, count)).tocsr()
     number.sort_indices()
-    found = []
+    triples = []
     for link in range(len(low)):
         i, j = int(low[link]), int(high[link])
-        own = number.indices[number.indptr[i] : number.indptr[i + 1]]
+        partners = number.indices[number.indptr[i] : number.indptr[i + 1]]
         other = number.indices[number.indptr[j] : number.indptr[j + 1]]
-        third = np.intersect1d(own, other)
+        third = np.intersect1d(partners, other)
         if len(third):
             jk = number.data[number.indptr[j] : number.indptr[j + 1]][np.searchsorted(other, third)] - 1
-            ik = number.data[number.indptr[i] : number.indptr[i + 1]][np.searchsorted(own, third)] - 1
-            found.append(np.column_stack([np.full(len(third), link), jk, ik]))
-    result = np.concatenate(found).astype(np.intp) if found else np.empty((0, 3), dtype=np.intp)
+            ik = number.data[number.indptr[i] : number.indptr[i + 1]][np.searchsorted(partners, third)] - 1
+            triples.append(np.column_stack([np.full(len(third), link), jk, ik]))
+    result = np.concatenate(triples).astype(np.intp) if triples else np.empty((0, 3), dtype=np.intp)
     every = -(-len(result) // _MAX_TRIANGLES) if len(result) else 1
     return result[::every]
 

@@ -36,20 +36,20 @@ def turned_tilts(tilts: FloatArray, orientations: Sequence[int]) -> FloatArray:
 
 def turned_link(link: Link, cameras: Sequence[Camera], orientations: Sequence[int]) -> Link:
     """The same correspondences in images, of the cameras given, after orientations 1, 3, 6 and 8."""
-    own = orientations[link.image1], orientations[link.image2]
-    if own == (1, 1):
+    pair = orientations[link.image1], orientations[link.image2]
+    if pair == (1, 1):
         return link
-    first, second = turns(own)
+    first, second = turns(pair)
     relation = link.relation
     return replace(
         link,
-        points1=_turned_points(link.points1, cameras[link.image1], own[0]),
-        points2=_turned_points(link.points2, cameras[link.image2], own[1]),
+        points1=_turned_points(link.points1, cameras[link.image1], pair[0]),
+        points2=_turned_points(link.points2, cameras[link.image2], pair[1]),
         relation=replace(
             relation,
             homography=second @ relation.homography @ first.T,
-            camera=relation.camera.turned(own[0]),
-            camera2=relation.camera2.turned(own[1]),
+            camera=relation.camera.turned(pair[0]),
+            camera2=relation.camera2.turned(pair[1]),
             covariance=np.empty((0, 0)),
             motion=None,
         ),
@@ -68,7 +68,7 @@ def turned_alignment(alignment: Alignment, orientations: Sequence[int], gravity:
     if all(orientation == 1 for orientation in orientations):
         return alignment
     turn, used, reference = turns(orientations), alignment.used, alignment.reference
-    own, poses, tilt = turn[reference], alignment.poses, alignment.tilt
+    turn_of_reference, poses, tilt = turn[reference], alignment.poses, alignment.tilt
     homographies = np.array(alignment.homographies)
     if alignment.on_sphere:
         matrices = turn[used] @ np.linalg.inv(homographies[used])
@@ -76,12 +76,12 @@ def turned_alignment(alignment: Alignment, orientations: Sequence[int], gravity:
         place = int(used[:reference].sum())
         homographies[used] = levelled(matrices, place, None if gravity is None else gravity[used])
     else:
-        plane = own
+        plane = turn_of_reference
         if poses is not None:
             poses, plane = _turned_poses(poses, turn, reference)
         homographies[used] = plane @ homographies[used] @ turn[used].transpose(0, 2, 1)
     if tilt is not None:
-        psi, theta = tilt_from_normal(own @ rotation_from_tilt(tilt)[:, 2]).tolist()
+        psi, theta = tilt_from_normal(turn_of_reference @ rotation_from_tilt(tilt)[:, 2]).tolist()
         tilt = (psi, theta)
     return replace(
         alignment,
@@ -89,7 +89,7 @@ def turned_alignment(alignment: Alignment, orientations: Sequence[int], gravity:
         homographies=homographies,
         poses=poses,
         tilt=tilt,
-        covariance=_turned_covariance(alignment, own[:2, :2]),
+        covariance=_turned_covariance(alignment, turn_of_reference[:2, :2]),
     )
 
 
@@ -105,13 +105,13 @@ def _turned_poses(poses: PlanarPoses, turn: FloatArray, reference: int) -> tuple
     return PlanarPoses(yaw, poses.position @ around.T, poses.height, tilt, *poses.turned(around)), plane
 
 
-def _turned_covariance(alignment: Alignment, own: FloatArray) -> FloatArray:
+def _turned_covariance(alignment: Alignment, turn: FloatArray) -> FloatArray:
     """Covariance of the parameters of the lens and the tilt, to first order, in the frame of the turned reference."""
     names, jacobian = alignment.parameters, np.eye(len(alignment.parameters))
     for pair in (("psi", "theta"), LENS_PARAMETERS[3:]):
         if set(pair) <= set(names):
             index = [names.index(name) for name in pair]
-            jacobian[np.ix_(index, index)] = own
+            jacobian[np.ix_(index, index)] = turn
     covariance: FloatArray = jacobian @ alignment.covariance @ jacobian.T
     return covariance
 
@@ -137,8 +137,8 @@ def frontal_reference(alignment: Alignment) -> int:
     """The reference image, or, where another one is absurdly stretched by its frame, the one that stretches least."""
     used = np.flatnonzero(alignment.used)
     nearness = np.array([_nearest_to_horizon(alignment, used, int(k)) for k in used])
-    own = int(np.flatnonzero(used == alignment.reference)[0])
-    if nearness[own].min() > MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
+    present = int(np.flatnonzero(used == alignment.reference)[0])
+    if nearness[present].min() > MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
         return alignment.reference
     crossing, least = (nearness <= 0.0).sum(axis=1), nearness.min(axis=1)
     return int(used[np.lexsort((-least, crossing))[0]])

@@ -231,11 +231,11 @@ def _parts(observations: Observations) -> IntArray:
         return link
     cell = np.zeros(len(link), dtype=np.intp)
     for number in range(len(observations)):
-        own = slice(observations.start[number], observations.start[number + 1])
-        points = observations.points1[own]
+        rows = slice(observations.start[number], observations.start[number + 1])
+        points = observations.points1[rows]
         for axis in range(2):
             rank = np.argsort(np.argsort(points[:, axis]))
-            cell[own] = cell[own] * _CELLS + rank * _CELLS // max(len(points), 1)
+            cell[rows] = cell[rows] * _CELLS + rank * _CELLS // max(len(points), 1)
     return link * _CELLS**2 + cell
 
 

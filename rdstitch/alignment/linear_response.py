@@ -58,9 +58,9 @@ class LinearResponse:
         for part in self.parts():
             weighted = fields(part) * (self.curvature * self.weight[part.rows])[:, None, None]
             for link in range(part.first, part.last):
-                own = slice(start[link] - part.rows.start, start[link + 1] - part.rows.start)
-                jacobian = part.jacobian[own].reshape(-1, derivative.shape[1])
-                links[link] = jacobian.T @ weighted[own].reshape(-1, columns)
+                rows = slice(start[link] - part.rows.start, start[link + 1] - part.rows.start)
+                jacobian = part.jacobian[rows].reshape(-1, derivative.shape[1])
+                links[link] = jacobian.T @ weighted[rows].reshape(-1, columns)
         local = np.swapaxes(derivative, 1, 2) @ links
         blocks = self.normal.blocks
         pair = blocks.column.shape[1]
@@ -73,9 +73,9 @@ class LinearResponse:
         padded = np.concatenate([poses, np.zeros((1, columns))])
         change = np.empty((*part.errors.shape, columns))
         for link in range(part.first, part.last):
-            own = slice(start[link] - part.rows.start, start[link + 1] - part.rows.start)
+            rows = slice(start[link] - part.rows.start, start[link + 1] - part.rows.start)
             step = self._derivative[link] @ np.concatenate([padded[column[link]], shared])
-            change[own] = part.jacobian[own] @ step
+            change[rows] = part.jacobian[rows] @ step
         return change
 
     @cached_property

@@ -72,11 +72,11 @@ def link_equations(
     squared, error, whitening = np.empty(count), np.empty((2, count)), np.empty((2, 2, count))
     for first, last in observations.chunks:
         rows = slice(observations.start[first], observations.start[last])
-        there = _transferred(observations, homographies, lens, first, last)
-        squared[rows], error[:, rows] = squared_lengths(there.whitened.T), there.error
-        whitening[:, :, rows] = there.whitening.transpose(1, 2, 0)
+        transferred = _transferred(observations, homographies, lens, first, last)
+        squared[rows], error[:, rows] = squared_lengths(transferred.whitened.T), transferred.error
+        whitening[:, :, rows] = transferred.whitening.transpose(1, 2, 0)
         edges = observations.start[first : last + 1] - observations.start[first]
-        sums[first:last] = _link_sums(there, np.sqrt(robust_weight(squared[rows], width)), free_lens, edges)
+        sums[first:last] = _link_sums(transferred, np.sqrt(robust_weight(squared[rows], width)), free_lens, edges)
     return LinkEquations(sums[:, :-1, :-1], sums[:, :-1, -1], squared, whitening.transpose(2, 0, 1), error.T)
 
 
@@ -106,18 +106,18 @@ def linearized_errors(
 ) -> Iterator[LinearizedErrors]:
     """All links, some at a time: derivatives of all correspondences at once would be most of an alignment's memory."""
     for first, last in observations.chunks:
-        there = _transferred(observations, homographies, lens, first, last)
-        found = there.derivatives
-        by_homography = found.by_image[:, :, None] * found.lifted
-        columns = np.concatenate([by_homography.reshape(2, 9, -1), found.by_lens(free_lens)], axis=1)
+        transferred = _transferred(observations, homographies, lens, first, last)
+        derivatives = transferred.derivatives
+        by_homography = derivatives.by_image[:, :, None] * derivatives.lifted
+        columns = np.concatenate([by_homography.reshape(2, 9, -1), derivatives.by_lens(free_lens)], axis=1)
         yield LinearizedErrors(
             first,
             last,
             slice(int(observations.start[first]), int(observations.start[last])),
-            _finite(there.whitened.T),
-            _finite(whiten(there.whitening, columns).transpose(2, 0, 1)),
-            _finite(there.whitening @ found.by_point),
-            _finite(-there.whitening),
+            _finite(transferred.whitened.T),
+            _finite(whiten(transferred.whitening, columns).transpose(2, 0, 1)),
+            _finite(transferred.whitening @ derivatives.by_point),
+            _finite(-transferred.whitening),
         )
 
 
@@ -155,29 +155,31 @@ def _transferred(
     scale2 = np.repeat(observations.scale2[first:last], counts)[:, None, None]
     homography = np.repeat(homographies[first:last], counts, axis=0)
     distortion, higher, center = split_lens(lens)
-    found = transfer_jacobian(homography, distortion, observations.points1[rows] - center, higher)
+    derivatives = transfer_jacobian(homography, distortion, observations.points1[rows] - center, higher)
     relief = None if observations.relief is None else observations.relief[rows]
-    whitening = measurement_whitening(found.by_point * (scale2 / scale1), relief) * scale2
-    error = (found.points - (observations.points2[rows] - center)).T
-    return _Transferred(found, whitening, error, whiten(whitening, error))
+    whitening = measurement_whitening(derivatives.by_point * (scale2 / scale1), relief) * scale2
+    error = (derivatives.points - (observations.points2[rows] - center)).T
+    return _Transferred(derivatives, whitening, error, whiten(whitening, error))
 
 
-def _link_sums(there: _Transferred, root: FloatArray, free_lens: BoolArray, edges: NDArray[np.intp]) -> FloatArray:
+def _link_sums(
+    transferred: _Transferred, root: FloatArray, free_lens: BoolArray, edges: NDArray[np.intp]
+) -> FloatArray:
     """``[J r]'[J r]`` (l, 10 + K, 10 + K) of links, whose correspondences lie between the edges (l + 1,).
 
     ``root`` (m,) is what a correspondence is multiplied by.
     """
-    found = there.derivatives
-    own = np.concatenate([found.by_image, found.by_lens(free_lens), there.error[:, None]], axis=1)
-    own = whiten(there.whitening * root[:, None, None], own)
-    products = _products(own)
-    monomials = _products(np.concatenate([found.lifted, np.ones((1, len(root)))])[None])
+    derivatives = transferred.derivatives
+    columns = np.concatenate([derivatives.by_image, derivatives.by_lens(free_lens), transferred.error[:, None]], axis=1)
+    columns = whiten(transferred.whitening * root[:, None, None], columns)
+    products = _products(columns)
+    monomials = _products(np.concatenate([derivatives.lifted, np.ones((1, len(root)))])[None])
     if len(lost := np.flatnonzero(root == 0.0)):
         products[:, lost], monomials[:, lost] = 0.0, 0.0
     sums = np.empty((len(edges) - 1, len(products), len(monomials)))
     for link, (start, stop) in enumerate(pairwise(edges.tolist())):
         np.matmul(products[:, start:stop], monomials[:, start:stop].T, out=sums[link])
-    return sums[:, *_entries(own.shape[1] - 3)]
+    return sums[:, *_entries(columns.shape[1] - 3)]
 
 
 def _products(values: FloatArray) -> FloatArray:
@@ -186,10 +188,10 @@ def _products(values: FloatArray) -> FloatArray:
     products = np.empty((count * (count + 1) // 2, length))
     start = 0
     for k in range(count):
-        own = products[start : start + count - k]
-        np.multiply(values[0, k], values[0, k:], out=own)
+        rows = products[start : start + count - k]
+        np.multiply(values[0, k], values[0, k:], out=rows)
         for others in values[1:]:
-            own += others[k] * others[k:]
+            rows += others[k] * others[k:]
         start += count - k
     return products
 
@@ -200,9 +202,9 @@ def _entries(others: int) -> tuple[IntArray, IntArray]:
 
     A column is the derivative by one of z times one coordinate of p; of the others, the lens and the error, times 1.
     """
-    own, lifted = np.divmod(np.arange(9), 3)
-    own, lifted = np.append(own, 3 + np.arange(others)), np.append(lifted, np.full(others, 3))
-    return _number(3 + others)[np.ix_(own, own)], _number(4)[np.ix_(lifted, lifted)]
+    column, lifted = np.divmod(np.arange(9), 3)
+    column, lifted = np.append(column, 3 + np.arange(others)), np.append(lifted, np.full(others, 3))
+    return _number(3 + others)[np.ix_(column, column)], _number(4)[np.ix_(lifted, lifted)]
 
 
 def _number(count: int) -> IntArray:

@@ -91,9 +91,9 @@ def neighbours(observations: Observations, inliers: BoolArray) -> tuple[IntArray
     nearby = spatial.cKDTree(apart).query(apart, k=min(4, len(apart)))
     distance, neighbour = np.asarray(nearby[0]), np.asarray(nearby[1])
     pairs = (distance[:, 1:] > _MIN_DISTANCE) & (distance[:, 1:] < _MAX_DISTANCE)
-    found = pairs.any(axis=1)
+    has_neighbour = pairs.any(axis=1)
     nearest = neighbour[np.arange(len(apart)), np.argmax(pairs, axis=1) + 1]
-    return chosen[found], chosen[nearest[found]]
+    return chosen[has_neighbour], chosen[nearest[has_neighbour]]
 
 
 def apart(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:
@@ -101,7 +101,7 @@ def apart(observations: Observations, inliers: BoolArray) -> tuple[IntArray, Int
     chosen = _sample(observations, inliers)
     link = observations.link[chosen]
     pairs = [(chosen[:-k], chosen[k:], link[:-k] == link[k:]) for k in range(1, _PARTNERS + 1)]
-    first, second = (np.concatenate([own[side][own[2]] for own in pairs]) for side in (0, 1))
+    first, second = (np.concatenate([each[side][each[2]] for each in pairs]) for side in (0, 1))
     order = np.argsort(first, kind="stable")
     return first[order], second[order]
 
@@ -129,26 +129,26 @@ def _overdispersion(link: IntArray, points: FloatArray, residual: FloatArray, co
     return max(1.0, float((sums[several] ** 2).sum() / power[several].sum()))
 
 
-def judge_relief(found: Coherence, model: str, links: int) -> ReliefTest:
+def judge_relief(left: Coherence, model: str, links: int) -> ReliefTest:
     """What the agreement of neighbours that a model leaves means for the scene.
 
     What is as wide as the overlap of one pair alone, its homography and λ absorb.
     """
-    agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} pixels in common)"
-    relief = found.correlation > COHERENT_CORRELATION and found.relative_size > LARGE_RELIEF
+    agreement = f"errors of neighbours agree (correlation {left.correlation:.2f}, {left.size:.1f} pixels in common)"
+    relief = left.correlation > COHERENT_CORRELATION and left.relative_size > LARGE_RELIEF
     if model == "rotation":
         moved = "the camera moved between the images (parallax): what is near does not fit; turn about the lens"
-        text = f"{agreement}: {moved}" if relief else f"the camera hardly moved (correlation {found.correlation:.2f})"
+        text = f"{agreement}: {moved}" if relief else f"the camera hardly moved (correlation {left.correlation:.2f})"
     elif relief:
         text = (
             f"{agreement}: the scene is not one plane, or the {model} model does not describe the camera; λ may be off"
         )
-    elif found.correlation > COHERENT_CORRELATION:
+    elif left.correlation > COHERENT_CORRELATION:
         text = f"{agreement}, as over a scene that is nearly flat"
     else:
         seen = "the scene is flat" if links > 1 else "no relief shows, but hills as wide as one overlap would not"
-        text = f"errors of neighbours hardly agree (correlation {found.correlation:.2f}): {seen}"
-    return ReliefTest(relief, found.correlation, found.size, text)
+        text = f"errors of neighbours hardly agree (correlation {left.correlation:.2f}): {seen}"
+    return ReliefTest(relief, left.correlation, left.size, text)
 
 
 EXACTNESS = 0.1

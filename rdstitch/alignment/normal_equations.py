@@ -41,10 +41,10 @@ class PoseBlocks:
         entries, place = np.unique(
             np.concatenate([across[kept] * total + down[kept], of_diagonal]), return_inverse=True
         )
-        own, diagonal = np.split(place.reshape(-1), [int(kept.sum())])
+        places, diagonal = np.split(place.reshape(-1), [int(kept.sum())])
         indptr = np.searchsorted(entries, np.arange(total + 1) * total)
         indices = entries % max(total, 1)
-        return cls(column, total, kept, own, indices.astype(np.int32), indptr.astype(np.int32), diagonal)
+        return cls(column, total, kept, places, indices.astype(np.int32), indptr.astype(np.int32), diagonal)
 
     def entries(self, local: FloatArray) -> FloatArray:
         """Entries of the matrix (E,) that is the sum of blocks (L, 2 D, 2 D)."""

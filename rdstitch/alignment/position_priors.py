@@ -39,20 +39,20 @@ def hold_positions(problem: Problem, fit: Fit) -> tuple[Problem, Fit, str]:
     known = np.isfinite(metres)
     if not isinstance(fit.model, PlanarModel) or known.sum() < _MIN_POSITIONS or _spread(metres[known]) < _MIN_SPREAD:
         return problem, fit, ""
-    held, found = problem, fit
+    held, refined = problem, fit
     for _ in range(_ROUNDS):
-        here = _places(found)
-        there, precision = _prior(metres, here, known)
-        priors = replace(problem.camera_priors, places=there, places_precision=precision)
+        here = _places(refined)
+        target, precision = _prior(metres, here, known)
+        priors = replace(problem.camera_priors, places=target, places_precision=precision)
         held = replace(problem, camera_priors=priors)
-        found = held.refine(fit.model, found.adjusted.parameters, fit.tilt_spread or None)
-        if np.abs(_places(found) - here).max() ** 2 * precision.max() < _SETTLED**2:
+        refined = held.refine(fit.model, refined.adjusted.parameters, fit.tilt_spread or None)
+        if np.abs(_places(refined) - here).max() ** 2 * precision.max() < _SETTLED**2:
             break
-    there, precision = _prior(metres, _places(found), known)
-    off = np.abs(_places(found) - there @ np.array([1.0, 1.0j]))[known] * math.sqrt(precision.max())
-    growth = math.hypot(found.adjusted.sigma, EXACTNESS) / math.hypot(fit.adjusted.sigma, EXACTNESS)
+    target, precision = _prior(metres, _places(refined), known)
+    off = np.abs(_places(refined) - target @ np.array([1.0, 1.0j]))[known] * math.sqrt(precision.max())
+    growth = math.hypot(refined.adjusted.sigma, EXACTNESS) / math.hypot(fit.adjusted.sigma, EXACTNESS)
     if growth <= _MAX_GROWTH and np.median(off) <= OUTLYING:
-        return held, found, ""
+        return held, refined, ""
     why = (
         f"they are {POSITION_STD * np.median(off):.0f} m off in the median"
         if np.median(off) > OUTLYING
@@ -79,7 +79,7 @@ def _prior(
     """Where the positions say that the cameras are (N, 2), and how surely, as inverse variances (N,)."""
     fit = fit_similarity(here[known], metres[known], POSITION_STD)
     scale = fit.scale or 1e-300
-    there, precision = np.zeros((len(metres), 2)), np.zeros(len(metres))
-    there[known] = ((metres[known] - fit.origin) / scale).view(np.float64).reshape(-1, 2)
+    target, precision = np.zeros((len(metres), 2)), np.zeros(len(metres))
+    target[known] = ((metres[known] - fit.origin) / scale).view(np.float64).reshape(-1, 2)
     precision[known] = fit.weights * (abs(scale) / POSITION_STD) ** 2
-    return there, precision
+    return target, precision

@@ -115,8 +115,8 @@ class Parallax:
         away = (place - feet[images]) / heights[images, None]
         ends = []
         for step in (_STEP, -_STEP):
-            there = np.column_stack([place + step * self.size * away, np.ones(len(place))])
-            ends.append(distort(project(np.einsum("mij,mj->mi", matrices, there)), distortion, higher))
+            lifted = np.column_stack([place + step * self.size * away, np.ones(len(place))])
+            ends.append(distort(project(np.einsum("mij,mj->mi", matrices, lifted)), distortion, higher))
         moved: FloatArray = (ends[0] - ends[1]) / (2.0 * _STEP)
         return moved
 
@@ -154,12 +154,12 @@ class ReliefField:
         common.
         """
         count = len(self.response.normal.gradient_shared)
-        found, std = self._agreement()
-        if not len(found) or found[0] <= 0.0:
+        agreement, std = self._agreement()
+        if not len(agreement) or agreement[0] <= 0.0:
             return np.zeros((count, count))
         step = _WAVES // _BANDS
         answers = [self._answers(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
-        power = _spectrum(np.stack([left for left, _ in answers], axis=1), found, std)
+        power = _spectrum(np.stack([left for left, _ in answers], axis=1), agreement, std)
         covariance: FloatArray = np.einsum("b,bst->st", power, np.stack([moved for _, moved in answers]))
         return covariance
 
@@ -174,14 +174,14 @@ class ReliefField:
         errors = np.concatenate([part.errors for part in self.response.parts()])
         power = float((errors[np.unique(np.concatenate(pairs[0]))] ** 2).mean())
         independent = power * self._answers(_independent, _NOISE_FIELDS)[0]
-        found, std = np.empty(len(pairs)), np.empty(len(pairs))
+        agreement, std = np.empty(len(pairs)), np.empty(len(pairs))
         for k, (first, second) in enumerate(pairs):
             products = np.einsum("mi,mi->m", errors[first], errors[second])
             mean = float(products.mean())
             # Errors of a link depend on each other.
             by_link = np.bincount(o.link[first], products - mean, len(o))
-            found[k], std[k] = mean - independent[k], np.sqrt((by_link**2).sum()) / len(first)
-        return found, std
+            agreement[k], std[k] = mean - independent[k], np.sqrt((by_link**2).sum()) / len(first)
+        return agreement, std
 
     def _answers(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray]:
         """Agreement (D,) at each distance, px², that fields leave, and products (S, S) of the steps of the shared
@@ -192,8 +192,8 @@ class ReliefField:
         for part in self.response.parts():
             left = fields(part) + self.response.changes(part, poses, shared)
             for k, (first, second) in enumerate(self._pairs):
-                own = slice(*np.searchsorted(first, [part.rows.start, part.rows.stop]).tolist())
-                a, b = (left[rows[own] - part.rows.start] for rows in (first, second))
+                chosen = slice(*np.searchsorted(first, [part.rows.start, part.rows.stop]).tolist())
+                a, b = (left[rows[chosen] - part.rows.start] for rows in (first, second))
                 agreement[k] += float(np.einsum("mic,mic->", a, b)) / (len(first) * columns)
         return agreement, shared @ shared.T / columns
 
@@ -227,27 +227,27 @@ class ReliefField:
             return []
         first, second = apart(o, inliers)
         distance = np.linalg.norm(o.points1[first] - o.points1[second], axis=1)
-        found = [(nearest[0], nearest[1])]
+        result = [(nearest[0], nearest[1])]
         for low, high in pairwise(_DISTANCES):
             chosen = (low <= distance) & (distance < high)
             if chosen.sum() >= _FEWEST:
-                found.append((first[chosen], second[chosen]))
-        return found
+                result.append((first[chosen], second[chosen]))
+        return result
 
 
-def _spectrum(left: FloatArray, found: FloatArray, std: FloatArray) -> FloatArray:
+def _spectrum(left: FloatArray, agreement: FloatArray, std: FloatArray) -> FloatArray:
     """Mean squares (B,) of the heights of the bands of waves, in those of waves that are equally steep.
 
     By the agreement at each distance that each band leaves (D, B), what was found (D,), and its standard deviation.
     """
-    steep = found[0] / float(left[0].mean()) if left[0].mean() > 0.0 else 0.0
+    steep = agreement[0] / float(left[0].mean()) if left[0].mean() > 0.0 else 0.0
     if steep <= 0.0:
         return np.zeros(left.shape[1])
     bands = left.shape[1]
     weight = 1.0 / np.maximum(std, 1e-12)
     # What the errors do not show is as of equally steep waves: an octave may have next to nothing or twice as much.
     equations = np.concatenate([left * (steep / bands) * weight[:, None], np.eye(bands)])
-    power = _nonnegative_solution(equations, np.concatenate([found * weight, np.ones(bands)]))
+    power = _nonnegative_solution(equations, np.concatenate([agreement * weight, np.ones(bands)]))
     scaled: FloatArray = power * (steep / bands)
     return scaled
 

@@ -135,16 +135,16 @@ class Posterior:
     def of(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
         errors = whitened_errors(self.problem.observations, fit.adjusted.homographies, fit.adjusted.parameters.lens)
-        found = self.evidence.cost(errors)
+        errors_cost = self.evidence.cost(errors)
         wide = 0.0
         if fit.tilt_spread > 0.0:
             wide = 4.0 * self.problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
         priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
-        score = found.cost + self.price(fit.model, fit.free_lens, found.count) + wide + priors
+        score = errors_cost.cost + self.price(fit.model, fit.free_lens, errors_cost.count) + wide + priors
         if fit.model.on_sphere != self.prefer_turn:
             score += _PREFERENCE
         absurd = self.layout_matters and not stretch(fit) <= MAX_STRETCH
-        return Hypothesis(fit, score if has_plausible_focal(fit) else math.inf, found.field, absurd)
+        return Hypothesis(fit, score if has_plausible_focal(fit) else math.inf, errors_cost.field, absurd)
 
     def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""

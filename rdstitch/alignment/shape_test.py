@@ -275,8 +275,8 @@ class _Answers:
             """How the errors change (m, 2, E)."""
             changes = np.zeros((*part.errors.shape, count))
             for by, points, images in ((part.by_point1, o.points1, o.image1), (part.by_point2, o.points2, o.image2)):
-                own = points[part.rows], images[link[part.rows]]
-                changes += by @ np.nan_to_num(np.stack([each.displacement(*own) for each in effects], axis=2))
+                measured = points[part.rows], images[link[part.rows]]
+                changes += by @ np.nan_to_num(np.stack([each.displacement(*measured) for each in effects], axis=2))
             return changes
 
         poses, shared = response.steps_of(fields, count)
@@ -348,7 +348,11 @@ def _displacements(answers: _Answers, fit: Fit, count: int, cameras: Sequence[Ca
         moved = parameters.retract(fit.model, poses, answers.shared[:, column] * size, free.lens)
         columns.append((ground(measured, moved) - here) / size)
     flat = (here - np.nanmean(here, axis=0)) / max(float(np.nanstd(here)), 1e-12)
-    frame = [np.outer(own, unit).reshape(-1, 2) for own in (np.ones(len(flat)), *flat.T) for unit in np.eye(2)]
+    frame = [
+        np.outer(axis_values, unit).reshape(-1, 2)
+        for axis_values in (np.ones(len(flat)), *flat.T)
+        for unit in np.eye(2)
+    ]
     frame += [flat * flat[:, [axis]] for axis in (0, 1)]
     by_point = [(ground(points + step) - ground(points - step)) / (2.0 * _STEP) for step in _STEP * np.eye(2)]
     on_plane = np.stack([*columns, *frame], axis=2)
@@ -366,7 +370,9 @@ def _cause(effects: Sequence[Effect], sizes: FloatArray, covariance: FloatArray)
     causes = [effect.cause for effect in effects]
 
     def significance(cause: str) -> float:
-        own = [k for k, each in enumerate(causes) if each == cause]
-        return float(sizes[own] @ np.linalg.solve(covariance[np.ix_(own, own)], sizes[own])) / len(own)
+        indices = [k for k, each in enumerate(causes) if each == cause]
+        return float(sizes[indices] @ np.linalg.solve(covariance[np.ix_(indices, indices)], sizes[indices])) / len(
+            indices
+        )
 
     return max(dict.fromkeys(causes), key=significance)

@@ -101,16 +101,16 @@ class Trajectory:
         if poses.covariance is None or poses.with_first is None:
             return path
         one, both = poses.covariance[frame], poses.with_first[frame]
-        own = np.diag([unit, unit, unit, 1.0])
-        own[:2, :2] = unit * np.array([[c, -s], [s, c]])
+        change = np.diag([unit, unit, unit, 1.0])
+        change[:2, :2] = unit * np.array([[c, -s], [s, c]])
         # The first frame moves all others: by its place, by its height, which is the unit, and by its yaw.
-        first_moves = np.tile(-own, (len(frame), 1, 1))
+        first_moves = np.tile(-change, (len(frame), 1, 1))
         first_moves[:, :2, 2] = -path.position / poses.height[first]
         first_moves[:, 2, 2] = -path.height / poses.height[first]
         first_moves[:, :2, 3] = np.stack([-path.position[:, 1], path.position[:, 0]], axis=1)
-        mixed = own @ both @ first_moves.transpose(0, 2, 1)
+        mixed = change @ both @ first_moves.transpose(0, 2, 1)
         moved = first_moves @ one[0] @ first_moves.transpose(0, 2, 1)
-        return replace(path, covariance=own @ one @ own.T + mixed + mixed.transpose(0, 2, 1) + moved)
+        return replace(path, covariance=change @ one @ change.T + mixed + mixed.transpose(0, 2, 1) + moved)
 
     @classmethod
     def on_map(cls, poses: PlanarPoses, to_map: FloatArray) -> Self:

@@ -45,10 +45,10 @@ def sandwich_covariance(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResu
     errors = 2 * int((response.weight > 0.0).sum())
     absorbed = errors / max(errors - count, 0.25 * errors)
     noise = absorbed * _by_keypoints(observations, influence)
-    found = _at_least(priors + noise + _by_relief(adjuster, adjusted), by_images)
+    correlated = _at_least(priors + noise + _by_relief(adjuster, adjusted), by_images)
     derivative = adjuster.named_parameters(adjusted.parameters.shared)[1]
     independent = replace(adjuster, overdispersion=1.0).covariance(adjusted)
-    return _at_least(independent, derivative @ found @ derivative.T)
+    return _at_least(independent, derivative @ correlated @ derivative.T)
 
 
 def _by_relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> FloatArray:
@@ -100,8 +100,8 @@ def _at_least(covariance: FloatArray, least: FloatArray) -> FloatArray:
 def _by_keypoints(observations: Observations, influence: FloatArray) -> FloatArray:
     """Covariance (S, S) when errors of correspondences that share a keypoint agree, by the influence (M, S) of each."""
     images = np.concatenate([observations.image1, observations.image2])
-    own = influence.T @ influence
-    shared = -own  # each correspondence is among those of two keypoints
+    independent = influence.T @ influence
+    shared = -independent  # each correspondence is among those of two keypoints
     # One image after the other: all keypoints at once would be most of the memory of an alignment.
     for ends in np.split(np.argsort(images, kind="stable"), np.cumsum(np.bincount(images))[:-1]):
         sides, links = np.divmod(ends, len(observations))
@@ -117,7 +117,7 @@ def _by_keypoints(observations: Observations, influence: FloatArray) -> FloatArr
         sums = np.zeros((len(keypoint), influence.shape[1]))
         np.add.at(sums, keypoint, influence[np.concatenate(rows)])
         shared = shared + sums.T @ sums
-    return _at_least(own, shared)
+    return _at_least(independent, shared)
 
 
 def _by_images(observations: Observations, influence: FloatArray) -> FloatArray:
@@ -216,16 +216,16 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
 
     def block(one: int, other: int, poses: FloatArray, columns: dict[int, int]) -> FloatArray:
         """Covariance (D + S, D + S) of two images' parameters, by the columns of the inverse that are the other's."""
-        found = np.zeros((size + shared, size + shared))
-        found[size:, size:] = of_shared
+        covariance = np.zeros((size + shared, size + shared))
+        covariance[size:, size:] = of_shared
         rows, across = free[one], free[other]
-        found[: len(rows), size:][rows] = by_shared[row[one][rows]]
-        found[size:, :size][:, across] = by_shared[row[other][across]].T
+        covariance[: len(rows), size:][rows] = by_shared[row[one][rows]]
+        covariance[size:, :size][:, across] = by_shared[row[other][across]].T
         inner = poses[row[one][rows]][:, [columns[k] for k in row[other][across].tolist()]]
-        found[:size, :size][np.ix_(rows, across)] = inner
-        return found
+        covariance[:size, :size][np.ix_(rows, across)] = inner
+        return covariance
 
-    own, with_first = np.empty((2, count, 4, 4))
+    of_images, with_first = np.empty((2, count, 4, 4))
     step = max(1, _COLUMNS // size)
     for start in range(0, count, step):
         images = range(start, min(start + step, count))
@@ -235,9 +235,9 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
         poses = normal.responses(gradient, np.zeros((shared, len(wanted))))[0]
         columns = {int(k): place for place, k in enumerate(wanted)}
         for k in images:
-            own[k] = jacobian[k] @ block(k, k, poses, columns) @ jacobian[k].T
+            of_images[k] = jacobian[k] @ block(k, k, poses, columns) @ jacobian[k].T
             with_first[k] = (jacobian[0] @ block(0, k, poses, columns) @ jacobian[k].T).T
-    return own, with_first
+    return of_images, with_first
 
 
 def _jacobian(model: PlanarModel, poses: FloatArray, shared: FloatArray, reference: int, size: int) -> FloatArray:

@@ -136,7 +136,7 @@ def _choose(
         tried.append(fit_fields(fitted, images, Stiffness(cells, slope), tried[-1] if tried else None))
     stiffest, *freer = [(fields, HeldOut.of(fields.explain(held_out)[0])) for fields in reversed(tried)]
     best, after = stiffest
-    for fields, found in freer:
-        if found.median < (1.0 - _BETTER) * after.median:
-            best, after = fields, found
+    for fields, residuals in freer:
+        if residuals.median < (1.0 - _BETTER) * after.median:
+            best, after = fields, residuals
     return best, HeldOut.of(held_out.residual), after

@@ -73,8 +73,8 @@ class PlacedFields:
             points = node_points(size, shape)
             with np.errstate(invalid="ignore"):
                 shown = self.images.from_surface(k, self.images.to_surface(k, points) + values)
-            found = np.where(np.isfinite(shown), shown - points, 0.0).reshape(*shape, 2)
-            field = DisplacementField.of(size, found)
+            displaced = np.where(np.isfinite(shown), shown - points, 0.0).reshape(*shape, 2)
+            field = DisplacementField.of(size, displaced)
             if field.steepest > _MAX_GRADIENT:
                 field = DisplacementField.of(size, field.values * (_MAX_GRADIENT / field.steepest))
             done.append(field)
@@ -135,8 +135,8 @@ def _expected(
     moved = (sides @ values).reshape(matches.places.shape) * _SIGNS[:, None]
     places, expected = (matches.places - moved).reshape(2 * len(matches), -1), matches.points.reshape(-1, 2).copy()
     for k, chosen in matches.of_image:
-        found = images.from_surface(k, places[chosen])
-        expected[chosen] = np.where(np.isfinite(found), found, expected[chosen])
+        shown = images.from_surface(k, places[chosen])
+        expected[chosen] = np.where(np.isfinite(shown), shown, expected[chosen])
     return expected
 
 

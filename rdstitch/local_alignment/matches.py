@@ -106,12 +106,12 @@ class PlacedMatches:
         """For each match the nearest other one of the same pair of images; itself where there is none."""
         new_pair = (self.images[1:] != self.images[:-1]).any(axis=1)
         first = np.concatenate([[0], np.flatnonzero(new_pair) + 1, [len(self)]])
-        found = np.empty(len(self), dtype=np.intp)
+        nearest_other = np.empty(len(self), dtype=np.intp)
         for start, stop in pairwise(first.tolist()):
             points = self.points[start:stop, 0]
             nearest = np.asarray(spatial.cKDTree(points).query(points, k=2)[1])[:, 1]
-            found[start:stop] = start + np.minimum(nearest, len(points) - 1)
-        return found
+            nearest_other[start:stop] = start + np.minimum(nearest, len(points) - 1)
+        return nearest_other
 
     @cached_property
     def noise(self) -> float:

@@ -92,8 +92,8 @@ class PlanarModel(MotionModel):
 
     def _tilts(self, poses: FloatArray, shared: FloatArray) -> FloatArray:
         """How the tilts of the images differ from the shared one (N, 2), radians."""
-        own: FloatArray = poses[:, [PSI, THETA]] * (np.exp(shared[2]) if self.free_tilts else 1.0)
-        return own
+        tilts: FloatArray = poses[:, [PSI, THETA]] * (np.exp(shared[2]) if self.free_tilts else 1.0)
+        return tilts
 
     def _tilted(self, tilts: FloatArray, shared: FloatArray) -> FloatArray:
         """Poses (N, 6) at the origin with tilts (N, 2) that differ by so much from the shared one, radians."""
