@@ -17,7 +17,6 @@ from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.process_memory import return_freed_memory
-from rdstitch.stage.flat_field import estimate_illumination
 
 
 def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
@@ -83,6 +82,9 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         field = read_flat_field(wanted, sources[0].camera.image_size, channels)
         return [replace(source, flat_field=field) for source in sources], []
+    # Imported late: images that are no tiles have no use for it.
+    from rdstitch.stage.flat_field import estimate_illumination
+
     shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
     if shown.field is None:
         text = f"{len(sources)} tiles show no illumination that they have in common, and samples stay as they are"

@@ -1,40 +1,292 @@
-"""Reading a sidecar: a registration that was found before, checked field by field."""
+"""Reading a sidecar: its fields with their types, by which they are checked, and the registration that they make.
+
+docs/formats.md describes the fields. Fields may be added; a change that would mislead a reader raises the version. What
+earlier versions did not have has a default.
+"""
 
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
+from msgspec import Meta, Struct, field
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.camera import Camera, CameraRecord, FocalSource, LensRecord
 from rdstitch.compositing import CompositeOptions
+from rdstitch.compositing.projection import ProjectionName
 from rdstitch.crs import Crs
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.georeference import Georeference, Residual
 from rdstitch.file_access import read_text
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.outputs import Fingerprint, fingerprint, tiles_folder
+from rdstitch.records import Count, Matrix, NonNegative, Pair, Size, Triple, check_invertible, convert, parse_json
 from rdstitch.sidecar.write import VERSION
 
-if TYPE_CHECKING:
-    from rdstitch.sidecar.schema import ImageRecord, OutputRecord
+Lens = Literal["division", "division-center", "division2", "division3"]
+Model = Literal["rigid", "similarity", "tilting", "pose", "homography", "rotation"]
+_Row = tuple[float, float, float, float]
+_Positive = Annotated[float, Meta(gt=0.0)]
+_FileName = Annotated[str, Meta(pattern=r"^[^/\\]+$", description="in the folder of the sidecar")]
+_Digest = Annotated[
+    str,
+    Meta(description="SHA-256 of the file; of a Deep Zoom image that of the list of its files, as sha256sum has it"),
+]
 
 
-@dataclass(frozen=True)
-class SavedImage:
-    """One image of a saved registration."""
+class ResidualRecord(Struct):
+    """How far east and north of a position, of an image or a control point, the output has it."""
 
-    name: str  # name, path: as they were then
+    name: str
+    east_m: float | None
+    north_m: float | None
+    used: bool
+
+
+class GeoreferenceRecord(Struct, kw_only=True):
+    """Where the output lies on the Earth; or only the reason why that is not known."""
+
+    reason: str | None = None
+    crs: Annotated[str, Meta(pattern="^EPSG:[0-9]+$")] | None = None
+    gsd_m: _Positive | None = None
+    pixel_to_map: tuple[Triple, Triple] | None = None
+    north_up: bool | None = None
+    source: Literal["GPS positions", "ground control points"] = "GPS positions"
+    positions: Count = 0
+    positions_used: Count = 0
+    rms_m: NonNegative = 0.0
+    residuals: list[ResidualRecord] = []
+
+    def __post_init__(self) -> None:
+        if self.crs is not None and (self.pixel_to_map is None or not any(self.pixel_to_map[0][:2])):
+            raise ValueError("expected a similarity as pixel_to_map")
+
+
+class OutputRecord(Struct, kw_only=True):
+    """The image that the sidecar belongs to."""
+
+    file: _FileName | None = None
+    bytes: Count | None = None
+    sha256: _Digest | None = None
+    size: Size | None = None
+    plane_to_output: Matrix | None = None
+    projection: ProjectionName | None = None
+    orientation: Matrix | None = None
+    wraps_around: bool = False
+    field_of_view_deg: Pair | None = None
+    center_deg: Pair | None = None
+    georeference: GeoreferenceRecord | None = None
+
+    def __post_init__(self) -> None:
+        if self.plane_to_output is not None:
+            check_invertible(self.plane_to_output, "plane_to_output")
+        if self.orientation is not None:
+            check_invertible(self.orientation, "orientation")
+
+
+class HeldOut(Struct):
+    """Residuals of matches that took no part in the fit, px."""
+
+    median: NonNegative
+    percentile95: NonNegative
+
+
+class BeforeAfter(Struct):
+    """The same without and with local alignment."""
+
+    before: HeldOut | None
+    after: HeldOut | None
+
+
+class LocalAlignmentRecord(Struct):
+    """What local alignment found; the displacements are with the images."""
+
+    used: bool
+    reason: str
+    cells: Annotated[int, Meta(ge=0, description="of the grid, along the longer side of an image")]
+    held_out_px: BeforeAfter
+
+
+class Displacement(Struct):
+    """What local alignment adds to the pixels of an image, on a grid from its first to its last pixel."""
+
+    grid: Annotated[tuple[Annotated[int, Meta(ge=2)], Annotated[int, Meta(ge=2)]], Meta(description="columns and rows")]
+    px: Annotated[list[Pair], Meta(description="x and y at every node, row by row")]
+
+    def __post_init__(self) -> None:
+        if len(self.px) != self.grid[0] * self.grid[1]:
+            raise ValueError(f"expected {self.grid[0] * self.grid[1]} displacements, not {len(self.px)}")
+
+
+class PoseRecord(Struct):
+    """Where the camera was, in heights of the reference image."""
+
+    x: float
+    y: float
+    height: _Positive
+    yaw_deg: float
+    tilt_deg: Pair
+    covariance: Annotated[
+        tuple[_Row, _Row, _Row, _Row] | None, Meta(description="of x, y, height and yaw, heights and radians")
+    ] = None
+
+
+class ImageRecord(LensRecord, kw_only=True):
+    """One image; one that could not be read has no size."""
+
+    name: str
     path: str
-    camera: Camera | None  # with everything that was estimated; None where the image could not be read
-    # (3, 3): from undistorted coordinates, in half diagonals from the distortion centre, to the plane; None where the
-    # image was left out
-    to_plane: FloatArray | None
-    reason: str  # why it was left out; empty where it was used
-    # what local alignment found; None where the image was not aligned locally
-    displacement: DisplacementField | None = None
+    size: Size | None
+    used: bool
+    reason: str
+    features: Count | None = None
+    to_plane: Matrix | None = None
+    to_output: Matrix | None = None
+    displacement: Displacement | None = None
+    pose: PoseRecord | None = None
+
+    def __post_init__(self) -> None:
+        if self.size is not None:
+            self.lens(self.size)
+        if self.used and (self.size is None or self.to_plane is None):
+            raise ValueError(f"is used, and needs {'size' if self.size is None else 'to_plane'}")
+        if self.to_plane is not None:
+            check_invertible(self.to_plane, "to_plane")
+        if not self.used:
+            self.to_plane = None
+
+    @property
+    def camera(self) -> Camera | None:
+        """With everything that was estimated; None where the image could not be read."""
+        return None if self.size is None else self.lens(self.size)
+
+    def displacement_field(self) -> DisplacementField | None:
+        """Give what local alignment found; None where the image was not aligned locally."""
+        if self.displacement is None or self.size is None or not self.used:
+            return None
+        columns, rows = self.displacement.grid
+        return DisplacementField(self.size, np.array(self.displacement.px, dtype=np.float64).reshape(rows, columns, 2))
+
+
+class PairRecord(Struct, kw_only=True):
+    """One pair of images that was looked at."""
+
+    images: tuple[str, str]
+    matches: Count
+    inliers: Count
+    rms_px: float | None
+    lambda_: float | None = field(name="lambda")
+    lambda_std: float | None
+    model: Model | None
+    homography: Matrix | None
+    solver: str | None
+    iterations: Count
+    ok: bool
+    reason: str
+    used: bool
+    dropped: str
+    inliers_of_whole: Count | None
+    rms_of_whole_px: float | None
+
+
+class ReliefRecord(Struct):
+    """Whether the scene is the plane that it is taken for."""
+
+    found: bool
+    coherence: float | None
+    size: float | None
+    explanation: str
+
+
+class VerdictRecord(Struct):
+    """Whether the result can be relied on."""
+
+    ok: bool
+    failures: list[str] = []
+    warnings: list[str] = []
+    relief: ReliefRecord | None = None
+
+
+class OptionsRecord(Struct):
+    """What the image was made with; those of compositing are read by their own rules."""
+
+    composite: dict[str, Any]
+
+
+class TileRecord(Struct):
+    """Where a tile on a stage is in its row and column, and what placed it."""
+
+    name: str
+    row: Count
+    column: Count
+    placed_by: Literal["overlap", "stage"]
+
+
+class StageRecord(Struct):
+    """What a stage does: the matrix from its pixels to the camera's, and what its lines are off, px."""
+
+    source: str
+    pixel_um: _Positive | None
+    matrix: tuple[Pair, Pair]
+    rows_px: list[Pair]
+    columns_px: list[Pair]
+    row_std_px: NonNegative
+    column_std_px: NonNegative
+    tile_std_px: NonNegative
+    tiles: list[TileRecord]
+
+
+class Applied(Struct):
+    """Only in the sidecar of ``apply``: what was applied, and how images found their places."""
+
+    sidecar: str
+    matched: Literal["name", "order"]
+
+
+class SidecarRecord(Struct, kw_only=True):
+    """What ``rdstitch pano``, ``mosaic`` and ``apply`` write beside an image."""
+
+    format: Literal["rdstitch sidecar"]
+    version: Annotated[int, Meta(ge=1, le=VERSION)]
+    lambda_: Annotated[float, Meta(description="of the division model for half the image diagonal")] = field(
+        name="lambda"
+    )
+    lambda_std: Annotated[float, Meta(ge=0.0, description="0 where λ was given, null where it cannot be seen")] | None
+    lambda_px: float
+    lambda_focal: float | None
+    lambda_known: bool
+    lens: Lens | None = None
+    lens_reason: str = ""
+    camera: CameraRecord
+    tilt_deg: Pair | None
+    focal_px: float | None
+    focal_source: FocalSource | None
+    model: Model
+    model_reason: str
+    rms_px: NonNegative | None
+    reference: str
+    output: OutputRecord
+    local_alignment: LocalAlignmentRecord | None = None
+    stage: StageRecord | None = None
+    images: Annotated[list[ImageRecord], Meta(min_length=1)]
+    pairs: list[PairRecord]
+    verdict: VerdictRecord
+    options: OptionsRecord
+    seed: Count
+    versions: dict[str, str]
+    applied: Applied | None = None
+
+    def __post_init__(self) -> None:
+        if not any(image.name == self.reference and image.used for image in self.images):
+            raise ValueError(f"reference: there is no used image {self.reference!r}")
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON Schema of sidecars of this version."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(SidecarRecord)}
 
 
 @dataclass(frozen=True)
@@ -42,7 +294,7 @@ class SavedRegistration:
     """A registration as its sidecar tells it."""
 
     path: Path  # of the sidecar
-    images: tuple[SavedImage, ...]
+    images: tuple[ImageRecord, ...]
     reference: int  # the image whose resolution the output has
     distortion: float  # λ in the half-diagonal frame
     turned: bool  # whether the camera turned on the spot, so that ``to_plane`` leads to directions
@@ -54,10 +306,6 @@ class SavedRegistration:
 
 def read_sidecar(path: str | Path) -> SavedRegistration:
     """Read a sidecar; every field that is there is checked."""
-    # Imported late: no other command should wait for it.
-    from rdstitch.records import convert, parse_json
-    from rdstitch.sidecar.schema import SidecarRecord
-
     content = parse_json(read_text(path), str(path))
     if isinstance(content, dict) and isinstance(version := content.get("version"), int) and version > VERSION:
         raise InputError(f"{path}: version: this rdstitch reads versions 1 to {VERSION} of sidecars, not {version}")
@@ -69,7 +317,6 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
     turned = record.model == "rotation"
     if composite.projection == "auto" and turned:
         composite = replace(composite, projection=record.output.projection or "auto")
-    images = tuple(map(_image, record.images))
     reference = next(k for k, image in enumerate(record.images) if image.name == record.reference and image.used)
     try:
         place = _place(record.output)
@@ -78,7 +325,7 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
     matrix = record.output.orientation
     orientation = None if matrix is None else np.array(matrix, dtype=np.float64)
     return SavedRegistration(
-        Path(path), images, reference, record.lambda_, turned, composite, orientation, place, content
+        Path(path), tuple(record.images), reference, record.lambda_, turned, composite, orientation, place, content
     )
 
 
@@ -96,7 +343,7 @@ def mismatch_with_image(saved: SavedRegistration) -> str:
     return "" if same else f"{image}: is not the image that {saved.path.name} was written with; one of them is newer"
 
 
-def _place(output: "OutputRecord") -> Georeference | None:
+def _place(output: OutputRecord) -> Georeference | None:
     """Give where the plane lies on the Earth; versions before did not say."""
     record = output.georeference
     if record is None or record.crs is None or record.pixel_to_map is None or output.plane_to_output is None:
@@ -119,14 +366,3 @@ def _place(output: "OutputRecord") -> Georeference | None:
         ),
     )
     return place.after(np.linalg.inv(output.plane_to_output).astype(np.float64))
-
-
-def _image(record: "ImageRecord") -> SavedImage:
-    camera = None if record.size is None else record.lens(record.size)
-    to_plane = np.array(record.to_plane, dtype=np.float64) if record.used else None
-    moved, given = None, record.displacement
-    if given is not None and record.used and camera is not None:
-        columns, rows = given.grid
-        nodes = np.array(given.px, dtype=np.float64).reshape(rows, columns, 2)
-        moved = DisplacementField(camera.image_size, nodes)
-    return SavedImage(record.name, record.path, camera, to_plane, record.reason, moved)

@@ -21,7 +21,7 @@ from rdstitch.features import FeatureOptions
 from rdstitch.options import StitchOptions
 from rdstitch.radial_homography import project
 from rdstitch.records import convert
-from rdstitch.sidecar.schema import json_schema
+from rdstitch.sidecar.read import json_schema
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 
 SIDECAR_SCHEMA = Draft202012Validator(json_schema())

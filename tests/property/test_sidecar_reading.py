@@ -82,7 +82,7 @@ def test_a_good_one_is_read_whole(tmp_path: Path) -> None:
     used, left_out, unread = saved.images
     assert (saved.reference, saved.distortion, saved.composite) == (0, -0.2, StitchOptions().composite)
     assert (used.camera.image_size, used.camera.focal, used.camera.focal_source) == ((400, 300), 380.0, "exif")
-    assert used.to_plane.tolist() == _IMAGE["to_plane"]
+    assert list(map(list, used.to_plane)) == _IMAGE["to_plane"]
     assert (left_out.to_plane, left_out.reason) == (None, "no overlap")
     assert unread.camera is None
 
