@@ -44,14 +44,9 @@ def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) 
     """Samples of 1/``factor`` of the size, (h, w) or (h, w, 3) in RGB order as stored, and what is wrong with the file.
 
     What Pillow would decode, bit for bit, in less time and memory. Pillow has the last word on files about which
-    the decoder has any complaint: it refuses some, and decodes others without a word, whatever comes out.
-
-    Returns
-    -------
-    samples : ndarray or None
-        None where something is not as it should be, or the file has no such reduction or is tiny.
-    complaint : str
-        The decoder's; empty where it has none, or one that says nothing of the pixels.
+    the decoder has any complaint: it refuses some, and decodes others without a word, whatever comes out. Then, and
+    where the file has no such reduction or is tiny, there are no samples; complaints that say nothing of the pixels
+    are empty.
     """
     if min(size) < _MIN_JPEG_SIDE:
         return None, ""
@@ -115,26 +110,27 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
         What :func:`read_metadata` has found in the file, which is not looked for again: of a small JPEG file that takes
         as long as its pixels.
     """
-    file = Path(path)
+    file, factor, damage = Path(path), 1, ""
     check_readable(file)
     with decoding(file):
         with open_regular(file) as stream:
             magic = stream.read(len(PNG_MAGIC))
         if is_raw(file):
-            return reduced(as_image(file, read_raw(file), None, metadata or read_metadata(file)), reduction)
-        if magic[:4] in TIFF_MAGIC:
-            return reduced(as_image(file, *_read_tiff(file), metadata or read_metadata(file)), reduction)
-        with opened_image(file) as opened:
-            metadata = metadata or metadata_of(opened)
-            if magic == PNG_MAGIC and metadata.bit_depth == 16 and opened.mode not in _GREY_16:
-                samples, alpha = _split(_read_16_bit_png(file))
-            else:
-                factor = _decoders_share(opened, metadata, reduction)
-                decoded, damage = _from_jpeg(file, opened, factor)
-                samples, alpha = from_pillow(opened, factor) if decoded is None else (decoded, None)
-                image = replace(as_image(file, samples, alpha, metadata), damage=damage)
-                return reduced(image, reduction // factor)
-        return reduced(as_image(file, samples, alpha, metadata), reduction)
+            samples, alpha = read_raw(file), None
+        elif magic[:4] in TIFF_MAGIC:
+            samples, alpha = _read_tiff(file)
+        else:
+            with opened_image(file) as opened:
+                metadata = metadata or metadata_of(opened)
+                if magic == PNG_MAGIC and metadata.bit_depth == 16 and opened.mode not in _GREY_16:
+                    samples, alpha = _split(_read_16_bit_png(file))
+                else:
+                    factor, decoded = _decoders_share(opened, metadata, reduction), None
+                    if opened.format in _JPEG and opened.mode in ("L", "RGB"):
+                        decoded, damage = decoded_jpeg(file, opened.size, factor, grey=opened.mode == "L")
+                    samples, alpha = from_pillow(opened, factor) if decoded is None else (decoded, None)
+        image = as_image(file, samples, alpha, metadata or read_metadata(file))
+        return reduced(replace(image, damage=damage), reduction // factor)
 
 
 def reduced(image: DecodedImage, factor: int) -> DecodedImage:
@@ -151,13 +147,6 @@ def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> i
     # Blocks begin at the stored image's first pixel; in one that is to be mirrored they must end at its last.
     crosswise = metadata.orientation != 1 and any(n % factor for n in image.size)
     return 1 if image.format not in _JPEG or min(image.size) < factor or crosswise else factor
-
-
-def _from_jpeg(file: Path, image: Image.Image, factor: int) -> tuple[Pixels | None, str]:
-    """Samples of an opened JPEG file in grey or colour, None for others; and what is wrong with it."""
-    if image.format not in _JPEG or image.mode not in ("L", "RGB"):
-        return None, ""
-    return decoded_jpeg(file, image.size, factor, grey=image.mode == "L")
 
 
 def from_pillow(image: Image.Image, factor: int = 1) -> tuple[Pixels, Pixels | None]:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rdstitch.compositing.seam_finder import SeamMap
-from rdstitch.viewer.page import seam_image
+from rdstitch.viewer import seam_image
 from tests.cli.running import CACHED, Run
 
 _ROOT = Path(__file__).parents[2]
