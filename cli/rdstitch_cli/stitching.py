@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from rdstitch.compositing import CompositePlan
     from rdstitch.options import StitchOptions
     from rdstitch.outputs import Outputs
-    from rdstitch.pipeline.result_files import PosesFrame
     from rdstitch.registration import Registration
     from rdstitch.robust import SolverName
     from rdstitch.stitch_result import StitchResult
@@ -116,26 +115,40 @@ def _check_written(read: Iterable[Path | None]) -> None:
             check_not_read([context.params[name]], files)
 
 
-class Report:
-    """The report of a run: the progress that measures its stages, and the file that is written with the image."""
+class FilesBeside:
+    """What is written beside a result: report, layers, project of Hugin, poses; and the stages that a report times."""
 
     def __init__(
-        self, file: Path | None, reporter: Reporter, inputs: Sequence[Path], overwrite: bool, output: Path | None = None
+        self, reporter: Reporter, inputs: Sequence[Path], given: dict[str, Any], output: Path | None = None
     ) -> None:
+        """Take their options out of a command's flags, and find out before long work whether they can be written."""
+        from rdstitch.outputs import check_distinct, check_output
         from rdstitch.progress import StageTimer
 
-        self._file, self._reporter, self.progress = file, reporter, StageTimer(reporter)
-        if file is not None:
-            from rdstitch.outputs import check_distinct, check_output
+        self._reporter, self.progress = reporter, StageTimer(reporter)
+        self._report, self._layers = given.pop("report", None), given.pop("layers", None)
+        self._project, self._poses = given.pop("hugin_project", None), given.pop("poses", None)
+        self._whole_layers, self._frame = given.pop("whole_layers", False), given.pop("frame", "enu")
+        names = [self._project, self._poses, output, None if output is None else f"{output}.json"]
+        if self._report is not None:
             from rdstitch.viewer import viewer_path
 
-            check_output(file, overwrite, inputs, suffixes=(".html", ".htm"))
-            page = None if output is None else viewer_path(output)
-            check_distinct([file] if page is None else [file, page])
+            check_output(self._report, given["overwrite"], inputs, suffixes=(".html", ".htm"))
+            names += [self._report, None if output is None else viewer_path(output)]
+        for file in (self._project, self._poses):
+            if file is not None:
+                check_output(file, given["overwrite"], inputs, suffixes=())
+        check_distinct(name for name in names if name is not None)
+        if self._whole_layers and self._layers is None:
+            raise click.UsageError("--whole-layers goes with --layers DIR")
+        if self._layers is not None:
+            from rdstitch.pipeline.result_files import make_folder
+
+            make_folder(self._layers)
 
     @contextmanager
     def explaining(self) -> Iterator[None]:
-        """Run a recipe; a result that is refused is shown, so that one can see why."""
+        """Run a recipe; a result that is refused is reported, so that one can see why."""
         from rdstitch.verification.verdict import RefusedError
 
         try:
@@ -148,63 +161,30 @@ class Report:
             raise
 
     def stage(self, outputs: "Outputs", result: "StitchResult | Registration") -> None:
-        """Stage the file, if one is wanted, to be published with what else the recipe writes."""
-        if (file := self._file) is None:
-            return
+        """Stage the files that are wanted, to be published with what else the recipe writes."""
+        from rdstitch.outputs import text_bytes
+        from rdstitch.stitch_result import StitchResult
 
-        def write() -> None:
+        def attempt(place: Path, write: Callable[[], object]) -> None:
+            for message in outputs.attempt(place, write):
+                self._reporter.warn(str(message))
+
+        if (report := self._report) is not None:
             from rdstitch.report import write_report
 
-            write_report(file, result, self.progress.stages, shlex.join(["rdstitch", *sys.argv[1:]]), outputs=outputs)
+            command = shlex.join(["rdstitch", *sys.argv[1:]])
+            attempt(report, lambda: write_report(report, result, self.progress.stages, command, outputs=outputs))
+        project, poses, layers = self._project, self._poses, self._layers
+        if isinstance(result, StitchResult) and (project or poses or layers):
+            from rdstitch.pipeline.result_files import poses_table, project_of_hugin, write_layers
 
-        for message in outputs.attempt(file, write):
-            self._reporter.warn(str(message))
-
-
-def staged_beside(
-    report: Report,
-    reporter: Reporter,
-    *,
-    layers: Path | None,
-    whole_layers: bool,
-    hugin_project: Path | None,
-    poses: Path | None = None,
-    frame: "PosesFrame" = "enu",
-) -> Callable[["Outputs", "StitchResult"], None]:
-    """Give what stages report, layers, project and poses, those that are wanted, together with the image."""
-    from rdstitch.outputs import check_distinct, check_output
-
-    given, files = click.get_current_context().params, [file for file in (hugin_project, poses) if file is not None]
-    for file in files:
-        check_output(file, given["overwrite"], given["inputs"], suffixes=())
-    check_distinct([*files, given["output"], f"{given['output']}.json"])
-    if whole_layers and layers is None:
-        raise click.UsageError("--whole-layers goes with --layers DIR")
-    if layers is not None:
-        from rdstitch.pipeline.result_files import make_folder
-
-        make_folder(layers)
-
-    def stage(outputs: "Outputs", result: "StitchResult") -> None:
-        report.stage(outputs, result)
-        if not files and layers is None:
-            return
-        from rdstitch.outputs import text_bytes
-        from rdstitch.pipeline.result_files import poses_table, project_of_hugin, write_layers
-
-        writing: dict[Path, Callable[[], object]] = {}
-        if hugin_project is not None and result.plan is None:
-            writing[hugin_project] = lambda: outputs.write(hugin_project, text_bytes(project_of_hugin(result)))
-        if poses is not None and result.plan is None:
-            writing[poses] = lambda: outputs.write(poses, text_bytes(poses_table(result, frame)))
-        if layers is not None:
-            how: dict[str, Any] = {"whole": whole_layers, "overwrite": result.options.overwrite, "outputs": outputs}
-            writing[layers] = partial(write_layers, result, layers, **how)
-        for place, write in writing.items():
-            for message in outputs.attempt(place, write):
-                reporter.warn(str(message))
-
-    return stage
+            if project is not None and result.plan is None:
+                attempt(project, lambda: outputs.write(project, text_bytes(project_of_hugin(result))))
+            if poses is not None and result.plan is None:
+                attempt(poses, lambda: outputs.write(poses, text_bytes(poses_table(result, self._frame))))
+            if layers is not None:
+                how = {"whole": self._whole_layers, "overwrite": result.options.overwrite, "outputs": outputs}
+                attempt(layers, lambda: write_layers(result, layers, **how))
 
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:

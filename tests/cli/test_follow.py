@@ -152,7 +152,7 @@ def test_a_frame_that_cannot_be_read_has_a_line_with_the_reason(
     lines = [json.loads(line) for line in outcome.out.splitlines()]
     assert [line["name"] for line in lines[:3]] == ["frame_0000.png", "frame_0002.png", "frame_0001.png"]
     assert lines[2]["frame"] == 1
-    assert "no image" in lines[2]["reason"]
+    assert "not an image" in lines[2]["reason"]
     assert lines[2]["x"] is None
 
 

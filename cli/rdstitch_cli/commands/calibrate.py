@@ -6,7 +6,7 @@ from typing import Any
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
 from rdstitch_cli.option_texts import option
-from rdstitch_cli.stitching import Report, report_registration, stitch_options
+from rdstitch_cli.stitching import FilesBeside, report_registration, stitch_options
 from rdstitch_cli.terminal import Reporter
 
 
@@ -29,7 +29,6 @@ def calibrate(
     inputs: tuple[Path, ...],
     output: Path,
     every: int | None,
-    report: Path | None,
     as_json: bool,
     reporter: Reporter,
     **given: Any,
@@ -48,11 +47,11 @@ def calibrate(
     from rdstitch.pipeline.recipes import calibrate as recipe
     from rdstitch.sidecar.write import plain
 
-    wanted = stitch_options(reporter, save_camera=output, **given)
     paths = options.resolve(inputs)
-    report_page = Report(report, reporter, paths, given["overwrite"])
-    with report_page.explaining():
-        registration = recipe(paths, wanted, every=every, progress=report_page.progress, beside=report_page.stage)
+    beside = FilesBeside(reporter, paths, given)
+    wanted = stitch_options(reporter, save_camera=output, **given)
+    with beside.explaining():
+        registration = recipe(paths, wanted, every=every, progress=beside.progress, beside=beside.stage)
     report_registration(registration, reporter, (lambda: plain(registration.camera.as_dict())) if as_json else None)
     for line in (
         *describe_camera(registration.alignment, registration.camera),

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,7 +13,7 @@ from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
 from rdstitch_cli.option_texts import option
 from rdstitch_cli.parameter_types import RealNumber
-from rdstitch_cli.stitching import Report, staged_beside, stitch_options, summarize
+from rdstitch_cli.stitching import FilesBeside, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
@@ -47,12 +47,6 @@ def mosaic(
     following: bool,
     idle: float | None,
     refresh: float,
-    report: Path | None,
-    layers: Path | None,
-    whole_layers: bool,
-    hugin_project: Path | None,
-    poses: Path | None,
-    frame: Literal["enu", "camera", "map"],
     as_json: bool,
     reporter: Reporter,
     **given: Any,
@@ -69,24 +63,16 @@ def mosaic(
     if all_blocks and (following or given["strict"]):
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
     with ExitStack() as stack:
-        stitch = stitch_options(reporter, pose_covariance=poses is not None, **given)
-        named: list[Path] = [] if following else options.resolve(inputs)
+        named = list(inputs) if following else options.resolve(inputs)
+        with_poses = given["poses"] is not None
+        beside = FilesBeside(reporter, named, given, output)
+        stitch = stitch_options(reporter, pose_covariance=with_poses, **given)
         paths: Sequence[Named] = named
-        report_page = Report(report, reporter, named, given["overwrite"], output)
         if following:
             arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle, refresh=refresh)
             paths = stack.enter_context(arrived)
-        beside = staged_beside(
-            report_page,
-            reporter,
-            layers=layers,
-            whole_layers=whole_layers,
-            hugin_project=hugin_project,
-            poses=poses,
-            frame=frame,
-        )
-        how: dict[str, Any] = {"every": every, "progress": report_page.progress, "beside": beside}
-        with report_page.explaining():
+        how: dict[str, Any] = {"every": every, "progress": beside.progress, "beside": beside.stage}
+        with beside.explaining():
             if all_blocks:
                 results = mosaic_blocks(paths, output, stitch, **how)
             else:

@@ -5,7 +5,7 @@ from typing import Any
 
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
-from rdstitch_cli.stitching import Report, staged_beside, stitch_options, summarize
+from rdstitch_cli.stitching import FilesBeside, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
 
 
@@ -25,10 +25,6 @@ def pano(
     inputs: tuple[Path, ...],
     output: Path,
     every: int | None,
-    report: Path | None,
-    layers: Path | None,
-    whole_layers: bool,
-    hugin_project: Path | None,
     as_json: bool,
     reporter: Reporter,
     **given: Any,
@@ -41,17 +37,10 @@ def pano(
     from rdstitch.pipeline.recipes import pano as recipe
 
     paths = options.resolve(inputs)
-    report_page = Report(report, reporter, paths, given["overwrite"], output)
-    beside = staged_beside(report_page, reporter, layers=layers, whole_layers=whole_layers, hugin_project=hugin_project)
-    with report_page.explaining():
-        result = recipe(
-            paths,
-            output,
-            stitch_options(reporter, **given),
-            every=every,
-            progress=report_page.progress,
-            beside=beside,
-        )
+    beside = FilesBeside(reporter, paths, given, output)
+    stitch = stitch_options(reporter, **given)
+    with beside.explaining():
+        result = recipe(paths, output, stitch, every=every, progress=beside.progress, beside=beside.stage)
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:
         reporter.made(result.summary)

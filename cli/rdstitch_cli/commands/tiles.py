@@ -9,7 +9,7 @@ from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
 from rdstitch_cli.option_texts import option
 from rdstitch_cli.parameter_types import RealNumber, WholeNumber
-from rdstitch_cli.stitching import Report, composite_fields, report_registration, summarize
+from rdstitch_cli.stitching import FilesBeside, composite_fields, report_registration, summarize
 from rdstitch_cli.terminal import Reporter
 
 
@@ -50,7 +50,6 @@ def tiles(
     output: Path | None,
     positions_only: Path | None,
     overlap: float,
-    report: Path | None,
     as_json: bool,
     reporter: Reporter,
     **given: Any,
@@ -68,18 +67,20 @@ def tiles(
 
     if output is None and positions_only is None:
         raise click.UsageError("nothing to write: give --output or --positions-only")
+    paths = options.resolve(inputs)
+    beside = FilesBeside(reporter, paths, given, output)
     composite = CompositeOptions(exposure="none", seam="none", **composite_fields(given))
     chosen = TileOptions(overlap=overlap / 100.0, composite=composite, **given)
-    paths = options.resolve(inputs)
-    page = Report(report, reporter, paths, chosen.overwrite, output)
     if output is None:
-        with page.explaining():
-            _, registration = place_tiles(paths, positions_only, chosen, progress=page.progress)
+        with beside.explaining():
+            _, registration = place_tiles(paths, positions_only, chosen, progress=beside.progress)
         report_registration(registration, reporter)
         reporter.made(f"{positions_only}: {registration.summary}")
         return
-    with page.explaining():
-        result = recipe(paths, output, chosen, positions_file=positions_only, progress=page.progress, beside=page.stage)
+    with beside.explaining():
+        result = recipe(
+            paths, output, chosen, positions_file=positions_only, progress=beside.progress, beside=beside.stage
+        )
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:
         reporter.made(result.summary)
