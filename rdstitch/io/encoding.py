@@ -178,7 +178,9 @@ def _jpeg(layout: Layout, samples: NDArray[np.generic], alpha: NDArray[np.uint8]
     else:
         block, image = _BLOCK_COLOUR, np.asarray(cv2.cvtColor(eight, cv2.COLOR_RGB2BGR))
     if alpha is not None and not alpha.all():
-        image = _on_background(image, alpha, layout.background)
+        image = np.asarray(cv2.bitwise_and(image, image, mask=alpha), dtype=np.uint8)
+        if layout.background:
+            image[alpha == 0] = layout.background
     options = [
         *(cv2.IMWRITE_JPEG_QUALITY, layout.quality),
         *(cv2.IMWRITE_JPEG_RST_INTERVAL, -(-layout.size[0] // block)),
@@ -188,14 +190,6 @@ def _jpeg(layout: Layout, samples: NDArray[np.generic], alpha: NDArray[np.uint8]
     if not done:
         raise LimitError(f"{layout.size[0]} x {layout.size[1]} pixels cannot be encoded as JPEG; write a .tif")
     return np.asarray(data, dtype=np.uint8).tobytes()
-
-
-def _on_background(image: NDArray[np.uint8], alpha: NDArray[np.uint8], background: int) -> NDArray[np.uint8]:
-    """An image (h, w) or (h, w, 3), grey where alpha is 0."""
-    shown = cv2.bitwise_and(image, image, mask=alpha)
-    if background:
-        shown[alpha == 0] = background
-    return np.asarray(shown, dtype=np.uint8)
 
 
 def _header_and_scan(data: bytes) -> tuple[bytes, memoryview]:
@@ -224,7 +218,9 @@ def png_pieces(layout: Layout, strips: Iterable[Strip]) -> Iterator[bytes]:
     yield from _metadata_chunks(layout.metadata)
     packer, pixel = zlib.compressobj(_PNG_LEVEL), layout.samples_per_pixel * layout.dtype.itemsize
     for samples, alpha in strips:
-        rows = _bytes_of_rows(with_alpha(samples, alpha) if layout.transparent else samples)
+        shown = with_alpha(samples, alpha) if layout.transparent else samples
+        ordered = np.ascontiguousarray(shown.astype(shown.dtype.newbyteorder(">"), copy=False))
+        rows = ordered.view(np.uint8).reshape(len(shown), -1)
         filtered = np.empty((len(rows), 1 + rows.shape[1]), dtype=np.uint8)
         filtered[:, 0] = _FILTER_SUB
         filtered[:, 1 : 1 + pixel] = rows[:, :pixel]
@@ -233,12 +229,6 @@ def png_pieces(layout: Layout, strips: Iterable[Strip]) -> Iterator[bytes]:
             yield png_chunk(b"IDAT", packed)
     yield png_chunk(b"IDAT", packer.flush())
     yield png_chunk(b"IEND", b"")
-
-
-def _bytes_of_rows(samples: NDArray[Any]) -> NDArray[np.uint8]:
-    """Rows as bytes, big-endian."""
-    ordered = np.ascontiguousarray(samples.astype(samples.dtype.newbyteorder(">"), copy=False))
-    return ordered.view(np.uint8).reshape(len(samples), -1)
 
 
 def _embedded(head: bytes, metadata: Metadata) -> list[bytes]:

@@ -111,7 +111,8 @@ class Metadata:
 
     def in_another_size(self) -> Self:
         """Of the same image at the same scale but cut or extended: of what film it would be that of is not true."""
-        return replace(self, exif=_edited(self.exif, _without_equivalent))
+        film = ExifTags.Base.FocalLengthIn35mmFilm
+        return replace(self, exif=_edited(self.exif, lambda exif: exif.get_ifd(ExifTags.IFD.Exif).pop(film, None)))
 
     def of_composite(self) -> Self:
         """Of an image made from several: no lens, exposure or place of one of them is true of it."""
@@ -333,7 +334,7 @@ def _clean_exif(exif: Image.Exif, width: int) -> bytes:
     return _edited(data, clean)
 
 
-def _edited(data: bytes, edit: Callable[[Image.Exif], None]) -> bytes:
+def _edited(data: bytes, edit: Callable[[Image.Exif], object]) -> bytes:
     """An EXIF block after a change; empty where it cannot be written, or says nothing."""
     exif = Image.Exif()
     try:
@@ -342,10 +343,6 @@ def _edited(data: bytes, edit: Callable[[Image.Exif], None]) -> bytes:
         return exif.tobytes() if len(exif) else b""
     except _UNWRITABLE:
         return b""
-
-
-def _without_equivalent(exif: Image.Exif) -> None:
-    exif.get_ifd(ExifTags.IFD.Exif).pop(ExifTags.Base.FocalLengthIn35mmFilm, None)
 
 
 def _who_and_when(exif: Image.Exif) -> None:

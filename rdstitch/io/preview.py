@@ -13,7 +13,7 @@ from rdstitch.io.read import read_image
 from rdstitch.late_imports import tifffile
 
 _JPEG_QUALITY = 80
-_OVERVIEW_FROM = 60_000_000  # pixels; of larger TIFF files an overview is read
+_OVERVIEW_FROM = 60_000_000  # pixels; of larger TIFF files the smallest overview that is large enough is read
 
 
 def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
@@ -22,7 +22,10 @@ def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[
     if suffix == ".dzi":
         return read_deep_zoom(path, size, side), None
     if size[0] * size[1] > _OVERVIEW_FROM and suffix in (".tif", ".tiff"):
-        return _overview(path, side), None
+        with tifffile.TiffFile(path) as file:
+            levels = file.series[0].levels
+            enough = [level for level in levels if max(level.shape[:2]) >= side]
+            return np.asarray((enough or levels)[-1 if enough else 0].asarray()), None
     if suffix in (".jpg", ".jpeg"):
         # Of any size: none of it is decoded larger than needed.
         with JpegImagePlugin.JpegImageFile(path) as jpeg:
@@ -58,11 +61,3 @@ def _as_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     low, high = np.percentile(values, [0.5, 99.5])
     stretched = (values - low) * (255.0 / max(float(high - low), 1e-12))
     return np.asarray(np.clip(stretched, 0.0, 255.0), dtype=np.uint8)
-
-
-def _overview(path: Path, side: int) -> NDArray[Any]:
-    """The smallest overview of a TIFF file that is large enough."""
-    with tifffile.TiffFile(path) as file:
-        levels = file.series[0].levels
-        enough = [level for level in levels if max(level.shape[:2]) >= side]
-        return np.asarray((enough or levels)[-1 if enough else 0].asarray())

@@ -280,8 +280,10 @@ def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip]) -> None:
             for number, pixels in enumerate(levels):
                 height, width, channels = pixels.shape
                 parts = [pixels[..., k : k + 1] for k in range(channels)] if apart else [pixels]
+                tops = range(0, height, STRIP_ROWS)
+                shown = (np.ascontiguousarray(part[top : top + STRIP_ROWS]) for part in parts for top in tops)
                 tiff.write(
-                    (_encoded_tile(tile) for part in parts for tile in _tiles_of(_rows(part))),
+                    (_encoded_tile(tile) for tile in _tiles_of(shown)),
                     shape=(channels, height, width) if apart else (height, width, channels),
                     dtype=layout.dtype,
                     photometric="minisblack" if apart else "rgb",
@@ -296,11 +298,6 @@ def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip]) -> None:
                     else {"axes": "CYX" if apart else "YXS", "UUID": f"urn:uuid:{identity}", **units, **names},
                     software="rdstitch",
                 )
-
-
-def _rows(level: NDArray[Any]) -> Iterator[NDArray[Any]]:
-    for top in range(0, len(level), STRIP_ROWS):
-        yield np.ascontiguousarray(level[top : top + STRIP_ROWS])
 
 
 def write_cropped_tiff(

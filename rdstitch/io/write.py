@@ -6,7 +6,7 @@ WebP. The same image gives the same bytes either way.
 
 import io
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +56,10 @@ def write_image(
     height, width, channels = samples.shape
     described = metadata or Metadata((width, height))
     layout = Layout((width, height), channels, samples.dtype, alpha is not None, described, quality, background)
+    pieces = (slice(top, top + _ROWS_AT_A_TIME) for top in range(0, height, _ROWS_AT_A_TIME))
+    strips = ((samples[rows], None if alpha is None else alpha[rows]) for rows in pieces)
     with Outputs(overwrite) as outputs:
-        write_strips(path, layout, _strips_of(samples, alpha), outputs=outputs)
+        write_strips(path, layout, strips, outputs=outputs)
 
 
 def write_strips(
@@ -143,13 +145,6 @@ def check_memory(path: str | Path, size: tuple[int, int], max_memory: int | None
             f"{path}: {size[0]} x {size[1]} pixels of WebP need {need / 2**20:.0f} MB, and --max-memory allows "
             f"{max_memory / 2**20:.0f} MB; write a .tif, .png or .jpg, which are written in strips"
         )
-
-
-def _strips_of(samples: NDArray[Any], alpha: NDArray[np.uint8] | None) -> Iterator[Strip]:
-    """An array in strips."""
-    for top in range(0, len(samples), _ROWS_AT_A_TIME):
-        rows = slice(top, top + _ROWS_AT_A_TIME)
-        yield samples[rows], None if alpha is None else alpha[rows]
 
 
 def _webp(layout: Layout, strips: Iterable[Strip]) -> bytes:
