@@ -75,29 +75,22 @@ class PlanarMotion:
         return rotation @ rigid_in_plane(self.yaw, self.translation, self.height) @ rotation.T
 
     @classmethod
-    def from_homography(cls, homography: ArrayLike) -> Self:
-        """The planar motion that a homography describes, or comes close to.
-
-        The plane normal is a left eigenvector, ``H' n = height n``, because the motion keeps the distances from the
-        plane. For φ = 0 and equal heights the eigenvalue is threefold; then ``H - I = -R t n'`` has rank one, and n
-        spans its row space. Of all these candidates the one that reproduces H best is taken.
-        """
+    def from_homography(cls, homography: ArrayLike, normal: FloatArray | None = None) -> Self:
+        """Give the planar motion that a homography (3, 3) comes closest to, for the normal (3,) of its plane if given."""
         h = np.array(homography, dtype=np.float64)
-        return cls._of_row(motions_from_homographies(h[None])[0])
-
-    @classmethod
-    def from_homography_and_normal(cls, h: FloatArray, normal: FloatArray) -> Self:
-        """The motion nearest to a homography (3, 3) for a given plane normal (3,) of any length and sign."""
-        return cls._of_row(motions_from_homographies(h[None], normal[None])[0])
-
-    @classmethod
-    def _of_row(cls, row: FloatArray) -> Self:
+        row = motions_from_homographies(h[None], None if normal is None else normal[None])[0]
         psi, theta, yaw, tx, ty, height = row.tolist()
         return cls((psi, theta), yaw, (tx, ty), height)
 
 
 def motions_from_homographies(homography: FloatArray, normal: FloatArray | None = None) -> FloatArray:
-    """Rows (ψ, θ, φ, tx, ty, height), (B, 6), of planar motions nearest to focal-normalized homographies (B, 3, 3)."""
+    """Rows (ψ, θ, φ, tx, ty, height), (B, 6), of planar motions nearest to focal-normalized homographies (B, 3, 3).
+
+    The plane normal is a left eigenvector, ``H' n = height n``, because the motion keeps the distances from the plane.
+    For φ = 0 and equal heights the eigenvalue is threefold; then ``H - I = -R t n'`` has rank one, and n spans its row
+    space. Of all these candidates the one that reproduces H best is taken; or normals (B, 3) of any length and sign
+    are given.
+    """
     if normal is not None:
         return _motions_for_normals(homography, normal)
     h = homography / np.linalg.norm(homography, axis=(1, 2), keepdims=True)

@@ -112,7 +112,7 @@ def _chained(homographies: FloatArray, tilt: tuple[float, float]) -> Trajectory:
     normal = rotation_from_tilt(tilt)[:, 2]
     yaw, position = [0.0], [np.zeros(2)]
     for h in homographies:
-        motion = PlanarMotion.from_homography_and_normal(h, normal)
+        motion = PlanarMotion.from_homography(h, normal)
         c, s = np.cos(yaw[-1]), np.sin(yaw[-1])
         position.append(position[-1] + np.array([[c, s], [-s, c]]) @ motion.translation)
         yaw.append(yaw[-1] + motion.yaw)

@@ -15,7 +15,7 @@ from rdstitch.compositing import Canvas
 from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
 from rdstitch.export.georeference import Georeference
-from rdstitch.local_alignment import DisplacementField, LocalAlignment
+from rdstitch.local_alignment import DisplacementField
 from rdstitch.outputs import Fingerprint
 from rdstitch.registration import Registration
 from rdstitch.stitch_result import StitchResult
@@ -34,7 +34,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
     to those of the second. All fields are described in docs/formats.md.
     """
     registration, alignment = result.registration, result.registration.alignment
-    camera = registration.camera
+    camera, local = registration.camera, result.local_alignment
     content = {
         "format": "rdstitch sidecar",
         "version": VERSION,
@@ -58,7 +58,13 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
             **output_geometry(result.canvas, turned=alignment.on_sphere),
             "georeference": georeference_fields(result.georeference, result.not_georeferenced),
         },
-        "local_alignment": _local_alignment(result.local_alignment),
+        # The displacements are with their images.
+        "local_alignment": {
+            "used": bool(local.fields),
+            "reason": local.reason,
+            "cells": local.cells,
+            "held_out_px": {"before": local.before, "after": local.after},
+        },
         "stage": _stage(registration),
         "images": _images(result),
         "pairs": _pairs(result),
@@ -151,16 +157,6 @@ def identity_fields(output: Path | None, written: Fingerprint | None) -> dict[st
         "file": None if output is None else output.name,
         "bytes": None if written is None else written.size,
         "sha256": None if written is None else written.sha256,
-    }
-
-
-def _local_alignment(local: LocalAlignment) -> dict[str, Any]:
-    """Give what local alignment found, beside the displacements, which are with their images."""
-    return {
-        "used": bool(local.fields),
-        "reason": local.reason,
-        "cells": local.cells,
-        "held_out_px": {"before": local.before, "after": local.after},
     }
 
 
