@@ -19,21 +19,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a result can be relied on.
+    """Whether a result can be relied on."""
 
-    Attributes
-    ----------
-    ok : bool
-        Whether it passed its own checks.
-    failures : tuple of str
-        Why it did not; empty if ``ok``.
-    warnings : tuple of str
-        What to look at.
-    """
-
-    ok: bool
-    failures: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    ok: bool  # whether it passed its own checks
+    failures: tuple[str, ...] = ()  # why it did not
+    warnings: tuple[str, ...] = ()  # what to look at
 
 
 @dataclass(frozen=True, repr=False)
