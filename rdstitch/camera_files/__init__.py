@@ -19,6 +19,7 @@ What is written follows from the name, as above; what is read is known by its co
 import re
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -149,14 +150,14 @@ def export_note(camera: Camera, path: str | Path) -> tuple[str, ...]:
 
 _WRITERS: dict[str, Callable[[Camera], str]] = {
     "cameras.json": formats.opendronemap_json,
-    "opencv.json": formats.opencv_json,
-    "*.opencv.json": formats.opencv_json,
+    "opencv.json": partial(formats.opencv_text, yaml=False),
+    "*.opencv.json": partial(formats.opencv_text, yaml=False),
     "?*.json": lambda camera: json_bytes(camera.as_dict()).decode(),
     "camera_info.yaml": formats.camera_info_yaml,
     "camchain.yaml": formats.camera_chain_yaml,
-    "fisheye.yaml": formats.opencv_fisheye_yaml,
-    "*.fisheye.yaml": formats.opencv_fisheye_yaml,
-    "?*.yaml": formats.opencv_yaml,
+    "fisheye.yaml": partial(formats.opencv_text, fisheye=True),
+    "*.fisheye.yaml": partial(formats.opencv_text, fisheye=True),
+    "?*.yaml": formats.opencv_text,
     "cameras.txt": formats.colmap_text,
     "?*.pto": hugin_project,
     "?*.xml": lensfun_xml,

@@ -235,24 +235,15 @@ def read_colmap(camera: Sequence[str], file: str) -> CameraFile:
     return fitted_lens(lens, "COLMAP", size)
 
 
-def opencv_json(camera: Camera) -> str:
-    """Write a camera as FileStorage writes JSON: Brown's model, or the rational one where that is closer."""
-    return json.dumps(_opencv(camera, "polynomial", "rational"), indent=4) + "\n"
+def opencv_text(camera: Camera, *, yaml: bool = True, fisheye: bool = False) -> str:
+    """Write a camera as FileStorage writes YAML or JSON, for the functions of ``cv2.fisheye`` or for the usual ones.
 
-
-def opencv_yaml(camera: Camera) -> str:
-    """Write the same as FileStorage writes YAML."""
-    return "%YAML:1.0\n---\n" + _as_yaml(_opencv(camera, "polynomial", "rational"))
-
-
-def opencv_fisheye_yaml(camera: Camera) -> str:
-    """Write a camera for the functions of ``cv2.fisheye``, as FileStorage writes YAML."""
-    return "%YAML:1.0\n---\n" + _as_yaml(_opencv(camera, "fisheye", fisheye_model=1))
-
-
-def _opencv(camera: Camera, *models: str, **further: int) -> dict[str, Any]:
-    lens, fit = nearest_model(camera, *models)
-    return {**_calibration(camera, lens, **further), OWN: _own(camera, fit)}
+    Those have Brown's model, or the rational one where that is closer.
+    """
+    lens, fit = nearest_model(camera, *(("fisheye",) if fisheye else ("polynomial", "rational")))
+    mark = {"fisheye_model": 1} if fisheye else {}
+    content = {**_calibration(camera, lens, **mark), OWN: _own(camera, fit)}
+    return "%YAML:1.0\n---\n" + _as_yaml(content) if yaml else json.dumps(content, indent=4) + "\n"
 
 
 def _calibration(camera: Camera, lens: LensModel, **further: Any) -> dict[str, Any]:
