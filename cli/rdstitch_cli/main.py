@@ -90,8 +90,13 @@ def main() -> None:
     # Images and pairs are worked on side by side; threads within each matrix product would only be in the way.
     # NumPy reads this when it is loaded, which is later.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    _share_memory()
-    _silence_decoders()
+    # Large arrays are freed by one stage's threads and wanted by the next one's; their own pools would keep them.
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
+    # Decoders warn and log of odd files; this process is ours, and what matters ends as an error.
+    for name in _DECODERS:
+        warnings.filterwarnings("ignore", module=rf"{name}\b")
+        logging.getLogger(name).addHandler(logging.NullHandler())
     for number in _TERMINATION_SIGNALS:
         signal.signal(number, _end)
     status = run(sys.argv[1:])
@@ -109,22 +114,6 @@ def _open_standard_streams() -> None:
                 os.dup2(nowhere, number)
                 os.close(nowhere)
             setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8"))  # noqa: PTH123, SIM115
-
-
-def _share_memory() -> None:
-    """Let all threads take memory from one pool, where the C library would give each its own (glibc).
-
-    Large arrays are freed by one stage's threads and wanted by the next one's; pools of their own would keep them.
-    """
-    with suppress(AttributeError, OSError, TypeError):
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
-
-
-def _silence_decoders() -> None:
-    """Drop what decoders warn and log of odd files: this process is ours, and what matters ends as an error."""
-    for name in _DECODERS:
-        warnings.filterwarnings("ignore", module=rf"{name}\b")
-        logging.getLogger(name).addHandler(logging.NullHandler())
 
 
 def run(arguments: list[str]) -> int:
