@@ -156,19 +156,15 @@ class Camera:
             )
         if self.focal_source is not None and self.focal_source not in FOCAL_LOG_STD:
             raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
+        named = ", ".join(f"{value:g}" for value in self.coefficients if value)
         with np.errstate(all="ignore"):  # absurd values, from a damaged file, overflow
             if self.image_circle is not None and not self.image_circle > 0.0:
                 raise ImpossibleCameraError(f"an image circle has a radius above 0 pixels, not {self.image_circle:g}")
             corner = self._corner_radius
             if not (math.isfinite(corner * corner) and not folds(corner, self.coefficients)):
-                raise ImpossibleCameraError(
-                    f"distortion {', '.join(f'{value:g}' for value in self.coefficients if value)} folds the image"
-                )
+                raise ImpossibleCameraError(f"distortion {named} folds the image")
             if horizon_radius(self.distortion, self.higher) < _NEAREST_HORIZON:
-                raise ImpossibleCameraError(
-                    f"distortion {', '.join(f'{value:g}' for value in self.coefficients if value)} leaves next to "
-                    "nothing of the image before the camera"
-                )
+                raise ImpossibleCameraError(f"distortion {named} leaves next to nothing of the image before the camera")
 
     @property
     def coefficients(self) -> tuple[float, float, float]:

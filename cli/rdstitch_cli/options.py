@@ -103,11 +103,7 @@ def verbosity(command: Callable[..., Any]) -> Any:
     return run
 
 
-def flat_field(usual: str) -> Decorator[Any]:
-    """The option, and what a command does without it."""
-    return option("--flat-field", FileOr("auto", "off"), usual)
-
-
+flat_field, no_flat_field = (option("--flat-field", FileOr("auto", "off"), usual) for usual in ("auto", "off"))
 follow = together(option("--follow", bool, dest="following"), option("--idle", RealNumber(0.0, min_open=True)))
 distortion = option("--lambda", RealNumber(), dest="distortion")
 lens = together(option("--camera", IMAGE), distortion)
@@ -145,12 +141,7 @@ report = option("--report", IMAGE)
 trust = together(strict, option("--force", bool))
 
 
-def _blend(usual: str) -> Decorator[Any]:
-    """The option, and how a command blends without it."""
-    return option("--blend", ("none", "feather", "multiband"), usual)
-
-
-blend, cut = _blend("multiband"), _blend("none")
+blend, cut = (option("--blend", ("none", "feather", "multiband"), usual) for usual in ("multiband", "none"))
 crop = option("--crop/--no-crop", default=False, callback=lambda _context, _option, value: "auto" if value else "none")
 interpolation = option("--interpolation", ("linear", "cubic", "lanczos"), "cubic")
 output_form = together(

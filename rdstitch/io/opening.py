@@ -96,23 +96,28 @@ _PNG_METADATA = (b"eXIf", b"tEXt", b"zTXt", b"iTXt")
 
 def check_readable(path: Path) -> None:
     """Refuse what cannot be an image file, before a decoder blocks or stumbles on it."""
-    if is_url(path):
-        _check_remote(path)
-        return
+    remote, regular = is_url(path), True
+    if remote and is_raw(path):
+        raise InputError(f"{path}: raw files are read from this machine's disks only; download it first")
     try:
-        status = path.stat()
+        if remote:
+            is_folder, size, _ = remote_status(path)
+        else:
+            status = path.stat()
+            is_folder, regular, size = stat.S_ISDIR(status.st_mode), stat.S_ISREG(status.st_mode), status.st_size
     except FileNotFoundError:
-        raise InputError(f"{path}: {_missing(path)}") from None
+        raise InputError(f"{path}: {'no such file; check the address' if remote else _missing(path)}") from None
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}; check the name") from error
-    if stat.S_ISDIR(status.st_mode):
+        reason = str(error) if remote else f"{getattr(error, 'strerror', None) or error}; check the name"
+        raise InputError(f"{path}: {reason}") from error
+    if is_folder:
         raise InputError(f"{path}: is a folder, not an image; name the images in it")
-    if not stat.S_ISREG(status.st_mode):
+    if not regular:
         raise InputError(f"{path}: is not a regular file; copy it to one first")
-    if status.st_size == 0:
+    if size == 0:
         raise InputError(f"{path}: is empty (0 bytes); copy it again from its source")
     _check_reader(path)
-    if not os.access(path, os.R_OK):
+    if not remote and not os.access(path, os.R_OK):
         raise InputError(f"{path}: permission denied; make it readable")
 
 
@@ -130,23 +135,6 @@ def _missing(path: Path) -> str:
 
     alike = alike or get_close_matches(path.name, names, n=1, cutoff=0.8)
     return f"no such {what}; " + (f"did you mean {path.with_name(alike[0])}?" if alike else "check the name")
-
-
-def _check_remote(path: Path) -> None:
-    """The same of what a URL names."""
-    if is_raw(path):
-        raise InputError(f"{path}: raw files are read from this machine's disks only; download it first")
-    _check_reader(path)
-    try:
-        is_folder, size, _ = remote_status(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the address") from None
-    except OSError as error:
-        raise InputError(f"{path}: {error}") from error
-    if is_folder:
-        raise InputError(f"{path}: is a folder, not an image; name the images in it")
-    if size == 0:
-        raise InputError(f"{path}: is empty (0 bytes); copy it again from its source")
 
 
 @contextmanager

@@ -29,7 +29,7 @@ from rdstitch_cli.terminal import Reporter
 @options.topic
 @option("--match", ("auto", "name", "order"), "auto")
 @options.mask
-@options.flat_field("off")
+@options.no_flat_field
 @options.compositing
 @options.workers
 @options.strict

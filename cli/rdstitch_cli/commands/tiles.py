@@ -32,7 +32,7 @@ from rdstitch_cli.terminal import Reporter
 @option("--pixel-size", RealNumber(0.0))
 @option("--search", RealNumber(0.0))
 @option("--channel", WholeNumber(0))
-@options.flat_field("auto")
+@options.flat_field
 @option("--save-flat-field", options.IMAGE)
 @options.distortion
 @options.cut
