@@ -19,7 +19,6 @@ from rdstitch.report.svg import (
     counted,
     drawing,
     element,
-    fit_into,
     joined,
     label,
     line,
@@ -45,7 +44,11 @@ def match_graph(registration: Registration) -> str:
     used = np.flatnonzero(alignment.used)
     outlines = {int(k): footprint(registration, int(k)) for k in used}
     centers = {int(k): middle(registration, int(k)) for k in used}
-    shift, scale, (width, height) = fit_into(np.concatenate(list(outlines.values())), _GRAPH_SIDE, _GRAPH_MARGIN)
+    points = np.concatenate(list(outlines.values()))
+    low = np.nanmin(points, axis=0)
+    extent = np.maximum(np.nanmax(points, axis=0) - low, 1e-9)
+    scale = float((_GRAPH_SIDE - 2 * _GRAPH_MARGIN) / extent.max())
+    (width, height), shift = (extent * scale + 2 * _GRAPH_MARGIN).tolist(), _GRAPH_MARGIN / scale - low
     parts = [
         path((outline + shift) * scale, closed=True, stroke=BLUE, fill=BLUE, fill_opacity=0.05, stroke_opacity=0.5)
         for outline in outlines.values()

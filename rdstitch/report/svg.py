@@ -91,18 +91,6 @@ def section(title: str, explanation: str, *content: Content) -> Markup:
     return element("section", element("h2", title), element("p", explanation), *content)
 
 
-def fit_into(points: NDArray[np.float64], side: float, margin: float) -> tuple[FloatArray, float, tuple[float, float]]:
-    """Shift, scale and size that bring points (N, 2) into a drawing whose longer side is given.
-
-    A point ``p`` goes to ``(p + shift) * scale``.
-    """
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    extent = np.maximum(high - low, 1e-9)
-    scale = float((side - 2 * margin) / extent.max())
-    width, height = extent * scale + 2 * margin
-    return margin / scale - low, scale, (float(width), float(height))
-
-
 def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.2f}"
