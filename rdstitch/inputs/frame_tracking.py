@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features.prepared_image import PreparedImage
-from rdstitch.inputs.corner_flow import CornerFlow, fitted_affine
+from rdstitch.inputs.corner_flow import CornerFlow, corners_of, fitted_affine
 
 _SIDE = 320  # pixels of the longer side that frames are tracked at
 _MIN_CORNERS = 12  # corners that a motion is believed by
@@ -59,7 +59,7 @@ def tracked(frames: Iterable[NDArray[np.uint8]]) -> FramePlaces:
         track.append((track[-1] + (motion is None)) if track else 0)
         places.append(np.eye(3) if motion is None else begun_at @ motion)
         if worn:
-            flow.begin(image)
+            flow.begin(image, corners_of(image))
             begun_at = places[-1]
     return FramePlaces(np.array(size, dtype=np.float64), np.array(places).reshape(-1, 3, 3), np.array(track, np.intp))
 
