@@ -27,8 +27,7 @@ from rdstitch.messages import Message, left_out
 from rdstitch.orientation import inverse, turned_size
 from rdstitch.planar_motion import rotation_from_tilt
 
-_HELD_UPRIGHT = 6
-"""EXIF orientation."""
+_HELD_UPRIGHT = 6  # EXIF orientation
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from rdstitch.robust.ransac import ransac
 from rdstitch.robust.verification import MIN_PLACES, places, rejection_reason
 
 _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
+# matches, with padding, of the pairs in one batch: enough to hide Python's overhead, few enough for the caches
 _MATCHES_AT_ONCE = 1 << 14
-"""Matches, with padding, of the pairs in one batch: enough to hide Python's overhead, few enough for the caches."""
 
 
 @dataclass(frozen=True)

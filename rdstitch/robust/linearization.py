@@ -16,9 +16,7 @@ from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
 from rdstitch.robust.loss import loss_ratio
 from rdstitch.robust.measurements import Measurements
 
-_PAIRS = np.triu_indices(3)
-"""Entries of a symmetric matrix of 3 x 3 that determine it."""
-
+_PAIRS = np.triu_indices(3)  # entries of a symmetric matrix of 3 x 3 that determine it
 _ENTRY = np.zeros((3, 3), dtype=np.intp)
 _ENTRY[_PAIRS] = _ENTRY.T[_PAIRS] = np.arange(6)
 

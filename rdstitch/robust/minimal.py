@@ -12,8 +12,8 @@ from rdstitch.division_model import SEARCHED_DISTORTION
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.solvers.solutions import Solutions
 
+# half-diagonal frame: so near to any lens up to a wide angle that some inliers agree
 _SAMPLED_DISTORTION = (0.0, -0.12, -0.3)
-"""Half-diagonal frame: so near to any lens up to a wide angle that some inliers agree."""
 
 Solve = Callable[[FloatArray, FloatArray, FloatArray | None], Solutions]
 
@@ -98,8 +98,6 @@ def _scaled(solve: Callable[..., Solutions], focal: float = 1.0, *, tilted: bool
     def solve_in_half_diagonals(x1: FloatArray, x2: FloatArray, tilts: FloatArray | None = None) -> Solutions:
         known = {"tilt": (0.0, 0.0) if tilts is None else tilts} if tilted else {}
         solutions = solve(x1 / focal, x2 / focal, **known)
-        return Solutions(
-            solutions.sample, solutions.homography * (k[:, None] / k), solutions.distortion / focal**2
-        )
+        return Solutions(solutions.sample, solutions.homography * (k[:, None] / k), solutions.distortion / focal**2)
 
     return solve_in_half_diagonals
