@@ -42,8 +42,8 @@ class FramePlaces:
         """Which points of a grid in some frames another frame shows, (M, P)."""
         axis = (np.arange(_GRID) + 0.5) / _GRID
         points = np.stack([*np.meshgrid(*(axis * side for side in self.size)), np.ones((_GRID, _GRID))]).reshape(3, -1)
-        there = (np.linalg.inv(self.places[other]) @ self.places[frames] @ points)[:, :2]
-        inside = ((there >= 0.0) & (there <= self.size[:, None])).all(axis=1)
+        in_other = (np.linalg.inv(self.places[other]) @ self.places[frames] @ points)[:, :2]
+        inside = ((in_other >= 0.0) & (in_other <= self.size[:, None])).all(axis=1)
         return np.asarray(inside & (self.track[frames] == self.track[other])[:, None])
 
     def shared(self, first: int, second: int) -> float:
@@ -150,8 +150,8 @@ def _unseen(places: FramePlaces, first: int, end: int) -> list[int]:
     seen = places.seen_by(between, first)
     if end < len(places.places):
         seen |= places.seen_by(between, end)
-    found: list[int] = []
+    chosen: list[int] = []
     while (missing := 1.0 - seen.mean(axis=1)).max() > _UNSEEN:
-        found.append(int(between[missing.argmax()]))
-        seen |= places.seen_by(between, found[-1])
-    return found
+        chosen.append(int(between[missing.argmax()]))
+        seen |= places.seen_by(between, chosen[-1])
+    return chosen

@@ -110,21 +110,21 @@ class Pose:
 
     def as_dict(self) -> dict[str, Any]:
         """As a line of JSON takes it; null for what is not known."""
-        found = self.tracked
-        placement = None if found is None else found.placement
+        tracked = self.tracked
+        placement = None if tracked is None else tracked.placement
         return {
             "name": self.name,
             "frame": self.number,
             "timestamp": _known(self.timestamp),
-            **self.poses.fields(None if found is None else found.pose),
+            **self.poses.fields(None if tracked is None else tracked.pose),
             "homography": None if placement is None else placement.homography.tolist(),
-            "lambda": None if found is None else _known(found.distortion),
-            "lambda_std": None if found is None else _known(found.distortion_std),
-            "lambda_known": found is not None and found.distortion_known,
-            "map": None if found is None else found.map_number,
-            "keyframe": found is not None and found.keyframe,
-            "inliers": 0 if found is None else found.inliers,
-            "revised": found is not None and found.revised,
+            "lambda": None if tracked is None else _known(tracked.distortion),
+            "lambda_std": None if tracked is None else _known(tracked.distortion_std),
+            "lambda_known": tracked is not None and tracked.distortion_known,
+            "map": None if tracked is None else tracked.map_number,
+            "keyframe": tracked is not None and tracked.keyframe,
+            "inliers": 0 if tracked is None else tracked.inliers,
+            "revised": tracked is not None and tracked.revised,
             "reason": self.reason,
         }
 
@@ -176,9 +176,9 @@ def follow(
         if (image is None or (source is not None and source.guard.messages)) and comes_again(arrived):
             unread[arrived.path] = number
             continue
-        found = tracker.register(frame, source, image, reason)
-        yield from found
-        if source is not None and (result := found[-1].tracked) is not None:
+        poses_of_frame = tracker.register(frame, source, image, reason)
+        yield from poses_of_frame
+        if source is not None and (result := poses_of_frame[-1].tracked) is not None:
             if sketch is not None:
                 sketch.add(source, result)
             source.decoded_images.clear()
@@ -273,7 +273,7 @@ class Tracker:
         camera = at_working_size(source.camera, self._detection.limits[1])
         results = self._frames.add(image, camera)
         self._labels[results[-1].number] = label
-        found = [
+        poses = [
             replace(
                 self._labels[result.number],
                 tracked=result,
@@ -283,7 +283,7 @@ class Tracker:
         ]
         waiting = self._frames.numbers_without_place
         self._labels = {number: known for number, known in self._labels.items() if number in waiting}
-        return found
+        return poses
 
 
 class _Sketch:

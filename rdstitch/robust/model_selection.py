@@ -111,10 +111,10 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
     result: dict[int, PairFit] = {}
 
     def finished(index: int, rows: IntArray) -> dict[int, PairFit]:
-        model, fits, found = fitted[index]
-        own = replace(near.at(fits), noise=noise_of(found.errors, threshold)).take(rows)
+        model, fits, equations = fitted[index]
+        standing = replace(near.at(fits), noise=noise_of(equations.errors, threshold)).take(rows)
         reasons = [_explained(fitted, index, rms[row]) for row in rows]
-        chosen_fits = _finished(model, fits.take(rows), own, pairs.data.take(rows), reasons)
+        chosen_fits = _finished(model, fits.take(rows), standing, pairs.data.take(rows), reasons)
         return dict(zip(rows.tolist(), chosen_fits, strict=True))
 
     for index in range(len(fitted)):
@@ -157,17 +157,17 @@ def _finished(
         for index, row in enumerate(unseen.tolist()):
             why = f"{reasons[row]}; λ is not observable (standard deviation {std[row]:.2g}) and was set to 0"
             known[row] = straight, index, errors[index], covariance[index], np.inf, why
-    for own, k, error, spread, deviation, why in known:
-        distortion = float(own.distortion[k])
-        yield PairFit(model, own.state[k], own.homography[k], distortion, error, spread, float(deviation), why)
+    for fit, k, error, spread, deviation, why in known:
+        distortion = float(fit.distortion[k])
+        yield PairFit(model, fit.state[k], fit.homography[k], distortion, error, spread, float(deviation), why)
 
 
 def _inspected(model: PairModel, fits: Fits, pairs: PairSelection, data: Measurements) -> tuple[FloatArray, FloatArray]:
     """Errors and covariances of fits as they stand, on all matches."""
     width = loss_width(pairs.noise, pairs.threshold)
     problems = PairProblems(model, data, width, pairs.noise, pairs.fixed_distortion)
-    found, shares = problems.inspect(fits.parameters)
-    return found.errors, covariances(found.information, shares, pairs.noise, data)
+    equations, shares = problems.inspect(fits.parameters)
+    return equations.errors, covariances(equations.information, shares, pairs.noise, data)
 
 
 def noise_of(errors: FloatArray, threshold: float) -> FloatArray:
