@@ -1,18 +1,22 @@
 """Frames followed as they arrive: ``python -m examples.benchmarks.follow``.
 
-A robot's drive of 640 x 480 frames is rendered into a temporary folder and followed, by one thread. Printed are the
-processor time of a frame, reading and preview included, until λ is known and from then on; λ as it converges; how far
-the path of the poses as they were first given is from the truth; and the largest memory after a third of the frames and
-at the end.
+A robot's drive of 640 x 480 frames is rendered into a folder, which may be kept for another run, and followed. Printed
+are the processor time of a frame, reading and preview included, until λ is known and from then on: with one worker all
+of it, with two that beside the process that aligns keyframes; λ as it converges; how far the path of the poses as they
+were first given is from the truth, with ``--end`` that of ``rdstitch.trajectory`` too; and the largest memory after a
+third of the frames and at the end.
 """
 
 import time
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
 
+import rdstitch
 from examples.benchmarks.driver import peak_memory, run
 from examples.judging.trajectories import compare_trajectories
 from rdstitch.alignment.trajectory import Trajectory
@@ -32,35 +36,62 @@ def path_of(frames: list[Pose]) -> Trajectory:
     return Trajectory(np.array(numbers), places, yaw, height)
 
 
-def main(*, frames: int = 200, path: str = "turn", overlap: float = 0.9) -> None:
+def end_error(estimate: Trajectory, truth: Trajectory) -> float:
+    """How far the last position is from the truth where the first twentieth of the path lies on it, of its length."""
+    _, rows, others = np.intersect1d(estimate.frame, truth.frame, return_indices=True)
+    a, b = estimate.position[rows] @ [1.0, 1.0j], truth.position[others] @ [1.0, 1.0j]
+    start = slice(0, max(2, len(a) // 20))
+    a, b = a - a[start].mean(), b - b[start].mean()
+    factor = np.vdot(a[start], b[start]) / np.vdot(a[start], a[start])
+    return float(abs(factor * a[-1] - b[-1])) / truth.length
+
+
+def main(
+    *,
+    frames: int = 200,
+    path: str = "turn",
+    overlap: float = 0.9,
+    workers: int = 1,
+    folder: Path | None = None,
+    end: bool = False,
+) -> None:
     """Print the figures."""
     cv2.setNumThreads(1)
-    drive = floor_drive(path, frames, seed=3, overlap=overlap)
-    with TemporaryDirectory() as folder:
+    drive = replace(floor_drive(path, frames, seed=3, overlap=overlap), samples=1)
+    truth, options = true_path(drive), StitchOptions(workers=workers)
+    with TemporaryDirectory() if folder is None else nullcontext(folder) as kept:
+        images = Path(kept)
         for index in range(frames):
-            write_image(Path(folder) / f"frame_{index:05d}.jpg", drive.frame(index))
-        arrivals = Arrivals(folder, frames_folder=lambda: Path(folder), idle=0.5)
-        preview = Path(folder) / ".preview.jpg"
+            if not (file := images / f"frame_{index:05d}.jpg").exists():
+                write_image(file, drive.frame(index))
+        arrivals = Arrivals(images, frames_folder=lambda: images, idle=0.5)
+        preview = images / ".preview.jpg"
         found, spent, memory, last = list[Pose](), list[float](), 0.0, time.process_time()
-        for frame in follow(arrivals, StitchOptions(workers=1), preview=preview, refresh=1.0):
+        for frame in follow(arrivals, options, preview=preview, refresh=1.0):
             found.append(frame)
             spent.append((now := time.process_time()) - last)
             last = now
             if len(found) == frames // 3:
                 memory = peak_memory()
+        whole = rdstitch.trajectory([images], None, options)[0] if end else None
     aligned = [k for k, frame in enumerate(found) if frame.tracked and frame.tracked.placement is not None]
     known = next((k for k, frame in enumerate(found) if frame.tracked and frame.tracked.distortion_known), 0)
     before, after = np.array(spent[:known]), np.array(spent[known:])
     print(f"ms a frame: {1e3 * before.mean():.1f} in the {known} frames before λ is known,", end=" ")
-    print(f"{1e3 * after.mean():.1f} afterwards", end=" ")
-    print(f"({1.0 / after.mean():.1f} frames a second; the slowest frame {1e3 * after.max():.0f} ms)")
+    print(
+        f"{1e3 * after.mean():.1f} afterwards: {1.0 / before.mean():.1f} and {1.0 / after.mean():.1f} frames a second;"
+    )
+    print(f"the slowest frame {1e3 * before.max():.0f} and {1e3 * after.max():.0f} ms")
     for share in (0.05, 0.1, 0.25, 0.5, 1.0):
         tracked = found[max(int(share * len(found)) - 1, 0)].tracked
         if tracked is not None:
             print(f"after {share:4.0%} of the frames: λ - truth {tracked.distortion - DISTORTION:+.5f}", end=" ")
             print(f"± {tracked.distortion_std:.5f}")
-    error = compare_trajectories(path_of(found), true_path(drive))
-    print(f"{len(aligned)} of {frames} frames placed; drift {error.drift:.3%} of the path")
+    print(f"{len(aligned)} of {frames} frames placed, along {truth.length:.0f} heights of the camera")
+    for name, one in (("as they came", path_of(found)), ("at the end", whole)):
+        if one is not None:
+            error = compare_trajectories(one, truth)
+            print(f"{name}: drift {error.drift:.4%} of the path, {end_error(one, truth):.3%} at its end")
     print(f"largest memory {memory:.0f} MB after a third, {peak_memory():.0f} MB at the end")
 
 

@@ -26,7 +26,7 @@ from rdstitch.division_model import undistort
 from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.radial_homography import RadialHomography, transfer
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
-from rdstitch.solvers.direct_linear import direct_linear
+from rdstitch.solvers.homography import direct_linear
 
 MAX_ITERATIONS = 24
 """A start need not be the minimum."""

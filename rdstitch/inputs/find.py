@@ -249,25 +249,25 @@ def images_in(folder: Path) -> list[Path]:
         entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
-    found = [path for path in entries if path.suffix.lower() in IMAGE_SUFFIXES]
+    images = [path for path in entries if path.suffix.lower() in IMAGE_SUFFIXES]
     # Many cameras write a raw file beside each image, and phones that export JPEG leave the HEIC there.
-    stems = {path.stem for path in found}
-    found += [
+    stems = {path.stem for path in images}
+    images += [
         path for path in entries if path.suffix.lower() in HEIF_SUFFIXES | RAW_SUFFIXES and path.stem not in stems
     ]
-    return sorted(found, key=natural_key)
+    return sorted(images, key=natural_key)
 
 
 def _in_folder(folder: Path, notes: list[Message]) -> list[Path]:
     """The same; a folder without images is an error, and what else is in it a note."""
-    found = images_in(folder)
-    others = sorted({path for path in folder.iterdir() if not path.name.startswith(".")} - set(found), key=natural_key)
-    if not found:
+    images = images_in(folder)
+    others = sorted({path for path in folder.iterdir() if not path.name.startswith(".")} - set(images), key=natural_key)
+    if not images:
         raise InputError(f"{folder}: there are no images in this folder{_elsewhere(others)}")
     if others:
         text = f"{folder}: not taken for images: {shortened([path.name for path in others])}"
         notes.append(Message(text, severity="detail"))
-    return found
+    return images
 
 
 def _has_images(folder: Path) -> bool:

@@ -17,20 +17,11 @@ from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import mean_of_channels
 
-_IMAGES = 5
-"""Looked at, from all parts of the sequence: what is dark in their mean is dark in each."""
-
-_DARK = 0.1
-"""Of the brightest twentieth, up to which a pixel is dark: a surround has stray light, and noise."""
-
-_TOLERANCE = 0.01
-"""Of the radius that the edge of the circle may be off: JPEG files and blurred rims."""
-
-_MIN_ARC = 0.5
-"""Share of the circle that has to be seen: longer sides may cut off the rest."""
-
-_RIM = 0.97
-"""Of the radius that is used: the rim is dark and blurred."""
+_IMAGES = 5  # looked at, from all parts of the sequence: what is dark in their mean is dark in each
+_DARK = 0.1  # of the brightest twentieth, up to which a pixel is dark: a surround has stray light, and noise
+_TOLERANCE = 0.01  # of the radius that the edge of the circle may be off: JPEG files and blurred rims
+_MIN_ARC = 0.5  # share of the circle that has to be seen: longer sides may cut off the rest
+_RIM = 0.97  # of the radius that is used: the rim is dark and blurred
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from rdstitch.messages import Message, left_out
 from rdstitch.orientation import inverse, turned_size
 from rdstitch.planar_motion import rotation_from_tilt
 
-_HELD_UPRIGHT = 6
-"""EXIF orientation."""
+_HELD_UPRIGHT = 6  # EXIF orientation
 
 
 @dataclass(frozen=True)
@@ -195,14 +194,14 @@ def _check_memory(path: Path, metadata: Metadata, max_memory: int | None) -> Non
 
 def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, distortion: float | None) -> Camera:
     """The best that is known of one image's camera: what the user says, then EXIF; the guess comes later."""
-    found = Camera(metadata.size) if camera is None else _fitted(camera, metadata)
+    known = Camera(metadata.size) if camera is None else _fitted(camera, metadata)
     if focal is not None:
-        found = found.with_focal(focal, "option")
-    elif found.focal is None and metadata.focal_px is not None:
-        found = found.with_focal(metadata.focal_px, "exif")
+        known = known.with_focal(focal, "option")
+    elif known.focal is None and metadata.focal_px is not None:
+        known = known.with_focal(metadata.focal_px, "exif")
     if distortion is None:
-        return found
-    return found.with_coefficients(distortion)
+        return known
+    return known.with_coefficients(distortion)
 
 
 def _fitted(camera: Camera, metadata: Metadata) -> Camera:

@@ -15,7 +15,7 @@ from rdstitch.arrays import BoolArray
 from rdstitch.division_model import undistort
 from rdstitch.late_imports import spatial
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.solvers.direct_linear import direct_linear
+from rdstitch.solvers.homography import direct_linear
 
 _NEIGHBOURS = 6
 """Matches around one that it may continue: as many as a point has on average in a triangulation of the plane."""

@@ -1,25 +1,27 @@
 """Frames registered as they arrive: a pose for each, and a preview now and then."""
 
 import math
+import sys
 import time
+import weakref
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from rdstitch.camera import Camera
 from rdstitch.errors import InputError
+from rdstitch.executors import ProcessExecutor
 from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
 from rdstitch.features import FeatureOptions, Features, detect_view, match
-from rdstitch.features.prepared_image import PreparedImage, prepare
+from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.inputs.frame import Frame, Image, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.selection import is_selected, with_masks
 from rdstitch.inputs.source import Source
 from rdstitch.io.write import write_image
-from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import alignment_options
 from rdstitch.pipeline.read_inputs import read_frames
@@ -108,21 +110,21 @@ class Pose:
 
     def as_dict(self) -> dict[str, Any]:
         """As a line of JSON takes it; null for what is not known."""
-        found = self.tracked
-        placement = None if found is None else found.placement
+        tracked = self.tracked
+        placement = None if tracked is None else tracked.placement
         return {
             "name": self.name,
             "frame": self.number,
             "timestamp": _known(self.timestamp),
-            **self.poses.fields(None if found is None else found.pose),
+            **self.poses.fields(None if tracked is None else tracked.pose),
             "homography": None if placement is None else placement.homography.tolist(),
-            "lambda": None if found is None else _known(found.distortion),
-            "lambda_std": None if found is None else _known(found.distortion_std),
-            "lambda_known": found is not None and found.distortion_known,
-            "map": None if found is None else found.map_number,
-            "keyframe": found is not None and found.keyframe,
-            "inliers": 0 if found is None else found.inliers,
-            "revised": found is not None and found.revised,
+            "lambda": None if tracked is None else _known(tracked.distortion),
+            "lambda_std": None if tracked is None else _known(tracked.distortion_std),
+            "lambda_known": tracked is not None and tracked.distortion_known,
+            "map": None if tracked is None else tracked.map_number,
+            "keyframe": tracked is not None and tracked.keyframe,
+            "inliers": 0 if tracked is None else tracked.inliers,
+            "revised": tracked is not None and tracked.revised,
             "reason": self.reason,
         }
 
@@ -174,9 +176,9 @@ def follow(
         if (image is None or (source is not None and source.guard.messages)) and comes_again(arrived):
             unread[arrived.path] = number
             continue
-        found = tracker.register(frame, source, image, reason)
-        yield from found
-        if source is not None and (result := found[-1].tracked) is not None:
+        poses_of_frame = tracker.register(frame, source, image, reason)
+        yield from poses_of_frame
+        if source is not None and (result := poses_of_frame[-1].tracked) is not None:
             if sketch is not None:
                 sketch.add(source, result)
             source.decoded_images.clear()
@@ -212,7 +214,13 @@ class Tracker:
         self._options, self._poses = options or StitchOptions(), poses or FollowedPoses()
         self._detection = _live_features(self._options.features)
         how = TrackingOptions(self._options.estimation, alignment_options([], self._options))
-        self._frames = FrameTracker(how, partial(match, ratio=self._options.ratio))
+        # Of frames that have been made ready.
+        features = replace(self._detection, work_megapixels=None, stretch=None, equalize=False)
+        apart = self._options.threads > 1 and bool(sys.executable)
+        executor = ProcessExecutor(1) if apart else ThreadPoolExecutor(1)
+        weakref.finalize(self, executor.shutdown, wait=False, cancel_futures=True)
+        matcher = partial(match, ratio=self._options.ratio)
+        self._frames = FrameTracker(how, partial(_features, features), matcher, executor)
         self._labels: dict[int, Pose] = {}  # of the frames that may still find their place
         self._numbers = count()
         self.revised: tuple[Pose, ...] = ()
@@ -263,9 +271,9 @@ class Tracker:
             return [label]
         label = replace(label, name=source.name, timestamp=self._poses.timestamp(source))
         camera = at_working_size(source.camera, self._detection.limits[1])
-        results = self._frames.add(partial(_features, source, self._detection, camera), camera, image)
+        results = self._frames.add(image, camera)
         self._labels[results[-1].number] = label
-        found = [
+        poses = [
             replace(
                 self._labels[result.number],
                 tracked=result,
@@ -275,7 +283,7 @@ class Tracker:
         ]
         waiting = self._frames.numbers_without_place
         self._labels = {number: known for number, known in self._labels.items() if number in waiting}
-        return found
+        return poses
 
 
 class _Sketch:
@@ -311,9 +319,10 @@ def _live_features(options: FeatureOptions) -> FeatureOptions:
     )
 
 
-def _features(source: Source, options: FeatureOptions, camera: Camera) -> Features:
-    """Of a frame, in pixels of a camera of working size."""
-    return FeatureStore.of([detect_view(source.view, options)]).at_sizes([camera.image_size])[0]
+def _features(options: FeatureOptions, image: PreparedImage) -> Features:
+    """Of a frame, in its pixels."""
+    mask = None if image.clearance is None else image.clearance > 0.0
+    return detect_view(lambda _: View(image.grey, mask), options)
 
 
 def _why(tracker: FrameTracker, result: Tracked) -> str:

@@ -33,8 +33,7 @@ from rdstitch.registration import Registration
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.options import TileOptions
 from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table, oriented
-from rdstitch.stage.register import TileRegistration, evidence, register_tiles
-from rdstitch.stage.table import places_table
+from rdstitch.stage.register import TileRegistration, evidence, places_table, register_tiles
 from rdstitch.stitch_result import StitchResult
 
 

@@ -54,7 +54,7 @@ def _summed_over_cells(values: FloatArray, points: FloatArray) -> tuple[FloatArr
     cell = np.clip(cell, 0, _CELLS_PER_SIDE - 1).astype(np.intp)
     key = ((np.arange(batch)[:, None] * _CELLS_PER_SIDE + cell[:, 0]) * _CELLS_PER_SIDE + cell[:, 1]).ravel()
     order = np.argsort(key, kind="stable")
-    found = key[order]
-    starts = np.flatnonzero(np.diff(found, prepend=-1))
+    ordered = key[order]
+    starts = np.flatnonzero(np.diff(ordered, prepend=-1))
     sums: FloatArray = np.add.reduceat(values.reshape(batch * count, size)[order], starts, axis=0)
-    return sums, found[starts] // _CELLS_PER_SIDE**2
+    return sums, ordered[starts] // _CELLS_PER_SIDE**2

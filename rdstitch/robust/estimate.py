@@ -19,8 +19,8 @@ from rdstitch.robust.ransac import ransac
 from rdstitch.robust.verification import MIN_PLACES, places, rejection_reason
 
 _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
+# matches, with padding, of the pairs in one batch: enough to hide Python's overhead, few enough for the caches
 _MATCHES_AT_ONCE = 1 << 14
-"""Matches, with padding, of the pairs in one batch: enough to hide Python's overhead, few enough for the caches."""
 
 
 @dataclass(frozen=True)
@@ -143,8 +143,8 @@ def estimate_radial_homographies(pairs: Sequence[PairMatches], options: Estimati
     result: dict[int, RadialHomography] = {}
     batches: dict[tuple[int, float, float, bool], list[int]] = {}
     for index, pair in enumerate(pairs):
-        if (found := places(pair.points1, pair.points2, pair.camera2.image_size)) < MIN_PLACES:
-            reason = f"only {len(pair)} matches, in {found} places of the image"
+        if (cells := places(pair.points1, pair.points2, pair.camera2.image_size)) < MIN_PLACES:
+            reason = f"only {len(pair)} matches, in {cells} places of the image"
             result[index] = RadialHomography.failed(reason, pair.camera1, pair.camera2, len(pair))
         else:
             batches.setdefault(pair.batch_key, []).append(index)
@@ -160,7 +160,7 @@ def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> lis
     """Of pairs with the same ``batch_key``."""
     order = [pair.order for pair in pairs]
     data = Measurements.of_pairs(
-        [(pair.points1[own], pair.points2[own]) for pair, own in zip(pairs, order, strict=True)],
+        [(pair.points1[ranked], pair.points2[ranked]) for pair, ranked in zip(pairs, order, strict=True)],
         [(pair.camera1, pair.camera2) for pair in pairs],
     )
     known = [pair.tilts for pair in pairs if pair.tilts is not None]
@@ -171,25 +171,25 @@ def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> lis
     search = ransac(solvers, data, ordered, tilts, options)
     threshold = options.threshold
 
-    found = np.flatnonzero(np.isfinite(search.best.cost))
+    solved = np.flatnonzero(np.isfinite(search.best.cost))
     limit = np.inf if options.select_below is None else options.select_below
-    few = search.best.inliers[found].sum(axis=1) < limit
+    few = search.best.inliers[solved].sum(axis=1) < limit
     fits: dict[int, PairFit] = {}
     planar = [PlanarPairModel(focal, std, tilts is not None, height_free=free) for free in (False, True)]
     for models, rows in ((planar, few), ([], ~few)):
-        own = found[rows]
-        if not len(own):
+        members = solved[rows]
+        if not len(members):
             continue
         selection = PairSelection(
-            search.best.homography[own],
-            search.best.distortion[own],
-            data.take(own),
-            None if tilts is None else tilts[own],
-            np.ones(len(own)),
+            search.best.homography[members],
+            search.best.distortion[members],
+            data.take(members),
+            None if tilts is None else tilts[members],
+            np.ones(len(members)),
             threshold,
             options.distortion is not None,
         )
-        fits.update(zip(own.tolist(), select_models(models, selection), strict=True))
+        fits.update(zip(members.tolist(), select_models(models, selection), strict=True))
 
     result = []
     for row, pair in enumerate(pairs):

@@ -72,7 +72,7 @@ def descend(
     """
     least_gain = ROUGH_GAIN if rough else PAIR_GAIN
     result, parameters = start.copy(), start
-    current = found = problems.normal_equations(start)
+    current = equations = problems.normal_equations(start)
     damping, rows = np.full(len(start), FIRST_DAMPING), np.arange(len(start))
     for _ in range(iterations):
         step = _damped_step(current, damping)
@@ -84,14 +84,14 @@ def descend(
             rows, step, parameters, damping = rows[going], step[going], parameters[going], damping[going]
             problems, current = problems.take(going), current.take(going)
         moved, possible = problems.retract(parameters, step)
-        there = problems.normal_equations(moved)
-        better = possible & (there.cost < current.cost)
+        trial = problems.normal_equations(moved)
+        better = possible & (trial.cost < current.cost)
         damping = next_damping(damping, better)
         if better.any():
-            parameters, current = np.where(better[:, None], moved, parameters), current.where(better, there)
+            parameters, current = np.where(better[:, None], moved, parameters), current.where(better, trial)
             result[rows] = parameters
-            found.put(rows, current)
-    return result, found
+            equations.put(rows, current)
+    return result, equations
 
 
 def next_damping(damping: FloatArray, better: BoolArray) -> FloatArray:

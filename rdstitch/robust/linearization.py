@@ -16,9 +16,7 @@ from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
 from rdstitch.robust.loss import loss_ratio
 from rdstitch.robust.measurements import Measurements
 
-_PAIRS = np.triu_indices(3)
-"""Entries of a symmetric matrix of 3 x 3 that determine it."""
-
+_PAIRS = np.triu_indices(3)  # entries of a symmetric matrix of 3 x 3 that determine it
 _ENTRY = np.zeros((3, 3), dtype=np.intp)
 _ENTRY[_PAIRS] = _ENTRY.T[_PAIRS] = np.arange(6)
 
@@ -109,14 +107,14 @@ def differentiate(homography: FloatArray, lens: PairLenses, data: Measurements) 
     along_third = by_lifted[:, :, 2]
     slope1 = 2.0 * first if mu is None else 2.0 * first + 4.0 * mu * r2
     by_point = by_lifted[:, :, :2] + along_third[:, :, None] * (x1 * slope1[:, None])[:, None]
-    own = d * (rho2 * px / k)[:, None]
+    in_image2 = d * (rho2 * px / k)[:, None]
     if lens.own_distortion is None:
-        by_lens = (along_third * r2[:, None] + own)[:, :, None]
+        by_lens = (along_third * r2[:, None] + in_image2)[:, :, None]
     else:
         by_lens = np.empty((*d.shape[:2], 5, d.shape[2]))
         by_lens[:, :, 0] = along_third * r2[:, None]
-        by_lens[:, :, 1] = own
-        by_lens[:, :, 2] = along_third * (r2**2)[:, None] + own * rho2[:, None]
+        by_lens[:, :, 1] = in_image2
+        by_lens[:, :, 2] = along_third * (r2**2)[:, None] + in_image2 * rho2[:, None]
         by_lens[:, :, 3:] = -by_point
         by_lens[:, 0, 3] += px
         by_lens[:, 1, 4] += px
@@ -135,27 +133,27 @@ def _precision(by_point: FloatArray) -> FloatArray:
 
 
 def entry_equations(
-    found: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool
+    transferred: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool
 ) -> BatchedNormalEquations:
     """The loss with its scale ``c`` (B,), pixels, and its normal equations by the entries of H, then by the lens."""
-    squared = found.squared
+    squared = transferred.squared
     relative = loss_ratio(squared, scale[:, None])
-    lost, useless = found.lost & present, found.lost | ~present
+    lost, useless = transferred.lost & present, transferred.lost | ~present
     relative[useless] = 0.0
     cost = (squared * relative).sum(axis=1) + scale**2 * lost.sum(axis=1)
     squared[useless] = np.inf
 
-    lens = found.by_lens if free_lens else found.by_lens[:, :, :0]
+    lens = transferred.by_lens if free_lens else transferred.by_lens[:, :, :0]
     extra = lens.shape[2]
-    columns = np.concatenate([found.by_image, lens, found.error[:, :, None]], axis=2)
-    weight = found.precision * (relative * relative)[:, None]
+    columns = np.concatenate([transferred.by_image, lens, transferred.error[:, :, None]], axis=2)
+    weight = transferred.precision * (relative * relative)[:, None]
     xx, xy, yy = weight[:, :1], weight[:, 1:2], weight[:, 2:]
     across, down = columns[:, 0], columns[:, 1]
     left_across, left_down = xx * across + xy * down, xy * across + yy * down
     by_h = across[:, :3, None] * left_across[:, None] + down[:, :3, None] * left_down[:, None]
 
-    lifted = np.swapaxes(found.lifted, 1, 2)
-    monomials = (found.lifted[:, _PAIRS[0]] * found.lifted[:, _PAIRS[1]]).swapaxes(1, 2)
+    lifted = np.swapaxes(transferred.lifted, 1, 2)
+    monomials = (transferred.lifted[:, _PAIRS[0]] * transferred.lifted[:, _PAIRS[1]]).swapaxes(1, 2)
     batch, count = relative.shape
     quadratic = (by_h[:, :, :3].reshape(batch, 9, count) @ monomials)[:, :, _ENTRY]
     linear = by_h[:, :, 3:].reshape(batch, 3 * (extra + 1), count) @ lifted
@@ -169,22 +167,22 @@ def entry_equations(
         mixed = linear[:, :, :extra].transpose(0, 1, 3, 2).reshape(batch, 9, extra)
         information[:, :9, 9:] = mixed
         information[:, 9:, :9] = mixed.swapaxes(1, 2)
-        own = across[:, 3:-1] @ left_across[:, 3:].swapaxes(1, 2) + down[:, 3:-1] @ left_down[:, 3:].swapaxes(1, 2)
-        information[:, 9:, 9:] = own[:, :, :extra]
-        gradient[:, 9:] = own[:, :, extra]
+        of_lens = across[:, 3:-1] @ left_across[:, 3:].swapaxes(1, 2) + down[:, 3:-1] @ left_down[:, 3:].swapaxes(1, 2)
+        information[:, 9:, 9:] = of_lens[:, :, :extra]
+        gradient[:, 9:] = of_lens[:, :, extra]
     return BatchedNormalEquations(cost, information, gradient, squared)
 
 
-def influence(found: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool) -> FloatArray:
+def influence(transferred: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool) -> FloatArray:
     """Each match's share of the gradient by the entries of H and the lens, (B, N, 9 + E)."""
-    relative = loss_ratio(found.squared, scale[:, None])
-    relative[~present | found.lost] = 0.0
-    weight = found.precision * (relative * relative)[:, None]
+    relative = loss_ratio(transferred.squared, scale[:, None])
+    relative[~present | transferred.lost] = 0.0
+    weight = transferred.precision * (relative * relative)[:, None]
     xx, xy, yy = weight[:, 0], weight[:, 1], weight[:, 2]
-    dx, dy = found.error[:, 0], found.error[:, 1]
+    dx, dy = transferred.error[:, 0], transferred.error[:, 1]
     left = np.stack([xx * dx + xy * dy, xy * dx + yy * dy], axis=1)[:, :, None]
-    by_image, by_lens = ((part * left).sum(axis=1) for part in (found.by_image, found.by_lens))
+    by_image, by_lens = ((part * left).sum(axis=1) for part in (transferred.by_image, transferred.by_lens))
     batch, _, count = by_image.shape
-    by_h = (by_image[:, :, None] * found.lifted[:, None]).reshape(batch, 9, count)
+    by_h = (by_image[:, :, None] * transferred.lifted[:, None]).reshape(batch, 9, count)
     parts = [by_h, by_lens] if free_lens else [by_h]
     return np.ascontiguousarray(np.concatenate(parts, axis=1).swapaxes(1, 2))

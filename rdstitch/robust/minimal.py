@@ -12,8 +12,8 @@ from rdstitch.division_model import SEARCHED_DISTORTION
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.solvers.solutions import Solutions
 
+# half-diagonal frame: so near to any lens up to a wide angle that some inliers agree
 _SAMPLED_DISTORTION = (0.0, -0.12, -0.3)
-"""Half-diagonal frame: so near to any lens up to a wide angle that some inliers agree."""
 
 Solve = Callable[[FloatArray, FloatArray, FloatArray | None], Solutions]
 
@@ -80,12 +80,11 @@ def _sampled_distortion(x1: FloatArray, x2: FloatArray) -> Solutions:
 
     One point less finds pairs with a tenth of inliers twice as often.
     """
-    found = [solvers.four_point_dlt(x1, x2, distortion=distortion) for distortion in _SAMPLED_DISTORTION]
-    sample = np.concatenate([part.sample for part in found])
-    order = np.argsort(sample, kind="stable")
-    homography = np.concatenate([part.homography for part in found])
-    distortion = np.concatenate([part.distortion for part in found])
-    return Solutions(sample[order], homography[order], distortion[order])
+    count = len(_SAMPLED_DISTORTION)
+    solutions = solvers.four_point_dlt(
+        np.repeat(x1, count, axis=0), np.repeat(x2, count, axis=0), np.tile(_SAMPLED_DISTORTION, len(x1))
+    )
+    return Solutions(solutions.sample // count, solutions.homography, solutions.distortion)
 
 
 def _scaled(solve: Callable[..., Solutions], focal: float = 1.0, *, tilted: bool = False) -> Solve:
@@ -98,7 +97,7 @@ def _scaled(solve: Callable[..., Solutions], focal: float = 1.0, *, tilted: bool
 
     def solve_in_half_diagonals(x1: FloatArray, x2: FloatArray, tilts: FloatArray | None = None) -> Solutions:
         known = {"tilt": (0.0, 0.0) if tilts is None else tilts} if tilted else {}
-        found = solve(x1 / focal, x2 / focal, **known)
-        return Solutions(found.sample, found.homography * (k[:, None] / k), found.distortion / focal**2)
+        solutions = solve(x1 / focal, x2 / focal, **known)
+        return Solutions(solutions.sample, solutions.homography * (k[:, None] / k), solutions.distortion / focal**2)
 
     return solve_in_half_diagonals

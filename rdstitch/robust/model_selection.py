@@ -10,6 +10,7 @@ from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import OBSERVABLE_STD
 from rdstitch.robust.covariance import covariances
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
+from rdstitch.robust.linearization import PairLenses, differentiate
 from rdstitch.robust.loss import PAIR_WIDTH, RAYLEIGH_MEDIAN
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
@@ -18,7 +19,7 @@ from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
 # Halved or doubled, these change the median error of λ by a sixth at most.
 _MIN_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
 _MAX_RESIDUAL = 3.0  # errors, in thresholds, beyond which a match is left out of the choice
-_FREE_STEPS, _STEPS = 8, 15
+_STEPS = 15
 
 
 @dataclass(frozen=True)
@@ -67,11 +68,17 @@ class PairSelection:
             noise=self.noise[rows],
         )
 
-    def fit(self, model: PairModel, width: FloatArray, steps: int, *, rough: bool = False) -> _Fitted:
+    @np.errstate(all="ignore")
+    def errors(self) -> FloatArray:
+        """Errors of the matches (B, N) where the pairs stand, pixels; inf where there is none."""
+        moved = differentiate(self.homography, PairLenses(self.distortion), self.data)
+        return np.sqrt(np.where(moved.lost | ~self.data.present, np.inf, moved.squared))
+
+    def fit(self, model: PairModel, width: FloatArray, steps: int) -> _Fitted:
         """A model fitted to every pair from where it stands, with a loss of the given widths (B,), pixels."""
         start = Fits(model.initialize(self.homography, self.tilts), self.homography, self.distortion)
         problems = PairProblems(model, self.data, width, self.noise, self.fixed_distortion)
-        return _Fitted(model, *refine_pairs(problems, start, steps, rough=rough))
+        return _Fitted(model, *refine_pairs(problems, start, steps))
 
     def at(self, fits: Fits) -> Self:
         """Standing at fits."""
@@ -92,10 +99,9 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
         ``noise`` is estimated anew.
     """
     threshold, homography = pairs.threshold, HomographyPairModel()
-    free = pairs.fit(homography, np.full(len(pairs.data), threshold), _FREE_STEPS, rough=True)
-    errors = free.found.errors
+    errors = pairs.errors()
     noise = noise_of(errors, threshold)
-    near = replace(pairs.at(free.fits), noise=noise, data=pairs.data.only(errors < _MAX_RESIDUAL * threshold))
+    near = replace(pairs, noise=noise, data=pairs.data.only(errors < _MAX_RESIDUAL * threshold))
     inliers = np.maximum((errors < threshold).sum(axis=1), 1)
     width, price = loss_width(noise, threshold), noise**2 * np.log(2 * inliers)
     freest = near.fit(homography, width, _STEPS)
@@ -105,10 +111,10 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
     result: dict[int, PairFit] = {}
 
     def finished(index: int, rows: IntArray) -> dict[int, PairFit]:
-        model, fits, found = fitted[index]
-        own = replace(near.at(fits), noise=noise_of(found.errors, threshold)).take(rows)
+        model, fits, equations = fitted[index]
+        standing = replace(near.at(fits), noise=noise_of(equations.errors, threshold)).take(rows)
         reasons = [_explained(fitted, index, rms[row]) for row in rows]
-        chosen_fits = _finished(model, fits.take(rows), own, pairs.data.take(rows), reasons)
+        chosen_fits = _finished(model, fits.take(rows), standing, pairs.data.take(rows), reasons)
         return dict(zip(rows.tolist(), chosen_fits, strict=True))
 
     for index in range(len(fitted)):
@@ -151,17 +157,17 @@ def _finished(
         for index, row in enumerate(unseen.tolist()):
             why = f"{reasons[row]}; λ is not observable (standard deviation {std[row]:.2g}) and was set to 0"
             known[row] = straight, index, errors[index], covariance[index], np.inf, why
-    for own, k, error, spread, deviation, why in known:
-        distortion = float(own.distortion[k])
-        yield PairFit(model, own.state[k], own.homography[k], distortion, error, spread, float(deviation), why)
+    for fit, k, error, spread, deviation, why in known:
+        distortion = float(fit.distortion[k])
+        yield PairFit(model, fit.state[k], fit.homography[k], distortion, error, spread, float(deviation), why)
 
 
 def _inspected(model: PairModel, fits: Fits, pairs: PairSelection, data: Measurements) -> tuple[FloatArray, FloatArray]:
     """Errors and covariances of fits as they stand, on all matches."""
     width = loss_width(pairs.noise, pairs.threshold)
     problems = PairProblems(model, data, width, pairs.noise, pairs.fixed_distortion)
-    found, shares = problems.inspect(fits.parameters)
-    return found.errors, covariances(found.information, shares, pairs.noise, data)
+    equations, shares = problems.inspect(fits.parameters)
+    return equations.errors, covariances(equations.information, shares, pairs.noise, data)
 
 
 def noise_of(errors: FloatArray, threshold: float) -> FloatArray:

@@ -55,22 +55,22 @@ def own_lenses(relations: Sequence[RadialHomography], data: Measurements, thresh
     parameters[:, lens:] = _HOMOGRAPHY.initialize(np.stack([relation.homography for relation in relations]))
     with np.errstate(all="ignore"):  # a step may leave the domain of the lens model
         problems = PairProblems(_HOMOGRAPHY, data, np.full(count, threshold), np.ones(count), lens_std=_OWN_STD)
-        found = problems.normal_equations(parameters)
+        equations = problems.normal_equations(parameters)
         for _ in range(_ROUNDS):
-            noise = noise_of(found.errors, threshold)
+            noise = noise_of(equations.errors, threshold)
             problems = replace(problems, scale=loss_width(noise, threshold), noise=noise)
-            parameters, found = descend(problems, parameters, _ITERATIONS)
-        noise = noise_of(found.errors, threshold)
-        covariance = covariances(found.information, problems.inspect(parameters)[1], noise, data)
+            parameters, equations = descend(problems, parameters, _ITERATIONS)
+        noise = noise_of(equations.errors, threshold)
+        covariance = covariances(equations.information, problems.inspect(parameters)[1], noise, data)
         left = problems.transfer(parameters)
         inliers = data.present & ~left.lost & (left.squared < loss_width(noise, threshold)[:, None] ** 2)
     coherence = [
-        _coherence(points[:, own].T, errors[:, own].T)
-        for points, errors, own in zip(data.x1, left.error, inliers, strict=True)
+        _coherence(points[:, row].T, errors[:, row].T)
+        for points, errors, row in zip(data.x1, left.error, inliers, strict=True)
     ]
     return [
-        OwnLenses(own[:2], known[:2, :2], shared)
-        for own, known, shared in zip(parameters, covariance, coherence, strict=True)
+        OwnLenses(row[:2], known[:2, :2], shared)
+        for row, known, shared in zip(parameters, covariance, coherence, strict=True)
     ]
 
 

@@ -108,7 +108,7 @@ def ransac(
     turns, batch = lanes[-1:], _FIRST_BATCH
     while len(active):
         for lane in turns:
-            left = options.max_iterations - int(np.sum([own.drawn[active] for own in lanes], axis=0).max())
+            left = options.max_iterations - int(np.sum([lane.drawn[active] for lane in lanes], axis=0).max())
             lane.advance(best, active[lane.drawn[active] < lane.needed(best, active, explore=True)], min(batch, left))
         needed = np.stack([lane.needed(best, active) for lane in lanes])
         drawn = np.stack([lane.drawn[active] for lane in lanes])
@@ -158,8 +158,8 @@ class _Lane:
         picks = self._sampler.draw(self.drawn[rows], batch, self.data.count[rows], self.ordered[rows])
         self.drawn[rows] += batch
         step = max(1, _SAMPLES_AT_ONCE // batch)
-        found = [self._best_of(rows[i : i + step], picks[i : i + step]) for i in range(0, len(rows), step)]
-        homography, distortion, cost = (np.concatenate(column) for column in zip(*found, strict=True))
+        hypotheses = [self._best_of(rows[i : i + step], picks[i : i + step]) for i in range(0, len(rows), step)]
+        homography, distortion, cost = (np.concatenate(column) for column in zip(*hypotheses, strict=True))
         better = cost < self._least_raw_cost[rows]
         rows, homography, distortion = rows[better], homography[better], distortion[better]
         self._least_raw_cost[rows] = cost[better]
@@ -183,18 +183,20 @@ class _Lane:
             for x in (self.data.x1, self.data.x2)
         )
         tilts = None if self.tilts is None else np.repeat(self.tilts[rows], batch, axis=0)
-        found = self.solver.solve(x1.reshape(-1, size, 2), x2.reshape(-1, size, 2), tilts)
+        solutions = self.solver.solve(x1.reshape(-1, size, 2), x2.reshape(-1, size, 2), tilts)
         # A lens that is known may see beyond the horizon at the corners: what is there is no inlier.
-        keep = plausible(found, corner_radius=0.0 if self.solver.fixed_distortion else 1.0)
-        found = Solutions(found.sample[keep], found.homography[keep], found.distortion[keep])
-        pair = found.sample // batch
-        costs = truncated_costs(found.homography, found.distortion, pair, self.quick.take(rows), self.options.threshold)
+        keep = plausible(solutions, corner_radius=0.0 if self.solver.fixed_distortion else 1.0)
+        solutions = Solutions(solutions.sample[keep], solutions.homography[keep], solutions.distortion[keep])
+        pair = solutions.sample // batch
+        costs = truncated_costs(
+            solutions.homography, solutions.distortion, pair, self.quick.take(rows), self.options.threshold
+        )
         order = np.lexsort((costs, pair))
         first = order[np.flatnonzero(np.diff(pair[order], prepend=-1))]
         homography, distortion = np.zeros((len(rows), 3, 3)), np.zeros(len(rows))
         least = np.full(len(rows), np.inf)
         which = pair[first]
-        homography[which], distortion[which] = found.homography[first], found.distortion[first]
+        homography[which], distortion[which] = solutions.homography[first], solutions.distortion[first]
         least[which] = costs[first]
         return homography, distortion, least
 

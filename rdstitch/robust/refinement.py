@@ -63,9 +63,9 @@ class PairProblems:
         return self._equations(self.transfer(parameters), parameters, self.chain(parameters))
 
     def _equations(
-        self, found: TransferDerivatives, parameters: FloatArray, chain: FloatArray
+        self, transferred: TransferDerivatives, parameters: FloatArray, chain: FloatArray
     ) -> BatchedNormalEquations:
-        entries = entry_equations(found, self.data.present, self.scale, self.free > 0)
+        entries = entry_equations(transferred, self.data.present, self.scale, self.free > 0)
         information = np.swapaxes(chain, 1, 2) @ entries.information @ chain
         gradient = np.einsum("bkp,bk->bp", chain, entries.gradient)
         cost, weight = entries.cost, self.noise**2
@@ -99,9 +99,9 @@ class PairProblems:
 
     def inspect(self, parameters: FloatArray) -> tuple[BatchedNormalEquations, FloatArray]:
         """The equations, and each match's share of the gradient, (B, N, P)."""
-        found, chain = self.transfer(parameters), self.chain(parameters)
-        shares = influence(found, self.data.present, self.scale, self.free > 0) @ chain
-        return self._equations(found, parameters, chain), shares
+        transferred, chain = self.transfer(parameters), self.chain(parameters)
+        shares = influence(transferred, self.data.present, self.scale, self.free > 0) @ chain
+        return self._equations(transferred, parameters, chain), shares
 
 
 @np.errstate(all="ignore")  # a step may leave the domain of the lens model
@@ -124,6 +124,6 @@ def refine_pairs(
     rough : bool
         Another refinement goes on from there.
     """
-    found, equations = descend(problems, start.parameters, iterations, rough=rough)
-    state = found[:, 1:]
-    return Fits(state, problems.model.homography(state), found[:, 0]), equations
+    parameters, equations = descend(problems, start.parameters, iterations, rough=rough)
+    state = parameters[:, 1:]
+    return Fits(state, problems.model.homography(state), parameters[:, 0]), equations

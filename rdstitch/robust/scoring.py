@@ -47,8 +47,8 @@ def transfer_errors2(homography: FloatArray, distortion: FloatArray, pair: IntAr
     step = max(1, _BLOCK // errors.shape[1])
     for start in range(0, len(errors), step):
         part = slice(start, start + step)
-        own = pair[part]
-        z = np.matmul(coefficients[part], basis[own])
+        pairs = pair[part]
+        z = np.matmul(coefficients[part], basis[pairs])
         squares = z[:, 0] ** 2
         squares += z[:, 1] ** 2
         squares *= -4.0 * distortion[part, None]
@@ -61,10 +61,10 @@ def transfer_errors2(homography: FloatArray, distortion: FloatArray, pair: IntAr
         factor = np.divide(2.0, denominator, out=denominator)
         difference = z[:, :2]
         difference *= factor[:, None]
-        difference -= data.x2[own]
+        difference -= data.x2[pairs]
         difference *= difference
         squared = np.add(difference[:, 0], difference[:, 1], out=errors[part])
-        squared *= (data.px[own] ** 2)[:, None]
+        squared *= (data.px[pairs] ** 2)[:, None]
         squared[undefined] = np.inf
     return errors
 

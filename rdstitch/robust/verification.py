@@ -18,8 +18,7 @@ With half as many, 14 % of 72 pairs come out wrong instead of 3 %, mostly cluste
 the cells and the limit of chance, halved or doubled, change nothing there.
 """
 
-_MAX_CHANCE = 1e-4
-"""Probability that as many wrong matches agree by chance."""
+_MAX_CHANCE = 1e-4  # probability that as many wrong matches agree by chance
 
 
 def places(points1: FloatArray, points2: FloatArray, image_size: tuple[int, int]) -> int:

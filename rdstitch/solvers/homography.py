@@ -62,3 +62,16 @@ class Quadrangles(SampleArrays):
         norm = np.sqrt((h * h).sum(axis=0).sum(axis=0))
         scale = np.sign(alpha[0] * first * (second * third)) / np.where(norm > 0.0, norm, np.inf)
         return np.ascontiguousarray((h * scale).transpose(2, 0, 1)), possible
+
+
+def direct_linear(x1: FloatArray, x2: FloatArray) -> FloatArray:
+    """Fit the homography (3, 3), positive in front of the camera, to undistorted points (N, 2) of two images.
+
+    By the direct linear transformation (Hartley and Zisserman 2004, 4.1), without outliers.
+    """
+    lifted = np.column_stack([x1, np.ones(len(x1))])
+    zero = np.zeros_like(lifted)
+    first = np.concatenate([lifted, zero, -x2[:, :1] * lifted], axis=1)
+    second = np.concatenate([zero, lifted, -x2[:, 1:] * lifted], axis=1)
+    h: FloatArray = np.linalg.svd(np.concatenate([first, second]), full_matrices=False)[2][-1].reshape(3, 3)
+    return h * float(np.copysign(1.0 / np.linalg.norm(h), np.median(lifted @ h[2])))

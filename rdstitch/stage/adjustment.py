@@ -16,21 +16,11 @@ from rdstitch.late_imports import sparse, sparse_linalg
 from rdstitch.stage.grid import TileGrid
 
 _ROUNDS = 12
-_GENEROUS = 20.0
-"""Widths of the robust loss in the first round; it is halved until it is 1."""
-
-_WIDTH = 4.0
-"""Standard deviations at which a link counts a quarter: Geman and McClure's loss."""
-
-_MEDIAN = 1.386
-"""Median of the sum of two squared standard normal numbers."""
-
-_LEAST_STD = 0.05
-"""Standard deviation of a block, pixels, below which resampling and the camera do not let it come."""
-
-_USUAL_COUNT = 1.0
-"""Tiles or lines that what the stage may be off before anything is known counts for."""
-
+_GENEROUS = 20.0  # widths of the robust loss in the first round; it is halved until it is 1
+_WIDTH = 4.0  # standard deviations at which a link counts a quarter: Geman and McClure's loss
+_MEDIAN = 1.386  # median of the sum of two squared standard normal numbers
+_LEAST_STD = 0.05  # standard deviation of a block, pixels, below which resampling and the camera do not let it come
+_USUAL_COUNT = 1.0  # tiles or lines that what the stage may be off before anything is known counts for
 _SCALE_STD = 0.02
 _LENS_STD = 0.5
 

@@ -1,4 +1,4 @@
-"""Phase correlation of the blocks of an overlap, whitened as far as they are more than noise."""
+"""Phase correlation of the blocks of an expected overlap, whitened as far as they are more than noise."""
 
 import math
 from collections.abc import Sequence
@@ -10,23 +10,73 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.late_imports import fft
-from rdstitch.stage.overlap import Overlap
 
 Image = NDArray[np.float32]
 
-_TAPER = 0.15
-"""Share of a window on each side over which it falls to 0."""
+_TAPER = 0.15  # share of a window on each side over which it falls to 0
+_NOISE_SHARE = 4.0  # products of spectra are whitened where they are so many times what noise would give
+_CORRELATED = 4.0 * math.pi  # pixels that share their noise after a Gaussian filter of 1 pixel
+_BETTER = 3.0  # standard deviations of chance by which a correlation must exceed another
+_BLOCKS = 8  # blocks along a side of a tile: a lens that bends the overlap hardly bends one of them
+# side of a block, pixels, from which on it has enough of independent pixels for its displacement to be sure
+_LEAST_SIDE = 40
 
-_NOISE_SHARE = 4.0
-"""Products of spectra are whitened where they are so many times what noise would give."""
 
-_CORRELATED = 4.0 * math.pi
-"""Pixels that share their noise after a Gaussian filter of 1 pixel."""
+def _count(length: int, side: int) -> int:
+    """Blocks along a length on a tile of a side."""
+    return max(1, min(round(length / side * _BLOCKS), length // _LEAST_SIDE))
 
-_BETTER = 3.0
-"""Standard deviations of chance by which a correlation must exceed another."""
+
+@dataclass(frozen=True)
+class Overlap:
+    """Two tiles and what they should have in common."""
+
+    first: int
+    second: int
+    offset: IntArray  # (2,), int: expected place of the second in the first, pixels
+    blocks: IntArray  # (K, 4), int: boxes x0, y0, x1, y1 in the first tile, end exclusive
+
+    @classmethod
+    def expected(cls, first: int, second: int, offset: FloatArray, size: tuple[int, int], least: int) -> "Overlap":
+        """For tiles of a size, one of which should lie at an offset in the other.
+
+        An overlap narrower than ``least`` pixels is taken to be so wide.
+        """
+        side = np.array(size)
+        whole = np.rint(offset).astype(np.intp)
+        low, high = np.maximum(0, whole), np.minimum(side, side + whole)
+        lacking = np.maximum(0, least - (high - low))
+        # Of the second tile so much is expected beyond the border of the first.
+        low, high = low - np.where(whole > 0, lacking, 0), high + np.where(whole > 0, 0, lacking)
+        along = int(np.argmax(high - low))
+        count = _count(int((high - low)[along]), int(side[along]))
+        edges = np.rint(np.linspace(low[along], high[along], count + 1)).astype(np.intp)
+        blocks = np.empty((count, 4), dtype=np.intp)
+        blocks[:, :2], blocks[:, 2:] = low, high
+        blocks[:, along], blocks[:, 2 + along] = edges[:-1], edges[1:]
+        return cls(first, second, whole, blocks)
+
+    @property
+    def whole(self) -> IntArray:
+        """All blocks as one, (1, 4)."""
+        return np.concatenate([self.blocks[:, :2].min(axis=0), self.blocks[:, 2:].max(axis=0)])[None]
+
+    @property
+    def centers(self) -> FloatArray:
+        """Middle of each block in the first tile, pixels (K, 2)."""
+        return np.asarray((self.blocks[:, :2] + self.blocks[:, 2:] - 1) / 2.0)
+
+    def cells(self, size: tuple[int, int]) -> IntArray:
+        """The blocks cut across too where the overlap is wide, (L, 4), and every other one then, as on a chessboard."""
+        parts = []
+        for row, (x0, y0, x1, y1) in enumerate(self.blocks.tolist()):
+            across, down = (_count(b - a, n) for a, b, n in ((x0, x1, size[0]), (y0, y1, size[1])))
+            x, y = np.rint(np.linspace(x0, x1, across + 1)), np.rint(np.linspace(y0, y1, down + 1))
+            cut = [(i, k) for k in range(down) for i in range(across) if across * down == 1 or (i + k + row) % 2]
+            parts += [(x[i], y[k], x[i + 1], y[k + 1]) for i, k in cut]
+        return np.array(parts, dtype=np.intp)
 
 
 @dataclass(frozen=True)

@@ -19,20 +19,12 @@ from rdstitch.arrays import FloatArray
 from rdstitch.io.flat_field import FlatField
 from rdstitch.io.reduction import block_mean
 
-_CELLS = 24
-"""Cells along each side of a tile."""
-
-_SIDE = 512
-"""Pixels of the longer side that are enough."""
-
-_DEGREE = 4
-"""Degree of the polynomial that the logarithm of the illumination is."""
-
-_TRUNCATED = 0.9113
-"""Variance of a standard normal number within 2.5 of its mean."""
-
+_CELLS = 24  # cells along each side of a tile
+_SIDE = 512  # pixels of the longer side that are enough
+_DEGREE = 4  # degree of the polynomial that the logarithm of the illumination is
+_TRUNCATED = 0.9113  # variance of a standard normal number within 2.5 of its mean
+# bins of brightness, and cells of a bin, by which noise is compared with light
 _BINS, _LEAST_BINS, _LEAST_IN_BIN = 24, 6, 16
-"""Bins of brightness, and cells of a bin, by which noise is compared with light."""
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,9 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import ArgumentError
 
-_SAME_LINE = 0.25
-"""Share of a tile within which places belong to one row or column."""
-
+_SAME_LINE = 0.25  # share of a tile within which places belong to one row or column
+# share of a tile's shorter side along which an overlap is worth comparing: corners of diagonal neighbours are not
 _MIN_OVERLAP = 0.3
-"""Share of a tile's shorter side along which an overlap is worth comparing: corners of diagonal neighbours are not."""
 
 
 @dataclass(frozen=True)

@@ -167,8 +167,8 @@ ORIENTATIONS: tuple[tuple[tuple[int, int], tuple[int, int]], ...] = (
 """Orientations of a stage's axes in the image: rows are x and y of the image in axes of the stage."""
 
 
+# factor of evidence that other axes must have: of two where one is right, the pairs along it agree in both
 _CLEARLY = 1.2
-"""Factor of evidence that other axes must have: of two where one is right, the pairs along it agree in both."""
 
 
 def oriented(grid: TileGrid, evidence: Callable[[TileGrid], float]) -> TileGrid:

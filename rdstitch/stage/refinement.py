@@ -11,20 +11,13 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 
-_SMOOTHING = 1.2
-"""Standard deviation of the filter before derivatives are taken, pixels."""
-
+_SMOOTHING = 1.2  # standard deviation of the filter before derivatives are taken, pixels
 _MARGIN = 5
-_STEP = 8
-"""Pixels between which the lens is straight."""
-
+_STEP = 8  # pixels between which the lens is straight
 _ITERATIONS = 5
 _MIN_SIDE = 12
-_SIGNIFICANT = 5.0
-"""Standard deviations by which the correlation of a block must exceed that of noise."""
-
-_CORRELATED = 4.0 * np.pi * _SMOOTHING**2
-"""Pixels that share their noise after the filter."""
+_SIGNIFICANT = 5.0  # standard deviations by which the correlation of a block must exceed that of noise
+_CORRELATED = 4.0 * np.pi * _SMOOTHING**2  # pixels that share their noise after the filter
 
 
 Transfer = Callable[[FloatArray], FloatArray]

@@ -15,43 +15,25 @@ from rdstitch.io.reduction import block_mean
 from rdstitch.late_imports import csgraph, sparse
 from rdstitch.progress import Progress, silent
 from rdstitch.stage.adjustment import Adjustment, LinkedPoints, adjust
-from rdstitch.stage.correlation import Surfaces, best_place, correlate
+from rdstitch.stage.correlation import Overlap, Surfaces, best_place, correlate
 from rdstitch.stage.grid import TileGrid
-from rdstitch.stage.overlap import Overlap
 from rdstitch.stage.refinement import BlockMatches, Transfer, refine
 
 Reader = Callable[[int], NDArray[Any]]
 """Gives a tile as it is registered, (h, w)."""
 
-_COARSE_SIDE = 512
-"""Pixels of the longer side of a tile that are enough to find a displacement to a pixel of theirs."""
-
+_COARSE_SIDE = 512  # pixels of the longer side of a tile that are enough to find a displacement to a pixel of theirs
+# displacement from the nominal place that is searched where the user does not say, share of the longer side
 _SEARCH = 0.05
-"""Displacement from the nominal place that is searched where the user does not say, share of the longer side."""
-
+# largest displacement of an overlap's blocks against each other that the lens may add, share of the longer side
 _LENS_REACH = 0.02
-"""Largest displacement of an overlap's blocks against each other that the lens may add, share of the longer side."""
-
-_LENSES = np.linspace(-0.04, 0.04, 21)
-"""Values of λ that are tried before it is estimated."""
-
-_FALSE_ALARMS = 1e-4
-"""Chance that the highest of all peaks of noise is taken for an overlap."""
-
-_LARGEST_REACH = 4.0
-"""Standard deviations of the stage within which a peak of little height is looked for."""
-
-_CANDIDATES = 12
-"""Highest peaks of a pair that are compared by normalized cross-correlation."""
-
-_AGREES = 0.25
-"""Weight of a pair from which on it holds its tiles."""
-
-_PROBED = 16
-"""Pairs by which the axes of the stage are found."""
-
-_LEAST_BLOCK = 0.02
-"""Overlap that is compared at least, share of the longer side."""
+_LENSES = np.linspace(-0.04, 0.04, 21)  # values of λ that are tried before it is estimated
+_FALSE_ALARMS = 1e-4  # chance that the highest of all peaks of noise is taken for an overlap
+_LARGEST_REACH = 4.0  # standard deviations of the stage within which a peak of little height is looked for
+_CANDIDATES = 12  # highest peaks of a pair that are compared by normalized cross-correlation
+_AGREES = 0.25  # weight of a pair from which on it holds its tiles
+_PROBED = 16  # pairs by which the axes of the stage are found
+_LEAST_BLOCK = 0.02  # overlap that is compared at least, share of the longer side
 
 
 @dataclass(frozen=True)
@@ -284,3 +266,22 @@ def _result(grid: TileGrid, pairs: IntArray, links: Any, fitted: Adjustment) -> 
     groups = sorted((group for group in groups if len(group) > 1), key=len, reverse=True)
     linked = np.isin(np.arange(len(grid)), held)
     return TileRegistration(grid, fitted, links, pairs, linked, tuple(tuple(g.tolist()) for g in groups))
+
+
+def places_table(names: Sequence[str], tiled: TileRegistration) -> str:
+    """CSV of name, x and y of the first pixel, row, column, what placed it, and micrometres where they are known."""
+    grid, fitted = tiled.grid, tiled.adjustment
+    places = fitted.places - fitted.places.min(axis=0)
+    header = ["name", "x", "y", "row", "column", "placed_by"]
+    if grid.pixel_size is not None:
+        header += ["x_um", "y_um"]
+    lines = [",".join(header)]
+    for index, name in enumerate(names):
+        x, y = places[index].tolist()
+        by = "overlap" if tiled.linked[index] else "stage"
+        quoted = f'"{name}"' if "," in name else name
+        cells = [quoted, f"{x:.3f}", f"{y:.3f}", str(grid.rows[index]), str(grid.columns[index]), by]
+        if grid.pixel_size is not None:
+            cells += [f"{x * grid.pixel_size:.4f}", f"{y * grid.pixel_size:.4f}"]
+        lines.append(",".join(cells))
+    return "\n".join([*lines, ""])

@@ -2,8 +2,12 @@
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import Any
 
+import cv2
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
@@ -12,7 +16,7 @@ from rdstitch.camera import Camera
 from rdstitch.errors import RegistrationError
 from rdstitch.features import Features, Matcher
 from rdstitch.features.prepared_image import PreparedImage
-from rdstitch.inputs.corner_flow import CornerFlow, fitted_affine
+from rdstitch.inputs.corner_flow import CornerFlow, corners_of, matched_corners
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.radial_homography import from_plane
@@ -25,6 +29,7 @@ _SEARCHED = 12  # last keyframes among which a lost frame looks for its place
 _FIRST_ALIGNMENT = 5  # keyframes that the first alignment takes
 _GROWTH = 1.5  # from one alignment to the next, while λ is not known
 _ALIGNMENT_INTERVAL = 24  # keyframes from one alignment to the next afterwards
+_ALIGNMENT_DELAY = 8  # keyframes after which one is taken over, once λ is known; the next one before
 _KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of an image of 640 x 480 pixels, over half of it
 _MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
@@ -34,7 +39,7 @@ _MIN_INLIERS = 15
 _MATCHES = 80  # of a link, that the alignment uses
 _SAME_TILT = ("rigid", "similarity")
 _FLOW_ERROR = 1.5  # pixels by which a corner that was followed may be off the motion of the plane
-_AFFINE_ERROR = 0.02  # the same of an affine motion, in sides: lenses and tilts are not affine
+_UNKNOWN_LENS_ERROR = 0.02  # the same while the lens is not known, in sides
 _FLOW_AGREEING = 0.5  # share of the corners that must agree on it
 
 
@@ -73,15 +78,57 @@ class Tracked:
 class _Keyframe:
     number: int
     camera: Camera
-    features: Features
-    placement: Placement | None = None
+    image: PreparedImage
+    detect: Callable[[PreparedImage], Features]
+    place: Placement | None = None  # relative to the other keyframes, from the first one on
+    aligned: bool = False  # whether that is on the plane of the map
+
+    @cached_property
+    def corners(self) -> FloatArray:
+        """Corners (N, 2), by which it is matched where one knows about where it lies."""
+        return corners_of(self.image)
+
+    @cached_property
+    def features(self) -> Features:
+        """Features, by which it is matched where one does not."""
+        return self.detect(self.image)
+
+    def motion_to(self, other: "_Keyframe", points: FloatArray) -> FloatArray:
+        """Where another frame shows points (N, 2) of this one, by the places of both."""
+        assert self.place is not None
+        assert other.place is not None
+        return from_plane(other.place.camera, other.place.homography, self.place.to_plane(points))
+
+    @property
+    def grid(self) -> FloatArray:
+        """Points all over the image, pixels (N, 2)."""
+        axes = [(np.arange(_GRID) + 0.5) * side / _GRID - 0.5 for side in self.camera.image_size]
+        return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
 
 
 class Tracker:
-    """Registers frames of one camera one after the other."""
+    """Registers frames of one camera one after the other.
 
-    def __init__(self, options: TrackingOptions, matcher: Matcher) -> None:
-        self._options, self._match = options, matcher
+    Parameters
+    ----------
+    options : TrackingOptions
+    detect : callable
+        Features of a frame, in its pixels. They are asked for only where the corners of the last keyframe, which are
+        followed from frame to frame, do not place a frame.
+    matcher : Matcher
+        Of those.
+    executor : Executor
+        Where keyframes are aligned among themselves while further frames come.
+    """
+
+    def __init__(
+        self,
+        options: TrackingOptions,
+        detect: Callable[[PreparedImage], Features],
+        matcher: Matcher,
+        executor: Executor,
+    ) -> None:
+        self._options, self._detect, self._match, self._executor = options, detect, matcher, executor
         self._count, self._map, self._lost = 0, 0, 0
         self._flow = CornerFlow()
         self._model = options.alignment.model
@@ -104,176 +151,178 @@ class Tracker:
     @property
     def numbers_without_place(self) -> set[int]:
         """Numbers of the keyframes that may still find their place."""
-        return {keyframe.number for keyframe in self._keyframes if keyframe.placement is None}
+        return {keyframe.number for keyframe in self._keyframes if not keyframe.aligned}
 
-    def add(
-        self, features: Features | Callable[[], Features], camera: Camera, image: PreparedImage | None = None
-    ) -> list[Tracked]:
+    def add(self, image: PreparedImage, camera: Camera) -> list[Tracked]:
         """Register the next frame; it comes last, after those before it that only now have found their place.
 
         Parameters
         ----------
-        features : Features or callable
-            Of the frame, or what finds them: they are asked for only where corners of the last keyframe, which are
-            followed from frame to frame, do not place it, or it becomes a keyframe.
+        image : PreparedImage
         camera : Camera
-            Of the size that the features' points are measured at.
-        image : PreparedImage, optional
-            The frame at that size, in which corners are followed; without it none are.
+            Of the size of ``image``.
         """
         number, self._count = self._count, self._count + 1
-        if (followed := self._followed(number, camera, image)) is not None:
-            return [followed]
-        results = self._registered_frame(_Keyframe(number, camera, features() if callable(features) else features))
-        if results[-1].keyframe:
-            self._flow.begin(image)
-        return results
-
-    def _followed(self, number: int, camera: Camera, image: PreparedImage | None) -> Tracked | None:
-        """The frame placed by the corners of the last keyframe, where these show enough of it."""
-        matched = None if image is None else self._flow.follow(image)
-        last = self._keyframes[-1] if self._keyframes else None
-        if matched is None or last is None or image is None or image.grey.shape[::-1] != camera.image_size:
-            return None
-        frame = _Keyframe(number, camera, last.features)
-        if last.placement is None and self.waits:
-            lens = camera.with_coefficients(self._distortion if self._distortion and math.isfinite(self._std) else 0.0)
-            error = _AFFINE_ERROR * max(camera.image_size)
-            move, inliers = fitted_affine(lens.undistort(matched[0]), lens.undistort(matched[1]), error)
-            if move is None:
-                return None
-            seen = lens.distort(lens.undistort(self._grid(camera)) @ move[:, :2].T + move[:, 2])
-        elif last.placement is not None and self._planar_model in _SAME_TILT:
-            coefficients = last.placement.camera.coefficients
-            stay = replace(last.placement, camera=camera.with_coefficients(*coefficients))
-            target, source = last.placement.to_plane(matched[0]), stay.to_plane(matched[1])
-            pixel = float(np.std(target)) / max(float(np.std(matched[0])), 1e-9)
-            _, inliers = fitted_affine(target, source, _FLOW_ERROR * pixel)
-            if inliers.sum() < _MIN_INLIERS:
-                return None
-            rigid = self._planar_model == "rigid"
-            frame.placement = PlaneSimilarity.fitted(source[inliers], target[inliers], keep_size=rigid).applied(stay)
-            ground = frame.placement.to_plane(self._grid(camera))
-            seen = from_plane(last.placement.camera, last.placement.homography, ground)
-        else:
-            return None
-        if inliers.sum() < max(_MIN_INLIERS, _FLOW_AGREEING * len(inliers)):
-            return None
-        if self._share_inside(seen, last.camera) < _KEYFRAME_OVERLAP:
-            return None
-        self._lost = 0
-        return self._tracked(frame, keyframe=False, inliers=int(inliers.sum()))
-
-    def _registered_frame(self, frame: _Keyframe) -> list[Tracked]:
-        """Register a frame by its features."""
+        frame = _Keyframe(number, camera, image, self._detect)
         if not self._keyframes:
-            self._keyframes.append(frame)
-            return [self._tracked(frame, keyframe=True, inliers=0)]
+            return [self._first(frame)]
+        inliers = self._follow(frame)
+        if inliers and self._shown_by_last(frame) >= _KEYFRAME_OVERLAP:
+            self._lost = 0
+            return [self._tracked(frame, keyframe=False, inliers=inliers)]
         links = self._links(frame)
-        inliers = max((len(link) for link in links), default=0)
         if not links:
             return [self._without_place(frame)]
         self._lost = 0
-        frame.placement = self._placed(frame, links)
-        if self._shown_by_last(frame, links) >= _KEYFRAME_OVERLAP:
+        self._settle(frame, links)
+        inliers = max(map(len, links))
+        if self._shown_by_last(frame) >= _KEYFRAME_OVERLAP:
+            last = next((link for link in links if link.image1 == self._keyframes[-1].number), None)
+            if last is not None:
+                self._flow.begin(image, last.points1, last.points2)
             return [self._tracked(frame, keyframe=False, inliers=inliers)]
+        self._flow.begin(image, frame.corners)
         return [*self._add_keyframe(frame, links), self._tracked(frame, keyframe=True, inliers=inliers)]
+
+    def _first(self, frame: _Keyframe) -> Tracked:
+        """The first keyframe of a map."""
+        self._start_map()
+        known = self._distortion if self._distortion is not None and math.isfinite(self._std) else 0.0
+        frame.place = Placement(frame.camera.with_coefficients(known), np.eye(3), None)
+        self._keyframes.append(frame)
+        self._flow.begin(frame.image, frame.corners)
+        return self._tracked(frame, keyframe=True, inliers=0)
+
+    def _follow(self, frame: _Keyframe) -> int:
+        """Place the frame by the corners of the last keyframe; how many agree, 0 where they do not place it."""
+        matched = self._flow.follow(frame.image)
+        if matched is None:
+            return 0
+        place, inliers = self._moved(frame, self._keyframes[-1], *matched)
+        if inliers < max(_MIN_INLIERS, _FLOW_AGREEING * len(matched[0])):
+            return 0
+        frame.place, frame.aligned = place, self._keyframes[-1].aligned
+        return inliers
+
+    def _moved(
+        self, frame: _Keyframe, other: _Keyframe, before: FloatArray, now: FloatArray
+    ) -> tuple[Placement | None, int]:
+        """The place of a frame by points (N, 2) of a keyframe that it shows too, and how many of them agree."""
+        assert other.place is not None
+        start = other.place
+        stay = replace(start, camera=frame.camera.with_coefficients(*start.camera.coefficients))
+        error = _UNKNOWN_LENS_ERROR * max(frame.camera.image_size) if self.waits else _FLOW_ERROR
+        target, source = start.camera.undistort(before), stay.camera.undistort(now)
+        seen = np.flatnonzero(np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1))
+        if len(seen) < _MIN_INLIERS:
+            return None, 0
+        # Without the lens, where all numbers are of the size of an image: OpenCV computes in single precision.
+        source, target = stay.camera.normalize(source[seen]), start.camera.normalize(target[seen])
+        fit: Any = cv2.findHomography(source, target, cv2.RANSAC, error / start.camera.scale)
+        homography, agree = fit
+        if homography is None:
+            return None, 0
+        inliers = agree[:, 0] > 0
+        if self._planar_model in _SAME_TILT:
+            before, now = start.to_plane(before[seen][inliers]), stay.to_plane(now[seen][inliers])
+            rigid = self._planar_model == "rigid"
+            place = PlaneSimilarity.fitted(now, before, keep_size=rigid).applied(stay)
+        else:
+            place = replace(stay, homography=start.homography @ homography)
+        return place, int(inliers.sum())
 
     def _start_map(self) -> None:
         self._keyframes: list[_Keyframe] = []
         self._window_links: list[Link] = []
         self._keyframes_seen, self._next_alignment = 0, _FIRST_ALIGNMENT
+        self._alignment: tuple[list[_Keyframe], Future[Alignment]] | None = None
+        self._taken_over_at = 0  # keyframes seen from which on it is
         self._planar_model: str | None = None
 
     def _without_place(self, frame: _Keyframe) -> Tracked:
         """A frame that no keyframe shows; after many of them, a new map begins with the last."""
         self._lost += 1
-        waiting = self._planar_model is None and len(self._keyframes) == 1
-        if self._lost >= _MAX_LOST_FRAMES or waiting:
-            self._map += not waiting
+        alone = self.waits and len(self._keyframes) == 1
+        if self._lost >= _MAX_LOST_FRAMES or alone:
+            self._map += not alone
             self._lost = 0
-            self._start_map()
-            self._keyframes.append(frame)
-            return self._tracked(frame, keyframe=True, inliers=0)
+            return self._first(frame)
         return self._tracked(frame, keyframe=False, inliers=0)
 
     def _links(self, frame: _Keyframe) -> list[Link]:
         """The frame with the last keyframes, as far as they can be registered; of a lost one, with more of them."""
         recent = self._keyframes[::-1]
-        links = self._registered(frame, recent[:_PARTNERS])
-        return links or self._registered(frame, recent[_PARTNERS:_SEARCHED])
+        if frame.place is not None and (links := self._links_by_corners(frame, recent[:_PARTNERS])):
+            return links
+        for others in (recent[:_PARTNERS], recent[_PARTNERS:_SEARCHED]):
+            matched = [self._match(other.features, frame.features) for other in others]
+            pairs = [(other, m.points1, m.points2, -m.ratio) for other, m in zip(others, matched, strict=True)]
+            if links := self._registered(frame, pairs):
+                self._settle(frame, links)
+                numbers = {link.image1 for link in links}
+                return self._links_by_corners(frame, [k for k in others if k.number in numbers]) or links
+        return []
 
-    def _registered(self, frame: _Keyframe, others: Sequence[_Keyframe]) -> list[Link]:
-        """Links of other frames with the frame, by the numbers of all."""
-        if not others:
+    def _links_by_corners(self, frame: _Keyframe, others: Sequence[_Keyframe]) -> list[Link]:
+        """The same by the corners of a frame whose place is about known."""
+        if frame.place is None:
             return []
-        matched = [self._match(other.features, frame.features) for other in others]
+        matched = [
+            (other, *matched_corners(other.image, frame.image, frame.corners, partial(frame.motion_to, other)), None)
+            for other in others
+        ]
+        return self._registered(frame, matched)
+
+    def _registered(
+        self, frame: _Keyframe, matched: Sequence[tuple[_Keyframe, FloatArray, FloatArray, FloatArray | None]]
+    ) -> list[Link]:
+        """Links of keyframes with the frame, by matches (N, 2) of both and their quality (N,)."""
         pairs = [
-            PairMatches(
-                matches.points1, matches.points2, other.camera.with_focal(), frame.camera.with_focal(), -matches.ratio
-            )
-            for other, matches in zip(others, matched, strict=True)
+            PairMatches(points1, points2, other.camera.with_focal(), frame.camera.with_focal(), quality)
+            for other, points1, points2, quality in matched
         ]
         relations = estimate_radial_homographies(pairs, self._options.pair)
         return [
-            Link(other.number, frame.number, matches.points1[fit.inliers], matches.points2[fit.inliers], fit)
-            for other, matches, fit in zip(others, matched, relations, strict=True)
+            Link(other.number, frame.number, points1[fit.inliers], points2[fit.inliers], fit)
+            for (other, points1, points2, _), fit in zip(matched, relations, strict=True)
             if fit and fit.inliers.sum() >= _MIN_INLIERS
         ]
 
-    def _placed(self, frame: _Keyframe, links: Sequence[Link]) -> Placement | None:
-        """The place of a frame by its links with keyframes that have one."""
+    def _settle(self, frame: _Keyframe, links: Sequence[Link]) -> None:
+        """Place a frame by its largest link with a keyframe that is on the map, if there is any."""
         by_number = {keyframe.number: keyframe for keyframe in self._keyframes}
-        known = [(by_number[k.image1].placement, k) for k in links]
-        placed = [(placement, link) for placement, link in known if placement is not None]
-        if not placed:
-            return None
-        nearest, best = max(placed, key=lambda pair: len(pair[1]))
-        camera = frame.camera.with_coefficients(*nearest.camera.coefficients)
-        if self._planar_model not in _SAME_TILT:
-            inverse = np.linalg.inv(best.relation.homography)
-            return Placement(camera, nearest.homography @ inverse, nearest.focal)
-        # Where the camera of that keyframe would see the matches, and where they are: one motion of the plane.
-        stay = Placement(camera, nearest.homography, nearest.focal)
-        source = np.concatenate([stay.to_plane(link.points2) for _, link in placed])
-        target = np.concatenate([placement.to_plane(link.points1) for placement, link in placed])
-        seen = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
-        return PlaneSimilarity.fitted(source[seen], target[seen], keep_size=self._planar_model == "rigid").applied(stay)
+        best = max(links, key=lambda link: (by_number[link.image1].aligned, len(link)))
+        other = by_number[best.image1]
+        frame.place, _ = self._moved(frame, other, best.points1, best.points2)
+        frame.aligned = other.aligned and frame.place is not None
 
-    def _shown_by_last(self, frame: _Keyframe, links: Sequence[Link]) -> float:
-        """Share of the frame that the newest of its partners shows."""
-        last = max(links, key=lambda link: link.image1)
-        transferred = last.relation.transfer(self._grid(frame.camera))  # the camera moved by about as much either way
-        return self._share_inside(transferred, frame.camera)
-
-    @staticmethod
-    def _grid(camera: Camera) -> FloatArray:
-        """Points all over an image, pixels (N, 2)."""
-        axes = [(np.arange(_GRID) + 0.5) * side / _GRID - 0.5 for side in camera.image_size]
-        return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-
-    @staticmethod
-    def _share_inside(points: FloatArray, camera: Camera) -> float:
-        """Share of points (N, 2) that lie in an image."""
-        inside = (points >= 0.0).all(axis=1) & (points <= np.array(camera.image_size) - 1.0).all(axis=1)
+    def _shown_by_last(self, frame: _Keyframe) -> float:
+        """Share of the frame that the last keyframe shows."""
+        last = self._keyframes[-1]
+        if frame.place is None:
+            return 0.0
+        points = frame.motion_to(last, frame.grid)
+        inside = (points >= 0.0).all(axis=1) & (points <= np.array(last.camera.image_size) - 1.0).all(axis=1)
         return float(inside.mean())
 
     def _add_keyframe(self, frame: _Keyframe, links: Sequence[Link]) -> list[Tracked]:
-        """Keep the frame; align the window when it is due, which may place frames that had none."""
+        """Keep the frame; take over an alignment of the window, which may place others, and begin the next."""
         self._keyframes = [*self._keyframes, frame][-_WINDOW:]
         self._keyframes_seen += 1
         first = self._keyframes[0].number
         self._window_links = [link for link in [*self._window_links, *links] if link.image1 >= first]
         if not self.distortion_known:
             self._vote()
-        if self._keyframes_seen + 1 < self._next_alignment:
-            return []
-        steps = _ALIGNMENT_INTERVAL if self.distortion_known else max(2, round(self._next_alignment * (_GROWTH - 1.0)))
-        self._next_alignment += min(steps, _ALIGNMENT_INTERVAL)
-        without = [keyframe for keyframe in self._keyframes[:-1] if keyframe.placement is None]
-        self._align_window()
-        placed = [keyframe for keyframe in without if keyframe.placement is not None]
-        return [replace(self._tracked(keyframe, keyframe=True, inliers=0), revised=True) for keyframe in placed]
+        revised = self._take_over() if self._keyframes_seen >= self._taken_over_at else []
+        if self._keyframes_seen + 1 >= self._next_alignment:
+            grown = max(2, round(self._next_alignment * (_GROWTH - 1.0)))
+            steps = _ALIGNMENT_INTERVAL if self.distortion_known else min(grown, _ALIGNMENT_INTERVAL)
+            self._next_alignment += steps
+            # At a keyframe and not when it is done: so that time does not decide on the result.
+            waits_long = self.distortion_known and not self.waits
+            self._taken_over_at = self._keyframes_seen + (_ALIGNMENT_DELAY if waits_long else 1)
+            self._align_window()
+        return revised
 
     def _vote(self) -> None:
         """λ by the pairs alone, until there is an alignment."""
@@ -283,7 +332,7 @@ class Tracker:
             self._distortion, self._std = consensus.distortion, consensus.std
 
     def _align_window(self) -> None:
-        """Align the keyframes of the window among themselves, and bring them to the plane of the map."""
+        """Begin to align the keyframes of the window among themselves."""
         place = {keyframe.number: index for index, keyframe in enumerate(self._keyframes)}
         links = [replace(link, image1=place[link.image1], image2=place[link.image2]) for link in self._window_links]
         known = self._options.pair.distortion
@@ -302,47 +351,58 @@ class Tracker:
             attitudes=None,
             reference=None,
         )
-        try:
-            alignment = align(cameras, links, options)
-        except RegistrationError:
-            return
-        if alignment.on_sphere:
-            return
-        self._take_over(alignment)
+        self._alignment = list(self._keyframes), self._executor.submit(align, cameras, links, options)
 
-    def _take_over(self, alignment: Alignment) -> None:
-        """λ, the model and the places of the keyframes from an alignment of the window."""
+    def _take_over(self) -> list[Tracked]:
+        """λ, the model and the places of keyframes from an alignment; those that have found their place with it."""
+        if self._alignment is None:
+            return []
+        (keyframes, task), self._alignment = self._alignment, None
+        try:
+            alignment = task.result()
+        except RegistrationError:
+            return []
+        if alignment.on_sphere:
+            return []
         if not self.distortion_known and alignment.distortion_std < self._std:
             self._distortion, self._std = alignment.distortion, alignment.distortion_std
-        placements: list[Placement | None] = [
-            Placement(camera, homography, alignment.focal) if used else None
-            for camera, homography, used in zip(alignment.cameras, alignment.homographies, alignment.used, strict=True)
+        placed = [
+            (keyframe, Placement(camera, homography, alignment.focal))
+            for keyframe, camera, homography, used in zip(
+                keyframes, alignment.cameras, alignment.homographies, alignment.used, strict=True
+            )
+            if used
         ]
         self._planar_model = alignment.model
-        move = self._to_map(placements)
-        if move is None:
-            return
-        for keyframe, placement in zip(self._keyframes, placements, strict=True):
-            if placement is not None:
-                keyframe.placement = move.applied(placement)
-        if not self.distortion_known and self._std <= _KNOWN_STD and len(self._keyframes) >= _MIN_KEYFRAMES_FOR_LENS:
-            self._options = replace(
-                self._options, pair=replace(self._options.pair, distortion=self._distortion, solver="auto")
-            )
+        waiting, move = self.numbers_without_place, _to_map(placed)
+        for keyframe, placement in placed:
+            keyframe.place, keyframe.aligned = move.applied(placement), True
+        aligned = {id(keyframe) for keyframe, _ in placed}
+        for keyframe in self._keyframes:
+            links = [link for link in self._window_links if link.image2 == keyframe.number]
+            if id(keyframe) not in aligned and links:
+                self._settle(keyframe, links)
+        if not self.distortion_known and self._std <= _KNOWN_STD and len(keyframes) >= _MIN_KEYFRAMES_FOR_LENS:
+            pair = replace(self._options.pair, distortion=self._distortion, solver="auto")
+            self._options = replace(self._options, pair=pair)
             self._model, self._focal = alignment.model, alignment.focal
-
-    def _to_map(self, placements: Sequence[Placement | None]) -> PlaneSimilarity | None:
-        """From the plane of an alignment to that of the map; the first alignment defines it."""
-        both = [(new, keyframe.placement) for new, keyframe in zip(placements, self._keyframes, strict=True)]
-        shared = [(new, old) for new, old in both if new is not None and old is not None]
-        if shared:
-            return PlaneSimilarity.between(*zip(*shared, strict=True))
-        first = next((placement for placement in placements if placement is not None), None)
-        if first is None:
-            return None
-        return PlaneSimilarity(1.0, 0.0) if first.pose is None else PlaneSimilarity.to_origin(first.pose)
+        return [
+            replace(self._tracked(keyframe, keyframe=True, inliers=0), revised=True)
+            for keyframe in self._keyframes[:-1]
+            if keyframe.aligned and keyframe.number in waiting
+        ]
 
     def _tracked(self, frame: _Keyframe, *, keyframe: bool, inliers: int) -> Tracked:
         distortion = math.nan if self._distortion is None else self._distortion
         known = self.distortion_known
-        return Tracked(frame.number, frame.placement, distortion, self._std, known, self._map, keyframe, inliers)
+        placement = frame.place if frame.aligned else None
+        return Tracked(frame.number, placement, distortion, self._std, known, self._map, keyframe, inliers)
+
+
+def _to_map(placed: Sequence[tuple[_Keyframe, Placement]]) -> PlaneSimilarity:
+    """From the plane of an alignment to that of the map; the first alignment defines it."""
+    shared = [(new, keyframe.place) for keyframe, new in placed if keyframe.aligned and keyframe.place is not None]
+    if shared:
+        return PlaneSimilarity.between(*zip(*shared, strict=True))
+    pose = placed[0][1].pose
+    return PlaneSimilarity(1.0, 0.0) if pose is None else PlaneSimilarity.to_origin(pose)

@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rdstitch.inputs.find import find_images
-from rdstitch.inputs.frame_tracking import tracked
-from rdstitch.inputs.keyframes import Wanted, choose, keyframes, wanted_frames
+from rdstitch.inputs.keyframes import Wanted, choose, keyframes, tracked, wanted_frames
 from tests.videos import write_video
 
 _WIDTH, _HEIGHT = 160, 120
