@@ -25,6 +25,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.division_model import undistort
 from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.radial_homography import RadialHomography, transfer
+from rdstitch.robust.levenberg_marquardt import MIN_GAIN
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 from rdstitch.solvers.homography import direct_linear
 
@@ -127,7 +128,8 @@ class Problem:
     lens: FloatArray  # (5,): where to start
     free_lens: BoolArray  # (5,)
     camera_priors: CameraPriors
-    overdispersion: float = 1.0  # see BundleAdjuster
+    overdispersion: float = 1.0  # overdispersion, min_gain: see BundleAdjuster
+    min_gain: float = MIN_GAIN
 
     def part(self, kept: BoolArray, images: IntArray | None = None) -> tuple["Problem", IntArray]:
         """The problem of some links (L,) between these images, or the largest group that they connect; and the images.
@@ -238,7 +240,8 @@ class Problem:
         freedom = FreeParameters.fixing(model, self.count, [self.reference], self.free_lens)
         log_focal = None if shared is None or not len(shared) else float(shared[-1])
         priors = self.camera_priors.priors(model, self.count, tilt_spread, log_focal)
-        return BundleAdjuster(model, self.observations, freedom, priors, overdispersion or self.overdispersion)
+        adjuster = BundleAdjuster(model, self.observations, freedom, priors, overdispersion or self.overdispersion)
+        return replace(adjuster, min_gain=self.min_gain)
 
     def _chained(self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None) -> Parameters:
         """Every link on its own, chained along the tree of the links trusted most."""

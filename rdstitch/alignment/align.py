@@ -33,6 +33,7 @@ from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.matching.links import Link, in_alternate_directions
 from rdstitch.radial_homography import RadialHomography
+from rdstitch.robust.levenberg_marquardt import MIN_GAIN, PAIR_GAIN
 
 _UNCONFIRMED = 0.1
 """What the matches count in the spanning tree of a link without a consistent triangle, relative to one with."""
@@ -124,7 +125,7 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
     wrong, confirmed = cycle_consistency(apart, few, len(cameras))
     trust = _trust(few, confirmed)
     reference = -1 if options.reference is None else options.reference
-    whole = Problem(few, relations, trust, len(cameras), reference, lens, free_lens, known)
+    whole = Problem(few, relations, trust, len(cameras), reference, lens, free_lens, known, min_gain=PAIR_GAIN)
     problem, images = whole.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     problem = replace(
@@ -144,6 +145,7 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
     choice = choose_over_relief(problem, choice, options.models)
     free_lens = choice.fit.free_lens
     whole = replace(whole, observations=everything, free_lens=free_lens, overdispersion=choice.overdispersion)
+    whole = replace(whole, min_gain=MIN_GAIN)
     return AdjustedImages(
         cameras,
         links,

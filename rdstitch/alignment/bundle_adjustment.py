@@ -108,6 +108,7 @@ class BundleAdjuster:
     # variance of sums of errors over that of independent ones; weighs the correspondences against the priors
     overdispersion: float = 1.0
     max_iterations: int = 60  # linearizations at most
+    min_gain: float = MIN_GAIN  # expected relative fall of the cost that is worth another step
 
     def run(self, start: Parameters, revise: Revision | None = None) -> BundleAdjustmentResult:
         """Adjust.
@@ -176,7 +177,7 @@ class BundleAdjuster:
             step_poses[self.free.poses] = flat
             # The decrease of the quadratic model, less what the damping adds to it.
             predicted = -(normal.gradient_poses @ flat + normal.gradient_shared @ step_shared)
-            if not np.isfinite(predicted) or predicted <= MIN_GAIN * max(state.cost, 1e-12):
+            if not np.isfinite(predicted) or predicted <= self.min_gain * max(state.cost, 1e-12):
                 return state, used, True
             parameters_moved = state.parameters.retract(self.model, step_poses, step_shared, self.free.lens)
             used += 1

@@ -11,7 +11,7 @@ MIN_GAIN = 1e-5
 """Expected relative fall of the loss of all images that is worth another step: a hundredth of the noise."""
 
 PAIR_GAIN, ROUGH_GAIN = 1e-4, 1e-3
-"""The same of a pair, which has fewer matches; and where another descent goes on from there."""
+"""The same of a pair, or of a few matches of each; and where another descent goes on from there."""
 
 FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e4
 """Of the diagonal of the normal matrix: where a descent begins, and beyond which it has got stuck."""
