@@ -14,9 +14,8 @@ from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, 
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import Exposure, full_scale
-from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
 from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
-from rdstitch.compositing.warp import Geometry, Warp, locate
+from rdstitch.compositing.warp import Geometry, Warp, border_weight, locate, sample, sample_opacity
 
 
 @dataclass(frozen=True)
