@@ -351,8 +351,8 @@ def _refuse_absurd(
 ) -> None:
     """Refuse a canvas, or an image in it, that is out of all proportion to the input."""
     pixels = [c.image_size[0] * c.image_size[1] * scale**2 for c in cameras]
-    for outline, own, name in zip(outlines, pixels, names, strict=True):
-        growth = float(np.prod(np.ptp(outline, axis=0))) / own
+    for outline, image_pixels, name in zip(outlines, pixels, names, strict=True):
+        growth = float(np.prod(np.ptp(outline, axis=0))) / image_pixels
         if growth > _MAX_GROWTH:
             raise LimitError(
                 f"{name}: would be stretched to {growth:.0f} times its size (near the horizon, or wrongly placed); "

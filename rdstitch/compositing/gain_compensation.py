@@ -77,7 +77,7 @@ def compare_overlaps(survey: Survey) -> Cells | None:
     """Compare all images that lie over each other; None where no two show the same."""
     pairs, count = survey.pairs(), len(survey.tiles)
     areas = [0 if tile is None else np.count_nonzero(tile.inside) for tile in survey.tiles]
-    shares, found = np.zeros(len(pairs)), []
+    shares, means_of_pairs = np.zeros(len(pairs)), []
     for index, (i, j) in enumerate(pairs.tolist()):
         a, b, box, seen = survey.overlap(i, j)
         shares[index] = np.count_nonzero(seen) / min(areas[i], areas[j])
@@ -90,12 +90,12 @@ def compare_overlaps(survey: Survey) -> Cells | None:
         for which in filter(np.any, (lit & ~(bright_a | bright_b), lit & (bright_a | bright_b))):
             means = _cell_means(which, layers, side // step)
             means[:, :2] = means[:, :2] * step + box[:2]
-            found.append((np.full(len(means), index), means))
-    pair = np.concatenate([which for which, _ in found]) if found else np.zeros(0, dtype=np.intp)
+            means_of_pairs.append((np.full(len(means), index), means))
+    pair = np.concatenate([which for which, _ in means_of_pairs]) if means_of_pairs else np.zeros(0, dtype=np.intp)
     if not len(pair):
         return None
     kept = np.s_[:: -(-len(pair) // _MAX_CELLS)]
-    pair, means = pair[kept], np.concatenate([means for _, means in found])[kept]
+    pair, means = pair[kept], np.concatenate([means for _, means in means_of_pairs])[kept]
     values = np.moveaxis(means[:, 2:-2].reshape(len(means), 2, -1), 1, 0)
     overlap = sparse.csr_array((shares, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     clipped, points = means[:, -2:].T > 0.5, np.empty((2, len(pair), 2))
@@ -282,8 +282,8 @@ def _fit_fields(
     block = _evenness() + near * np.eye(nodes)
     precision = sparse.csr_array(sparse.kron(sparse.eye_array(len(cameras)), block))
     prior = precision, near * np.repeat(wanted, nodes, axis=0), np.asarray(np.linalg.inv(block), dtype=np.float64)
-    found, errors = _fit_robustly(cells, design, np.full(rows, _CELL_SIGMA**-2), values, prior)
-    return found.reshape(len(cameras), _NODES, _NODES, channels), errors
+    nodes_values, errors = _fit_robustly(cells, design, np.full(rows, _CELL_SIGMA**-2), values, prior)
+    return nodes_values.reshape(len(cameras), _NODES, _NODES, channels), errors
 
 
 def _evenness() -> FloatArray:
@@ -347,13 +347,13 @@ def _solve(
 
 def _medians(values: FloatArray, pair: IntArray, which: BoolArray) -> FloatArray:
     """Median of the values (M, C) of each pair, of those chosen (P, C); 0 where there are none."""
-    found = np.zeros((pair[-1] + 1, values.shape[1]))
+    medians = np.zeros((pair[-1] + 1, values.shape[1]))
     pair, values = pair[which], values[which]
     start = np.flatnonzero(np.diff(pair, prepend=-1))
     middle = start + np.diff(start, append=len(pair)) // 2
     for channel, column in enumerate(values.T):
-        found[pair[start], channel] = column[np.lexsort((column, pair))][middle]
-    return found
+        medians[pair[start], channel] = column[np.lexsort((column, pair))][middle]
+    return medians
 
 
 def _with_median_kept(exposure: Exposure, survey: Survey, cameras: Sequence[Camera]) -> Exposure:

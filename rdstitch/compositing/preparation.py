@@ -109,8 +109,8 @@ def _decided(
     box, note = _unwidened(canvas), ""
     if survey is not None and options.crop == "auto":
         find = crop_box if box is None else partial(crop_rows, whole=box)
-        found, note = find(covered_pixels(survey), survey.factor, canvas.size)
-        box = found or box
+        cropped_box, note = find(covered_pixels(survey), survey.factor, canvas.size)
+        box = cropped_box or box
     cropped = canvas if box is None else canvas.cropped(box)
     renderer = replace(renderer, exposure=exposure, seams=seams)
     tiles = TiledOutput(renderer, box or (0, 0, *canvas.size), plan.tile_size, plan.workers)

@@ -107,9 +107,9 @@ class Renderer:
         if opacity is not None:
             covered = covered & (opacity > 0)
         mask = np.zeros(covered.shape, dtype=np.bool_)
-        for own in self.owners(box):
-            if own.index == index:
-                cut(mask, box, own.box)[...] |= own.weight > 0
+        for layer in self.owners(box):
+            if layer.index == index:
+                cut(mask, box, layer.box)[...] |= layer.weight > 0
         samples = self._samples(Layer(index, box, covered.astype(np.float32), geometry), box)
         samples[~covered] = 0
         return samples, covered, mask

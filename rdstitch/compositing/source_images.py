@@ -73,8 +73,8 @@ def filled(pixels: NDArray[Any], opaque: BoolImage) -> NDArray[Any]:
         if not opaque[window].any():
             far.append(rows)
             continue
-        own = slice(rows.start - window.start, rows.stop - window.start)
-        result[rows] = _from_nearest(pixels[window], opaque[window], own)
+        inner = slice(rows.start - window.start, rows.stop - window.start)
+        result[rows] = _from_nearest(pixels[window], opaque[window], inner)
     below = list[slice]()
     for rows in far:
         if rows.start == (below[-1].stop if below else 0):
@@ -92,9 +92,9 @@ def opacity(opaque: BoolImage) -> tuple[NDArray[np.uint16], float]:
     weight = np.empty(opaque.shape, dtype=np.uint16)
     for rows, window in _windows(len(opaque), int(reach) + 1):
         distance = cv2.distanceTransform(opaque[window].view(np.uint8), cv2.DIST_L2, 5)
-        own = distance[rows.start - window.start : rows.stop - window.start]
+        within = distance[rows.start - window.start : rows.stop - window.start]
         # Where nothing is transparent distances are beyond all numbers.
-        weight[rows] = np.rint(np.minimum(own, np.float32(reach)) * np.float32(OPAQUE / reach))
+        weight[rows] = np.rint(np.minimum(within, np.float32(reach)) * np.float32(OPAQUE / reach))
     return weight, 1.0 / reach
 
 
@@ -276,8 +276,8 @@ class ImageReader:
         elif pixels.shape[2:] == (3,) and channels == ():
             pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
         if (pixels.shape[2:], pixels.dtype) != (channels, dtype):
-            own, other = _kind(pixels.shape[2:], pixels.dtype), _kind(channels, dtype)
-            raise InputError(f"{called}: has {own}, but {first} has {other}; convert them to one kind")
+            kind, expected = _kind(pixels.shape[2:], pixels.dtype), _kind(channels, dtype)
+            raise InputError(f"{called}: has {kind}, but {first} has {expected}; convert them to one kind")
         self._masked[index] = image.alpha is not None
         return replace(image, pixels=pixels)
 

@@ -224,9 +224,9 @@ def locate(warp: Warp, box: Box) -> Geometry:
 
 def _somewhere(points: FloatArray) -> Float32Array:
     """Places in an image, far outside where there are none."""
-    there = points.astype(np.float32)
-    there[~np.isfinite(there).all(axis=-1)] = _NOWHERE
-    return there
+    placed = points.astype(np.float32)
+    placed[~np.isfinite(placed).all(axis=-1)] = _NOWHERE
+    return placed
 
 
 def _grid(camera: Camera) -> FloatArray:
@@ -327,8 +327,8 @@ def _mirrored(image: LoadedImage, geometry: Geometry) -> tuple[Float32Array, Flo
     if not geometry.inside.all():
         # Mirroring rounds: what is inside keeps its coordinates, whatever else the box holds.
         mirrored = [_mirror(m, n) for m, n in zip((map_x, map_y), geometry.warp.camera.image_size, strict=True)]
-        for values, own in zip(mirrored, (map_x, map_y), strict=True):
-            np.copyto(values, own, where=geometry.inside)
+        for values, exact in zip(mirrored, (map_x, map_y), strict=True):
+            np.copyto(values, exact, where=geometry.inside)
         map_x, map_y = mirrored
     if image.reduction > 1:
         half, factor = np.float32(0.5), np.float32(image.reduction)

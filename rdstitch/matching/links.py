@@ -58,13 +58,13 @@ class Link:
 
     def reversed(self) -> Self:
         """The same correspondences, from the second image to the first."""
-        own = self.relation
-        back: FloatArray = np.linalg.inv(own.homography).astype(np.float64)
+        relation = self.relation
+        back: FloatArray = np.linalg.inv(relation.homography).astype(np.float64)
         relation = replace(
-            own,
+            relation,
             homography=back,
-            camera=own.camera2,
-            camera2=own.camera,
+            camera=relation.camera2,
+            camera2=relation.camera,
             covariance=np.empty((0, 0)),
             motion=None,
         )

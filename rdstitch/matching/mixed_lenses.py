@@ -105,14 +105,14 @@ class Votes:
 
 def _votes(pairs: Sequence[PairRegistration], threshold: float) -> list[OwnLenses]:
     """λ of both images of each pair, from what lies not too far from where one λ puts it."""
-    found: list[OwnLenses] = []
+    lenses: list[OwnLenses] = []
     for start in range(0, len(pairs), _PAIRS_AT_ONCE):
         block = pairs[start : start + _PAIRS_AT_ONCE]
         points = [_near(pair, threshold) for pair in block]
         cameras = [(pair.relation.camera, pair.relation.camera2) for pair in block]
         relations = [pair.relation for pair in block]
-        found += own_lenses(relations, Measurements.of_pairs(points, cameras), threshold)
-    return found
+        lenses += own_lenses(relations, Measurements.of_pairs(points, cameras), threshold)
+    return lenses
 
 
 def _near(pair: PairRegistration, threshold: float) -> tuple[FloatArray, FloatArray]:
@@ -159,7 +159,7 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     if not len(votes):
         return None
     count, gap = len(cameras), max(_MIN_GAP, _MIN_GAP_PX / min(camera.scale for camera in cameras))
-    divisions = [found for found in _divisions(count, votes) if abs(found[1][1] - found[1][0]) >= gap]
+    divisions = [division for division in _divisions(count, votes) if abs(division[1][1] - division[1][0]) >= gap]
     if not divisions:
         return None
     second, lenses = min(
@@ -208,13 +208,13 @@ def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> d
     linked = [pair for pair in pairs if pair.relation]
     sizes = []
     for second in (False, True):
-        own = [pair for pair in linked if mixed.second[[pair.image1, pair.image2]].tolist() == [second] * 2]
-        members = {image for pair in own for image in pair.images}
-        sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in own)))
+        of_lens = [pair for pair in linked if mixed.second[[pair.image1, pair.image2]].tolist() == [second] * 2]
+        members = {image for pair in of_lens for image in pair.images}
+        sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in of_lens)))
     kept = sizes[1] > sizes[0]
-    there, here = mixed.distortion[not kept], mixed.distortion[kept]
+    left_out, used = mixed.distortion[not kept], mixed.distortion[kept]
     reason = (
-        f"comes from another lens or zoom setting (λ about {there:.3f}, that of the others {here:.3f}); "
+        f"comes from another lens or zoom setting (λ about {left_out:.3f}, that of the others {used:.3f}); "
         "stitch those of each on their own"
     )
     return {int(k): reason for k in np.flatnonzero(mixed.second != kept)}
@@ -223,10 +223,10 @@ def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> d
 def _divisions(count: int, votes: Votes) -> Iterator[tuple[BoolArray, FloatArray]]:
     """Images of the second of two lenses, and λ of both, by the widest gaps between λ of each image on its own."""
     every = np.stack([votes.image1, votes.image2], axis=1)
-    own = votes.fitted(every, np.full(count, np.median(votes.distortion)))
-    levels = np.unique(own[every])
+    of_images = votes.fitted(every, np.full(count, np.median(votes.distortion)))
+    levels = np.unique(of_images[every])
     for cut in np.argsort(levels[:-1] - levels[1:], kind="stable")[:_STARTS]:
-        second, lenses = own > levels[cut], levels[[cut, cut + 1]]
+        second, lenses = of_images > levels[cut], levels[[cut, cut + 1]]
         for _ in range(_ROUNDS):
             lenses = votes.fitted(votes.which(second), lenses)
             second ^= _margins(count, votes, second, lenses) < 0.0
