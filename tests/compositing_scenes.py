@@ -13,7 +13,7 @@ from examples.judging.comparison import plane_under
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, PlacedImage, plan_canvas
-from rdstitch.compositing.placed_image import Displacement, ImageLoader
+from rdstitch.compositing.source_images import Displacement, ImageLoader
 from rdstitch.io import DecodedImage, Metadata
 from rdstitch.synthetic.poses import grid_poses
 from rdstitch.synthetic.rendering import Photometry, sequence_over

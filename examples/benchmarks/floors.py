@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 import rdstitch
 from examples.benchmarks.driver import images_of, run, timed
+from rdstitch.features.opencv import SIFT_CONTRAST
 from rdstitch.features.options import FeatureOptions
 from rdstitch.radial_homography import transfer_jacobian
 
@@ -93,7 +94,7 @@ def floors(
     """Seconds of the least that can be done in place of each stage but the decoding."""
     options = FeatureOptions().for_images(len(images))
     most, megapixels = options.limits
-    sift = cv2.SIFT.create(nfeatures=most, contrastThreshold=options.sift_contrast, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(nfeatures=most, contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
     small = [_reduced(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)), megapixels) for image in images]
     taken = {}
     taken["detect and describe"], found = timed(lambda: [sift.detectAndCompute(grey, None)[1] for grey in small])

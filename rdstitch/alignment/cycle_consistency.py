@@ -12,7 +12,7 @@ from rdstitch.alignment.link_equations import split_lens
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.late_imports import sparse
-from rdstitch.matching.thinning import spread_choice
+from rdstitch.matching.links import spread_choice
 from rdstitch.radial_homography import transfer_jacobian
 
 _PROBES = 6

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
-from rdstitch.matching.links import Link
-from rdstitch.matching.thinning import spread_choice
+from rdstitch.matching.links import Link, spread_choice
 
 _CHUNK = 4096
 """Correspondences linearized at a time: what stays in cache."""

@@ -4,8 +4,8 @@ from rdstitch.compositing.canvas import Canvas, plan_canvas
 from rdstitch.compositing.compositor import Composite, FileComposite, compose, compose_to_file
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.panorama_canvas import plan_panorama
-from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.plan import CompositePlan, plan_composite
+from rdstitch.compositing.source_images import PlacedImage
 
 __all__ = [
     "Canvas",

@@ -3,6 +3,12 @@
 A homography ``G`` maps the half-diagonal-normalized undistorted coordinates of its image to *plane* coordinates,
 which have no unit; the canvas is the plane scaled, turned and shifted to pixels. Where images were taken by turning
 on the spot, G maps them to directions, and the canvas is what a projection makes of these.
+
+Of an oblique image the near part is drawn, which is not much coarser than the reference image. A plane seen obliquely
+gets coarser towards the horizon, along the line of sight with the square of the distance. The distance is one over the
+third coordinate of ``G p``, undistorted points p of the image mapped to the plane; so a limit on the stretch is, in
+undistorted coordinates, a straight line parallel to the horizon. What the lens itself stretches, towards the corners
+of a wide-angle image, does not count.
 """
 
 import math
@@ -10,18 +16,126 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.camera import Camera, points_over
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.near_part import NearPart, near_parts
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.errors import ArgumentError, LimitError
+from rdstitch.io.read import DecodedImage
 from rdstitch.radial_homography import to_directions, to_plane
 
+_PROBES = 33  # points of a grid over the image, and along its outline, a side, at which the stretch is measured
+_POINTS_PER_SIDE = 64  # as the canvas samples outlines: undistorted, straight sides are curved
+_ROWS = 64  # rows of a mask that are computed at a time, so that they stay in the processor's cache
+
+
+@dataclass(frozen=True)
+class NearPart:
+    """The part of an image that is drawn."""
+
+    camera: Camera
+    # (3,): what is drawn has ``depth · (x, y, 1) > 0``; x, y undistorted, in half diagonals from the distortion centre
+    depth: FloatArray
+
+    def outline(self) -> FloatArray:
+        """Its border, measured pixels (K, 2), clockwise; empty where nothing is drawn."""
+        border = self.camera.outline(_POINTS_PER_SIDE)
+        flat = self.camera.normalize(self.camera.undistort(border))
+        inside = self._value(flat) > 0.0
+        if inside.all() or not inside.any():
+            return border if inside.all() else np.empty((0, 2))
+        # Begin where the border comes back from beyond the limit, so that the drawn part is in one piece.
+        start = int(np.flatnonzero(inside & ~np.roll(inside, 1))[0])
+        border, flat, inside = np.roll(border, -start, axis=0), np.roll(flat, -start, axis=0), np.roll(inside, -start)
+        last = int(np.flatnonzero(inside)[-1])
+        ends = [self._crossing(flat[last], flat[(last + 1) % len(flat)]), self._crossing(flat[-1], flat[0])]
+        cut = ends[0] + np.linspace(0.0, 1.0, _POINTS_PER_SIDE)[:, None] * (ends[1] - ends[0])
+        measured = np.asarray(self.camera.distort(self.camera.denormalize(cut)))
+        kept = border[: last + 1][inside[: last + 1]]
+        return np.concatenate([kept, measured[np.isfinite(measured).all(axis=1)]])
+
+    def masked(self, image: DecodedImage) -> DecodedImage:
+        """The image, whole or reduced, with the rest transparent."""
+        height, width = image.pixels.shape[:2]
+        shown = self._shown(width, height)
+        alpha = np.where(shown, np.uint8(255) if image.alpha is None else image.alpha, np.uint8(0))
+        return replace(image, alpha=alpha)
+
+    def _shown(self, width: int, height: int) -> NDArray[np.bool_]:
+        """Which pixels of the image at a size are drawn; in measured coordinates the limit is a conic."""
+        camera = self.camera.resized((width, height))
+        x = (np.arange(width) - camera.center[0]) / camera.scale
+        shown = np.empty((height, width), dtype=np.bool_)
+        for top in range(0, height, _ROWS):
+            y = ((np.arange(top, min(top + _ROWS, height)) - camera.center[1]) / camera.scale)[:, None]
+            radius2 = x**2 + y**2
+            lens = np.zeros_like(radius2)
+            for coefficient in (*reversed(camera.coefficients), 1.0):  # Horner's scheme, in place
+                lens *= radius2
+                lens += coefficient
+            shown[top : top + _ROWS] = self.depth[0] * x + self.depth[1] * y + self.depth[2] * lens > 0.0
+        return shown
+
+    def _value(self, flat: FloatArray) -> FloatArray:
+        """What is positive where undistorted points (K, 2) are drawn."""
+        value: FloatArray = flat @ self.depth[:2] + self.depth[2]
+        return value
+
+    def _crossing(self, inside: FloatArray, outside: FloatArray) -> FloatArray:
+        """Where the line between two undistorted points meets the limit."""
+        a, b = self._value(np.stack([inside, outside]))
+        crossing: FloatArray = inside + (outside - inside) * (a / (a - b))
+        return crossing
+
+
+def near_parts(
+    cameras: Sequence[Camera], homographies: Sequence[FloatArray], resolution: float, max_stretch: float
+) -> list[NearPart | None]:
+    """What of each image is drawn; None for all of it.
+
+    Parameters
+    ----------
+    homographies : sequence of ndarray of shape (3, 3)
+        Normalized undistorted coordinates to the plane, with positive third coordinates in front of the camera.
+    resolution : float
+        Canvas pixels per unit of the plane at which the reference image keeps its size.
+    max_stretch : float
+        How many times coarser than the reference image, or than its own finest part where that is coarser, an image
+        may be.
+    """
+    parts: list[NearPart | None] = []
+    if max_stretch == np.inf:
+        return [None] * len(cameras)
+    for camera, matrix in zip(cameras, homographies, strict=True):
+        stretch, depth = _stretch(camera, matrix, resolution)
+        finest = max(1.0, float(stretch.min()))
+        beyond = depth[stretch > max_stretch * finest]
+        if not len(beyond):
+            parts.append(None)
+            continue
+        parts.append(NearPart(camera, matrix[2] - np.array([0.0, 0.0, max(float(beyond.max()), 0.0)])))
+    return parts
+
+
+def _stretch(camera: Camera, matrix: FloatArray, resolution: float) -> tuple[FloatArray, FloatArray]:
+    """Canvas pixels per undistorted pixel, in the direction in which they are most, and depth, over an image (K,)."""
+    grid = points_over(camera.image_size, _PROBES)
+    drawn = grid[np.linalg.norm(grid - camera.center, axis=1) <= camera.drawn_radius]
+    flat = camera.normalize(camera.undistort(np.concatenate([drawn, camera.outline(_PROBES)])))
+    flat = flat[np.isfinite(flat).all(axis=1)]  # a fisheye may see beyond its horizon
+    moved = flat @ matrix[:, :2].T + matrix[:, 2]
+    depth: FloatArray = moved[:, 2]
+    with np.errstate(all="ignore"):
+        plane = moved[:, :2] / depth[:, None]
+        jacobian = (matrix[None, :2, :2] - plane[:, :, None] * matrix[None, 2:, :2]) / depth[:, None, None]
+        jacobian = np.where((depth > 0.0)[:, None, None], jacobian, 0.0)
+        largest = np.linalg.norm(jacobian, 2, axis=(1, 2)) * resolution / camera.scale
+    return np.where(depth > 0.0, largest, np.inf), depth
+
+
 # Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 pixels on 4000 pixels.
-_POINTS_PER_SIDE = 64
 _MAX_GROWTH = 100.0
 _MAX_ENLARGEMENT = 400.0  # pixels of the canvas for each of the images, where --scale requests it
 
@@ -146,7 +260,7 @@ def plan_canvas(
         What to call the images in messages.
     max_stretch : float
         What an image shows so many times coarser than the reference image has no place on the canvas; see
-        :mod:`rdstitch.compositing.near_part`. Without a limit, an image that shows the horizon is refused.
+        :mod:`rdstitch.compositing.canvas`. Without a limit, an image that shows the horizon is refused.
     """
     matrices = np.asarray(homographies, dtype=np.float64)
     called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
@@ -237,8 +351,8 @@ def _refuse_absurd(
 ) -> None:
     """Refuse a canvas, or an image in it, that is out of all proportion to the input."""
     pixels = [c.image_size[0] * c.image_size[1] * scale**2 for c in cameras]
-    for outline, own, name in zip(outlines, pixels, names, strict=True):
-        growth = float(np.prod(np.ptp(outline, axis=0))) / own
+    for outline, image_pixels, name in zip(outlines, pixels, names, strict=True):
+        growth = float(np.prod(np.ptp(outline, axis=0))) / image_pixels
         if growth > _MAX_GROWTH:
             raise LimitError(
                 f"{name}: would be stretched to {growth:.0f} times its size (near the horizon, or wrongly placed); "

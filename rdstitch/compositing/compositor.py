@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.blocks import BlockRunner
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.panorama_canvas import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
-from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
+from rdstitch.compositing.source_images import PlacedImage
+from rdstitch.compositing.tiles import BlockRunner
 from rdstitch.io.encoding import Layout
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
@@ -81,7 +81,7 @@ def compose(
     progress : callable, optional
         Called with the share of the work done, 0 to 1.
     elsewhere : callable, optional
-        Computes the pixels, in blocks, in other processes; see :mod:`rdstitch.compositing.blocks`.
+        Computes the pixels, in blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
     """
     with prepare_composite(images, canvas, options, progress, elsewhere) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size

@@ -11,20 +11,122 @@ With "balanced", fields tend to the brightness of each region's own images inste
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
+from rdstitch.compositing.boxes import cut
 from rdstitch.compositing.options import ExposureMethod
-from rdstitch.compositing.overlap_cells import Cells, compare_overlaps
 from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale, no_exposure, squared_radius
-from rdstitch.compositing.placed_image import PlacedImage
+from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.survey import Survey
 from rdstitch.late_imports import sparse
+
+# Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.
+_CELLS, _MAX_CELLS = 16, 150_000
+_SAMPLES = 12  # along a side of a cell
+# Integer samples outside this part of the range are clipped or mostly noise.
+_DARKEST, _BRIGHTEST = 0.02, 0.97
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells that two images show.
+
+    Attributes
+    ----------
+    pair : ndarray of shape (M,)
+        Index of the overlap, ascending.
+    images : ndarray of shape (2, M)
+    points : ndarray of shape (2, M, 2)
+        Middle of the cell, measured pixels of either image.
+    values : ndarray of shape (2, M, C)
+        Mean samples, share of the full range.
+    clipped : ndarray of shape (2, M), bool
+        Where an image is burnt out: its light is what the samples say, or more. Other cells hold no clipped sample.
+    overlap : sparse array of shape (N, N)
+        What two images have in common, share of the smaller one.
+    """
+
+    pair: IntArray
+    images: IntArray
+    points: FloatArray
+    values: FloatArray
+    clipped: BoolArray
+    overlap: "sparse.csr_array"
+
+    @property
+    def clear(self) -> BoolArray:
+        """Cells (M,) where neither image is burnt out."""
+        return np.asarray(~self.clipped.any(axis=0))
+
+    def by_image(self) -> Iterator[tuple[int, int, IntArray]]:
+        """Side (0 or 1), image, and its cells."""
+        for side, images in enumerate(self.images):
+            order = np.argsort(images, kind="stable")
+            for cells in np.split(order, np.flatnonzero(np.diff(images[order])) + 1):
+                yield side, int(images[cells[0]]), cells
+
+
+def compare_overlaps(survey: Survey) -> Cells | None:
+    """Compare all images that lie over each other; None where no two show the same."""
+    pairs, count = survey.pairs(), len(survey.tiles)
+    areas = [0 if tile is None else np.count_nonzero(tile.inside) for tile in survey.tiles]
+    shares, means_of_pairs = np.zeros(len(pairs)), []
+    for index, (i, j) in enumerate(pairs.tolist()):
+        a, b, box, seen = survey.overlap(i, j)
+        shares[index] = np.count_nonzero(seen) / min(areas[i], areas[j])
+        side = max(2, round(max(*seen.shape, *a.inside.shape, *b.inside.shape) / _CELLS))
+        step = max(1, side // _SAMPLES)
+        few = np.s_[::step, ::step]
+        (va, bright_a), (vb, bright_b) = (_samples(cut(tile.pixels, tile.box, box)[few]) for tile in (a, b))
+        lit = seen[few] & (np.minimum(va, vb) > (_DARKEST if a.pixels.dtype.kind == "u" else 0.0)).all(axis=0)
+        layers = np.concatenate([va, vb, [bright_a, bright_b]])
+        for which in filter(np.any, (lit & ~(bright_a | bright_b), lit & (bright_a | bright_b))):
+            means = _cell_means(which, layers, side // step)
+            means[:, :2] = means[:, :2] * step + box[:2]
+            means_of_pairs.append((np.full(len(means), index), means))
+    pair = np.concatenate([which for which, _ in means_of_pairs]) if means_of_pairs else np.zeros(0, dtype=np.intp)
+    if not len(pair):
+        return None
+    kept = np.s_[:: -(-len(pair) // _MAX_CELLS)]
+    pair, means = pair[kept], np.concatenate([means for _, means in means_of_pairs])[kept]
+    values = np.moveaxis(means[:, 2:-2].reshape(len(means), 2, -1), 1, 0)
+    overlap = sparse.csr_array((shares, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    clipped, points = means[:, -2:].T > 0.5, np.empty((2, len(pair), 2))
+    cells = Cells(pair, pairs[pair].T, points, values, clipped, sparse.csr_array(overlap + overlap.T))
+    for end, image, chosen in cells.by_image():
+        points[end, chosen] = survey.warps[image].source_points(*means[chosen, :2].T)
+    known = np.isfinite(points).all(axis=(0, 2))
+    parts = (cells.images[:, known], points[:, known], values[:, known], clipped[:, known])
+    return Cells(pair[known], *parts, cells.overlap)
+
+
+def _samples(pixels: NDArray[Any]) -> tuple[FloatArray, BoolArray]:
+    """Samples as share of the full range (C, h, w), and which pixels are clipped (h, w)."""
+    values = np.ascontiguousarray(np.moveaxis(pixels, -1, 0)) / full_scale(pixels.dtype)
+    return values, np.asarray((values > (_BRIGHTEST if pixels.dtype.kind == "u" else np.inf)).any(axis=0))
+
+
+def _cell_means(which: BoolArray, values: FloatArray, side: int) -> FloatArray:
+    """Mean x, y (pixels of the box) and values (K, h, w) of every cell of which more than half counts, (M, 2 + K).
+
+    As products with matrices of ones and zeros, which are many times faster than sums along short axes.
+    """
+    weight = which.astype(np.float64)
+    rows, columns = (1.0 * (np.arange(n) // side == np.arange(-(-n // side))[:, None]) for n in which.shape)
+    down, across = (cells * np.arange(cells.shape[1]) for cells in (rows, columns))
+    count, x, y = (a @ weight @ b.T for a, b in ((rows, columns), (rows, across), (down, columns)))
+    sums = rows @ (values * weight) @ columns.T
+    used = count > side**2 / 2
+    means: FloatArray = np.column_stack([x[used], y[used], *sums[:, used]]) / count[used][:, None]
+    return means
+
 
 _SRGB_OFFSET = 0.055
 # How well the gains of two images can explain their overlap, and how far gains stray (log units): keeps long chains
@@ -180,8 +282,8 @@ def _fit_fields(
     block = _evenness() + near * np.eye(nodes)
     precision = sparse.csr_array(sparse.kron(sparse.eye_array(len(cameras)), block))
     prior = precision, near * np.repeat(wanted, nodes, axis=0), np.asarray(np.linalg.inv(block), dtype=np.float64)
-    found, errors = _fit_robustly(cells, design, np.full(rows, _CELL_SIGMA**-2), values, prior)
-    return found.reshape(len(cameras), _NODES, _NODES, channels), errors
+    nodes_values, errors = _fit_robustly(cells, design, np.full(rows, _CELL_SIGMA**-2), values, prior)
+    return nodes_values.reshape(len(cameras), _NODES, _NODES, channels), errors
 
 
 def _evenness() -> FloatArray:
@@ -245,13 +347,13 @@ def _solve(
 
 def _medians(values: FloatArray, pair: IntArray, which: BoolArray) -> FloatArray:
     """Median of the values (M, C) of each pair, of those chosen (P, C); 0 where there are none."""
-    found = np.zeros((pair[-1] + 1, values.shape[1]))
+    medians = np.zeros((pair[-1] + 1, values.shape[1]))
     pair, values = pair[which], values[which]
     start = np.flatnonzero(np.diff(pair, prepend=-1))
     middle = start + np.diff(start, append=len(pair)) // 2
     for channel, column in enumerate(values.T):
-        found[pair[start], channel] = column[np.lexsort((column, pair))][middle]
-    return found
+        medians[pair[start], channel] = column[np.lexsort((column, pair))][middle]
+    return medians
 
 
 def _with_median_kept(exposure: Exposure, survey: Survey, cameras: Sequence[Camera]) -> Exposure:

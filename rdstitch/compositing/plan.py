@@ -8,8 +8,8 @@ import numpy as np
 from rdstitch.camera import Camera
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.masked_pixels import OPACITY_BYTES
 from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.source_images import OPACITY_BYTES
 from rdstitch.errors import LimitError
 from rdstitch.machine import available_memory, processor_count
 

@@ -6,21 +6,18 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from rdstitch.compositing.blender import margin
-from rdstitch.compositing.blocks import BlockRunner, strips_of_blocks
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.crop import covered_pixels, crop_box, crop_rows
 from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import no_exposure
-from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
-from rdstitch.compositing.source_images import ImageReader
-from rdstitch.compositing.survey import survey_factor, survey_images
-from rdstitch.compositing.tiles import OutputStrip, TiledOutput
+from rdstitch.compositing.source_images import ImageReader, PlacedImage
+from rdstitch.compositing.survey import covered_pixels, crop_box, crop_rows, survey_factor, survey_images
+from rdstitch.compositing.tiles import BlockRunner, OutputStrip, TiledOutput, strips_of_blocks
 from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.messages import Message
@@ -40,7 +37,7 @@ class Prepared:
     canvas: Canvas  # after cropping
     tiles: TiledOutput  # its pixels; their box is on the canvas of the renderer, before cropping
     messages: tuple[Message, ...]
-    elsewhere: BlockRunner | None = None  # computes the pixels in blocks, see :mod:`rdstitch.compositing.blocks`
+    elsewhere: BlockRunner | None = None  # computes the pixels in blocks, see :mod:`rdstitch.compositing.tiles`
 
     def strips(self, progress: ShareProgress = unheard) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
@@ -112,8 +109,8 @@ def _decided(
     box, note = _unwidened(canvas), ""
     if survey is not None and options.crop == "auto":
         find = crop_box if box is None else partial(crop_rows, whole=box)
-        found, note = find(covered_pixels(survey), survey.factor, canvas.size)
-        box = found or box
+        cropped_box, note = find(covered_pixels(survey), survey.factor, canvas.size)
+        box = cropped_box or box
     cropped = canvas if box is None else canvas.cropped(box)
     renderer = replace(renderer, exposure=exposure, seams=seams)
     tiles = TiledOutput(renderer, box or (0, 0, *canvas.size), plan.tile_size, plan.workers)

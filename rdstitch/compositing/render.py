@@ -14,9 +14,8 @@ from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, 
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import Exposure, full_scale
-from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
 from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
-from rdstitch.compositing.warp import Geometry, Warp, locate
+from rdstitch.compositing.warp import Geometry, Warp, border_weight, locate, sample, sample_opacity
 
 
 @dataclass(frozen=True)
@@ -108,9 +107,9 @@ class Renderer:
         if opacity is not None:
             covered = covered & (opacity > 0)
         mask = np.zeros(covered.shape, dtype=np.bool_)
-        for own in self.owners(box):
-            if own.index == index:
-                cut(mask, box, own.box)[...] |= own.weight > 0
+        for layer in self.owners(box):
+            if layer.index == index:
+                cut(mask, box, layer.box)[...] |= layer.weight > 0
         samples = self._samples(Layer(index, box, covered.astype(np.float32), geometry), box)
         samples[~covered] = 0
         return samples, covered, mask

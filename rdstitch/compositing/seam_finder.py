@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.photometric import Exposure, full_scale
-from rdstitch.compositing.sampling import border_weight
 from rdstitch.compositing.survey import Survey
-from rdstitch.compositing.warp import locate
+from rdstitch.compositing.warp import border_weight, locate
 from rdstitch.io.reduction import block_mean
 from rdstitch.progress import ShareProgress, unheard
 

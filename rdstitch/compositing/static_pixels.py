@@ -53,14 +53,14 @@ def static_pixels(images: Sequence[NDArray[np.generic]]) -> BoolArray | None:
 
 def _agreement(grey: NDArray[np.float32], window: int) -> FloatArray:
     """How far the corners of different images agree, over a window, shape (h, w): 1 for what stays, else about 0."""
-    own, total = np.zeros((3, *grey.shape[1:])), np.zeros((2, *grey.shape[1:]))
+    within_images, total = np.zeros((3, *grey.shape[1:])), np.zeros((2, *grey.shape[1:]))
     for image in grey:
         slope = np.stack([cv2.Sobel(image, cv2.CV_64F, 1, 0), cv2.Sobel(image, cv2.CV_64F, 0, 1)])
-        own += _tensor(slope)
+        within_images += _tensor(slope)
         total += slope
     # Products of the slopes of one image with those of all others, against those with its own.
-    others = (_tensor(total) - own) / (len(grey) - 1)
-    corners, common = (_smaller_eigenvalue(tensor, window) for tensor in (own, others))
+    others = (_tensor(total) - within_images) / (len(grey) - 1)
+    corners, common = (_smaller_eigenvalue(tensor, window) for tensor in (within_images, others))
     agreement: FloatArray = common / np.maximum(corners, _MIN_TEXTURE * float(np.median(corners)) + 1e-12)
     return agreement
 
@@ -91,18 +91,18 @@ def _with_captions(static: BoolArray, same: BoolArray, window: int) -> BoolArray
     pieces = [cv2.connectedComponentsWithStats(part.astype(np.uint8)) for part in parts]
     (_, labels, inside, _), (_, _, outside, _) = pieces
     large = np.flatnonzero(inside[:, cv2.CC_STAT_AREA] > outside[1:, cv2.CC_STAT_AREA].max(initial=0))
-    found = np.isin(labels, large[large > 0]) & (not strips.all())
-    return static | (cv2.dilate(found.astype(np.uint8), np.ones((5, 5), dtype=np.uint8)) > 0)
+    captions = np.isin(labels, large[large > 0]) & (not strips.all())
+    return static | (cv2.dilate(captions.astype(np.uint8), np.ones((5, 5), dtype=np.uint8)) > 0)
 
 
-def _regions(found: NDArray[np.bool_], *, at_border: bool) -> NDArray[np.bool_]:
+def _regions(candidates: NDArray[np.bool_], *, at_border: bool) -> NDArray[np.bool_]:
     """The connected regions that are large enough, and reach the border if they must; grown by two pixels."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(candidates.astype(np.uint8))
     border = set(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]).tolist())
     large = [
         k
         for k in range(1, count)
-        if stats[k, cv2.CC_STAT_AREA] >= _MIN_AREA * found.size and (not at_border or k in border)
+        if stats[k, cv2.CC_STAT_AREA] >= _MIN_AREA * candidates.size and (not at_border or k in border)
     ]
     kept = np.isin(labels, large).astype(np.uint8)
     return np.asarray(cv2.dilate(kept, np.ones((5, 5), dtype=np.uint8)), dtype=np.bool_)

@@ -16,11 +16,10 @@ from rdstitch.compositing.boxes import Box, Float32Array, cut
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import DEPTHS, full_scale
-from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.render import Layer
-from rdstitch.compositing.sampling import INTERPOLATION, remap, sample_places
-from rdstitch.compositing.source_images import LoadedImage, smoothed
+from rdstitch.compositing.source_images import LoadedImage, PlacedImage, smoothed
+from rdstitch.compositing.warp import INTERPOLATION, remap, sample_places
 from rdstitch.errors import ArgumentError
 
 

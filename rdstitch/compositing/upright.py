@@ -300,21 +300,21 @@ def of_scene(edges: Edges, start: FloatArray, focal: Focal, *, depth: bool) -> t
         tried.append((score - step**2 / 2.0, -abs(step), value, axes))
     _, _, value, axes = max(tried, key=lambda one: one[:2])
     angles = edges.angles(axes if depth else axes[:2], value)
-    own, fitting = np.argmin(angles, axis=0), angles.min(axis=0, initial=np.inf) < _TOLERANCE
-    meaningful = [k for k in range(len(angles)) if _false_alarms(own == k, fitting) < _FALSE_ALARMS]
+    axis, fitting = np.argmin(angles, axis=0), angles.min(axis=0, initial=np.inf) < _TOLERANCE
+    meaningful = [k for k in range(len(angles)) if _false_alarms(axis == k, fitting) < _FALSE_ALARMS]
     if not {0, 1} & set(meaningful):
         return None
-    kept = fitting & np.isin(own, meaningful)
-    upright = of_edges(edges.chosen(kept), own[kept], axes if len(meaningful) > 1 else start, focal, value)
-    return upright, int((own[kept] == 0).sum()), int((own[kept] == 1).sum())
+    kept = fitting & np.isin(axis, meaningful)
+    upright = of_edges(edges.chosen(kept), axis[kept], axes if len(meaningful) > 1 else start, focal, value)
+    return upright, int((axis[kept] == 0).sum()), int((axis[kept] == 1).sum())
 
 
-def _false_alarms(own: BoolArray, fitting: BoolArray) -> float:
+def _false_alarms(of_axis: BoolArray, fitting: BoolArray) -> float:
     """Directions by pairs of edges that would be expected to fit as many edges by chance.
 
     Edges come in pairs, one on each side of a line; only half of them count.
     """
-    count, fit = int(own.sum()) // 2, int((own & fitting).sum()) // 2
+    count, fit = int(of_axis.sum()) // 2, int((of_axis & fitting).sum()) // 2
     return float(count**2 / 2.0 * binomial_tail(fit, count, _TOLERANCE / (np.pi / 4))) if fit else math.inf
 
 
@@ -325,16 +325,16 @@ def _best_axes(edges: Edges, start: FloatArray, focal: float, *, depth: bool) ->
     near = nearest_axis(edges, start[:2], focal)
     frames = [start[None]]
     for first, second in ((1, 0), (0, 1)):
-        own, others = np.flatnonzero(near == first), np.flatnonzero(near == second)
-        if len(own) < 2:
+        parallel, others = np.flatnonzero(near == first), np.flatnonzero(near == second)
+        if len(parallel) < 2:
             continue
-        pairs = rng.choice(own, (2, _HYPOTHESES))
-        found = _along(np.cross(normals[pairs[0]], normals[pairs[1]]), start[first])
+        pairs = rng.choice(parallel, (2, _HYPOTHESES))
+        directions = _along(np.cross(normals[pairs[0]], normals[pairs[1]]), start[first])
         if len(others):
-            across = np.cross(normals[rng.choice(others, _HYPOTHESES)], found)
+            across = np.cross(normals[rng.choice(others, _HYPOTHESES)], directions)
         else:
-            across = start[second] - (found @ start[second])[:, None] * found
-        both = [_along(across, start[second]), found]
+            across = start[second] - (directions @ start[second])[:, None] * directions
+        both = [_along(across, start[second]), directions]
         right, down = both if first == 1 else both[::-1]
         frames.append(np.stack([right, down, np.cross(right, down)], axis=1))
     axes = np.concatenate(frames)

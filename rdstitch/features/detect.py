@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Features
 from rdstitch.features.learned import AlikedDetection
-from rdstitch.features.opencv import OpenCVDetection
+from rdstitch.features.opencv import LARGE, OpenCVDetection, SiftTilesDetection
 from rdstitch.features.options import CLOSER, FeatureOptions
 from rdstitch.features.prepared_image import CLIP_LIMIT, Mask, PixelArray, PreparedImage, View, prepare
-from rdstitch.features.sift_tiles import LARGE, SiftTilesDetection
 from rdstitch.features.surf.descriptor import SurfDetection
 from rdstitch.opencv_state import one_opencv_thread
 
 _MIN_KEYPOINT_SHARE = 0.5  # of the keypoints wanted: where a reduced image shows fewer, a larger one is used
+_SPREAD_CELL = 0.05  # side of a cell over which keypoints are spread, diagonals of the image
 _LASTING = 0.5  # share of the keypoints that must be seen at less contrast, too; of fewer, contrast is what is missing
 
 
@@ -27,7 +27,7 @@ Detection = SurfDetection | AlikedDetection | SiftTilesDetection | OpenCVDetecti
 def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
     """Find the keypoints of an image by the detector that the options name."""
     if options.kind == "surf":
-        return SurfDetection.find(grey, options)
+        return SurfDetection.find(grey)
     if options.kind == "aliked":
         return AlikedDetection.find(grey, options)
     if options.kind in ("sift", "rootsift") and grey.size > LARGE:
@@ -117,7 +117,7 @@ def _detect(source: ViewLoader, options: FeatureOptions) -> Features:
         image, detection, usable = _look(source, options, CLOSER * megapixels)
     points, response = detection.points[usable], detection.response[usable]
     if options.spread:
-        cell = options.spread_cell * float(np.hypot(*image.grey.shape))
+        cell = _SPREAD_CELL * float(np.hypot(*image.grey.shape))
         chosen = spread(points, response, most, cell)
     else:
         chosen = strongest(response, most)

@@ -1,7 +1,13 @@
-"""The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
+"""The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe.
 
-from collections.abc import Sequence
+SIFT's finest octave has four times the pixels of an image. Of a large one the two finest octaves, most of the memory
+and most of the keypoints, are found in overlapping tiles, where they are what they would be in the whole; the coarser
+ones are those of the image at half its size, and so on.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Self, cast
 
 import cv2
@@ -16,6 +22,11 @@ from rdstitch.process_memory import scratch_memory
 
 Grey = NDArray[np.uint8]
 
+SIFT_CONTRAST = 0.02
+"""SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy images."""
+
+_ORB_FAST_THRESHOLD = 7  # grey levels by which a corner must differ from its surroundings
+_AKAZE_THRESHOLD = 0.0005  # least response; 0.001 is OpenCV's
 _ROOTSIFT_NORM = 512.0
 # Side in pixels below which some detectors raise, and none finds a thing.
 _MIN_IMAGE = 16
@@ -102,13 +113,13 @@ def create_detector(options: FeatureOptions) -> Any:
     try:
         if kind in ("sift", "rootsift"):
             # Without the precise upscale all points are a quarter of a pixel off.
-            return cv2.SIFT.create(nfeatures=0, contrastThreshold=options.sift_contrast, enable_precise_upscale=True)
+            return cv2.SIFT.create(nfeatures=0, contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
         if kind == "orb":
             # Many more than wanted, because ORB keeps the strongest of the whole image and we spread them.
-            return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=options.orb_fast_threshold)
+            return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=_ORB_FAST_THRESHOLD)
         # OpenCV 5 moved it to xfeatures2d.
         namespace: Any = cv2 if hasattr(cv2, "AKAZE_create") else cv2.xfeatures2d
-        return namespace.AKAZE_create(threshold=options.akaze_threshold)
+        return namespace.AKAZE_create(threshold=_AKAZE_THRESHOLD)
     except (AttributeError, cv2.error) as error:
         raise ArgumentError(
             f"features {options.kind!r} are not in this OpenCV ({cv2.__version__}); choose others"
@@ -133,3 +144,142 @@ def _strength(kind: str, response: FloatArray, size: FloatArray) -> FloatArray:
     of images the product gives a fifth to a half more inliers, among other detectors it does not help.
     """
     return response * size if kind in ("sift", "rootsift") else response
+
+
+LARGE = 1_250_000
+"""Pixels from which on an image is taken in tiles: a whole one takes 230 bytes a pixel."""
+
+_SIDE = 640  # pixels of a tile without its overlap, at most
+# How far the descriptors of the two finest octaves reach, pixels: sigma of 4, times 3 a cell, 2.5 cells, diagonally,
+# and what is smoothed there.
+_OVERLAP = 64
+_UPSAMPLED, _FIRST = 255, 0  # octaves -1 and 0, as OpenCV packs them
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Keypoints of a tile."""
+
+    detection: OpenCVDetection
+    corner: NDArray[np.intp]  # (2,): of the tile, pixels of the reduced image that it is cut from
+    factor: FloatArray  # (2,): pixels of the image itself for one of the reduced one, horizontally and vertically
+
+    @property
+    def points(self) -> FloatArray:
+        """Places in the whole image, pixels."""
+        return self._in_whole(self.detection.points)
+
+    @property
+    def enlargement(self) -> float:
+        """Pixels of the image itself for one of the reduced one, in the mean of both directions."""
+        return float(np.sqrt(self.factor.prod()))
+
+    def describe(self, chosen: NDArray[np.intp]) -> Features:
+        """Features in pixels of the whole image."""
+        features = self.detection.describe(chosen)
+        return replace(
+            features,
+            points=self._in_whole(features.points),
+            scale=features.scale * self.enlargement,
+            response=features.response * self.enlargement,
+        )
+
+    def _in_whole(self, points: FloatArray) -> FloatArray:
+        return (points + self.corner + 0.5) * self.factor - 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class SiftTilesDetection:
+    """Keypoints of an image, found in parts of it."""
+
+    parts: tuple[_Part, ...]
+
+    @classmethod
+    def find(cls, grey: Grey, options: FeatureOptions) -> Self:
+        """Find the keypoints of an image by SIFT."""
+        return cls(tuple(_parts(grey, options)))
+
+    @property
+    def points(self) -> FloatArray:
+        """Places, pixels of the image, (N, 2)."""
+        return np.concatenate([part.points for part in self.parts])
+
+    @property
+    def scale(self) -> FloatArray:
+        """Diameters, pixels, (N,)."""
+        return np.concatenate([part.enlargement * part.detection.scale for part in self.parts])
+
+    @property
+    def response(self) -> FloatArray:
+        """Strengths, (N,): contrast times diameter, as of an image that is taken whole."""
+        return np.concatenate([part.enlargement * part.detection.response for part in self.parts])
+
+    def describe(self, chosen: NDArray[np.intp]) -> Features:
+        """Describe the chosen keypoints, part by part."""
+        stops = np.cumsum([len(part.detection.points) for part in self.parts])
+        features = []
+        for part, stop in zip(self.parts, stops, strict=True):
+            start = stop - len(part.detection.points)
+            features.append(part.describe(chosen[(chosen >= start) & (chosen < stop)] - start))
+        return Features.concatenate(features)
+
+
+def _parts(grey: Grey, options: FeatureOptions) -> Iterator[_Part]:
+    """The finest octaves in tiles of the image, and of its halves while these are large; then the rest."""
+    whole = np.array(grey.shape[::-1])
+    octaves = [_UPSAMPLED, _FIRST]
+    while True:
+        yield from _tiles(grey, whole / grey.shape[::-1], octaves, options)
+        # The finest octave of the half is the second of this one, but less exact.
+        octaves = [_FIRST]
+        size = (grey.shape[1] // 2, grey.shape[0] // 2)
+        grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        if grey.size <= LARGE:
+            break
+    detection = OpenCVDetection.find(grey, options)
+    coarse = np.flatnonzero(_octave(detection) != _UPSAMPLED)
+    yield _Part(detection.take(coarse), np.zeros(2, dtype=np.intp), whole / grey.shape[::-1])
+
+
+def _tiles(grey: Grey, factor: FloatArray, octaves: list[int], options: FeatureOptions) -> Iterator[_Part]:
+    """Find the keypoints of some octaves, tile by tile."""
+    for y in _intervals(grey.shape[0]):
+        for x in _intervals(grey.shape[1]):
+            detection = OpenCVDetection.find(grey[y.seen, x.seen], options)
+            inside = (
+                x.owns(detection.points[:, 0]) & y.owns(detection.points[:, 1]) & np.isin(_octave(detection), octaves)
+            )
+            yield _Part(detection.take(np.flatnonzero(inside)), np.array([x.seen.start, y.seen.start]), factor)
+
+
+@dataclass(frozen=True)
+class _Interval:
+    """The range of a side of the image that a tile covers, and the part it keeps: infinite at the image's border."""
+
+    seen: slice
+    start: float
+    stop: float
+
+    def owns(self, places: FloatArray) -> NDArray[np.bool_]:
+        """Test that places, pixels of the tile, are in the part that it keeps."""
+        places = places + self.seen.start
+        inside: NDArray[np.bool_] = (places >= self.start) & (places < self.stop)
+        return inside
+
+
+def _intervals(length: int) -> list[_Interval]:
+    """The tiles along a side."""
+    borders = np.linspace(0, length, -(-length // _SIDE) + 1).astype(int).tolist()
+    return [
+        _Interval(
+            slice(max(0, start - _OVERLAP), min(length, stop + _OVERLAP)),
+            start if start > 0 else -np.inf,
+            stop if stop < length else np.inf,
+        )
+        for start, stop in pairwise(borders)
+    ]
+
+
+def _octave(detection: OpenCVDetection) -> NDArray[np.intp]:
+    """The octave of each keypoint, as OpenCV packs it."""
+    return np.array([keypoint.octave & 255 for keypoint in detection.keypoints], dtype=np.intp)

@@ -35,31 +35,11 @@ class FeatureOptions:
         "auto": 0.6, and more where there are few images.
     spread : bool
         Keep the strongest of each cell of a grid in turn, rather than the strongest of the image.
-    spread_cell : float
-        Side of a cell of that grid, fraction of the image's diagonal.
     stretch : (float, float), optional
         Grey levels that become 0 and 255; None: those of the set where its images have more than 8 bits, see
         :mod:`rdstitch.pipeline.detect_features`, else none.
     equalize : bool, optional
         Equalize local contrast before detection; None: of a set whose images show too little otherwise.
-    sift_contrast : float
-        SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy images.
-    surf_threshold : float
-        Determinant of the Hessian, grey levels², from which on a blob counts.
-    surf_octaves : int
-        Octaves of scale.
-    surf_layers : int
-        Scales per octave.
-    surf_extended : bool
-        Descriptors of 128 numbers instead of 64.
-    surf_upright : bool
-        No orientation: for images that are turned by less than about 15°.
-    surf_refine : bool
-        Place blobs by Gaussian derivatives; False: by box filters alone, as the paper does.
-    orb_fast_threshold : int
-        Grey levels by which a corner must differ from its surroundings.
-    akaze_threshold : float
-        Least response of AKAZE; 0.001 is OpenCV's.
     aliked_model : path, optional
         ONNX file of the network of "aliked".
     aliked_size : int
@@ -75,18 +55,8 @@ class FeatureOptions:
     max_features: int | None = None
     work_megapixels: float | Literal["auto"] | None = "auto"
     spread: bool = True
-    spread_cell: float = 0.05
     stretch: tuple[float, float] | None = None
     equalize: bool | None = None
-    sift_contrast: float = 0.02
-    surf_threshold: float = 100.0
-    surf_octaves: int = 4
-    surf_layers: int = 3
-    surf_extended: bool = False
-    surf_upright: bool = False
-    surf_refine: bool = True
-    orb_fast_threshold: int = 7
-    akaze_threshold: float = 0.0005
     aliked_model: str | Path | None = None
     aliked_size: int = 640
 
@@ -104,10 +74,6 @@ class FeatureOptions:
                 raise ArgumentError(f"work_megapixels is a number, 'auto' or None, not {self.work_megapixels!r}")
         elif self.work_megapixels is not None and not self.work_megapixels > 0:
             raise ArgumentError(f"work_megapixels must be positive, not {self.work_megapixels}")
-        if self.surf_octaves < 1 or self.surf_layers < 1:
-            raise ArgumentError("surf_octaves and surf_layers must be at least 1")
-        if not 0 < self.spread_cell <= 1:
-            raise ArgumentError(f"spread_cell must be in (0, 1], not {self.spread_cell}")
 
     def for_images(self, count: int) -> Self:
         """The same with numbers for what was left open, which depend on how many images there are.

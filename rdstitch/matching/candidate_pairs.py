@@ -105,20 +105,20 @@ def pairs_that_matter(
         One an image; only their sizes are used.
     """
     partners: dict[int, list[tuple[tuple[int, int], FloatArray]]] = {}
-    for pair, found in shared.items():
-        matched = found.load()
+    for pair, matches in shared.items():
+        matched = matches.load()
         for image, points in zip(pair, (matched.points1, matched.points2), strict=True):
             cell = np.clip(points / cameras[image].image_size * _CELLS_PER_SIDE, 0, _CELLS_PER_SIDE - 1).astype(np.intp)
             counts = np.bincount(cell @ [1, _CELLS_PER_SIDE], minlength=_CELLS_PER_SIDE**2)
             partners.setdefault(image, []).append((pair, counts.astype(np.float64)))
     chosen: set[tuple[int, int]] = set()
-    for own in partners.values():
-        counts, covered = np.array([cells for _, cells in own]), np.zeros(_CELLS_PER_SIDE**2)
-        for _ in range(min(_PARTNERS, len(own))):
+    for choices in partners.values():
+        counts, covered = np.array([cells for _, cells in choices]), np.zeros(_CELLS_PER_SIDE**2)
+        for _ in range(min(_PARTNERS, len(choices))):
             best = int(np.sqrt(covered + counts).sum(axis=1).argmax())
-            chosen.add(own[best][0])
+            chosen.add(choices[best][0])
             covered, counts[best] = covered + counts[best], 0.0
-    return {pair: found for pair, found in shared.items() if pair in chosen}
+    return {pair: matches for pair, matches in shared.items() if pair in chosen}
 
 
 def neighbours(

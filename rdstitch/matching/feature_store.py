@@ -117,12 +117,12 @@ class StoredMatches:
 
     def load(self) -> Correspondences:
         """Read the matches; InputError when they have vanished."""
-        found = self.stored.load()
+        matches = self.stored.load()
         if self.sizes is None:
-            return found
+            return matches
         before1, before2, after1, after2 = self.sizes
         return replace(
-            found, points1=_moved(found.points1, before1, after1), points2=_moved(found.points2, before2, after2)
+            matches, points1=_moved(matches.points1, before1, after1), points2=_moved(matches.points2, before2, after2)
         )
 
     def resized(self, before: tuple[Size, Size], after: tuple[Size, Size]) -> Self:

@@ -6,10 +6,29 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import ArgumentError
-from rdstitch.matching.thinning import spread_choice
 from rdstitch.radial_homography import RadialHomography
+
+
+def spread_choice(points: FloatArray, most: int | None) -> IntArray:
+    """Indices of about ``most`` of the points (M, 2), ascending, evenly spread over their bounding box.
+
+    The points are dealt out by the cells of a grid: first one of each cell, then the second of each, until there
+    are enough.
+    """
+    count = len(points)
+    if most is None or count <= most:
+        return np.arange(count)
+    low, high = points.min(axis=0), points.max(axis=0)
+    side = max(int(np.sqrt(most)), 1)
+    cell = np.minimum(((points - low) / np.maximum(high - low, 1e-12) * side).astype(np.intp), side - 1)
+    number = cell[:, 0] * side + cell[:, 1]
+    order = np.argsort(number, kind="stable")
+    _, first, sizes = np.unique(number[order], return_index=True, return_counts=True)
+    turn = np.empty(count, dtype=np.intp)
+    turn[order] = np.arange(count) - np.repeat(first, sizes)
+    return np.sort(np.argsort(turn, kind="stable")[:most])
 
 
 @dataclass(frozen=True)
@@ -39,13 +58,13 @@ class Link:
 
     def reversed(self) -> Self:
         """The same correspondences, from the second image to the first."""
-        own = self.relation
-        back: FloatArray = np.linalg.inv(own.homography).astype(np.float64)
+        relation = self.relation
+        back: FloatArray = np.linalg.inv(relation.homography).astype(np.float64)
         relation = replace(
-            own,
+            relation,
             homography=back,
-            camera=own.camera2,
-            camera2=own.camera,
+            camera=relation.camera2,
+            camera2=relation.camera,
             covariance=np.empty((0, 0)),
             motion=None,
         )

@@ -6,13 +6,123 @@ the images into two lenses predicts what every pair sees.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
-from rdstitch.matching.lens_votes import Votes
+from rdstitch.late_imports import sparse, sparse_linalg
+from rdstitch.matching.links import spread_choice
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.robust.measurements import Measurements
+from rdstitch.robust.own_lenses import OwnLenses, own_lenses
+
+_MAX_DISTANCE = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two
+_MAX_MATCHES = 250  # matches of a pair that are used
+_MIN_STD = 2e-4  # λ; no pair knows it better than that the division model holds
+_MIN_INLIERS = 30  # of a pair that votes: three times the parameters of a homography and two λ
+_COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both images alike
+_MAX_COHERENCE = 0.5  # correlation of neighbours' errors: more is depth, for which λ of either image takes the blame
+_REWEIGHTINGS = 6
+_PAIRS_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class Votes:
+    """What pairs see of λ, each on its own."""
+
+    image1: IntArray  # image1, image2: (L,), intp: the images of each pair
+    image2: IntArray
+    distortion: FloatArray  # (L, 2): λ of its first and of its second image, half-diagonal frame
+    covariance: FloatArray  # (L, 2, 2)
+
+    @classmethod
+    def of(cls, pairs: Sequence[PairRegistration], threshold: float) -> Self:
+        """The votes of the pairs that see λ; ``threshold``, pixels, as they were estimated with."""
+        registered = [
+            pair
+            for pair in pairs
+            if pair.relation
+            and np.isfinite(pair.relation.distortion_std)
+            and int(pair.relation.inliers.sum()) >= _MIN_INLIERS
+        ]
+        seen = [
+            (pair, vote)
+            for pair, vote in zip(registered, _votes(registered, threshold), strict=True)
+            if np.isfinite(vote.covariance).all() and vote.coherence < _MAX_COHERENCE
+        ]
+        return cls(
+            np.array([pair.image1 for pair, _ in seen], dtype=np.intp),
+            np.array([pair.image2 for pair, _ in seen], dtype=np.intp),
+            np.array([vote.distortion for _, vote in seen]).reshape(-1, 2),
+            np.array([vote.covariance for _, vote in seen]).reshape(-1, 2, 2),
+        )
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self.image1)
+
+    def mahalanobis_residuals(self, expected: FloatArray | float) -> FloatArray:
+        """How far each vote is from what is expected, (L, 2), in its standard deviations."""
+        return np.asarray(np.linalg.norm(self._whitened(self.distortion - expected), axis=1))
+
+    def which(self, second: BoolArray) -> IntArray:
+        """From which lens, 0 or 1, the two images of each pair come, shape (L, 2)."""
+        return np.stack([second[self.image1], second[self.image2]], axis=1).astype(np.intp)
+
+    def fitted(self, which: IntArray, lenses: FloatArray) -> FloatArray:
+        """λ of the lenses that the votes miss by the least, by reweighted least squares.
+
+        Parameters
+        ----------
+        which : ndarray of shape (L, 2), intp
+            The lens of each image of each pair.
+        lenses : ndarray of shape (K,)
+            λ to start from; that of a lens without votes stays.
+        """
+        rows, count = 2 * len(self), len(lenses)
+        places = np.repeat(np.arange(rows), 2), np.repeat(which, 2, axis=0).ravel()
+        design = sparse.coo_array((self._whitening.ravel(), places), shape=(rows, count)).tocsc()
+        seen = np.bincount(which.ravel(), minlength=len(lenses)) > 0
+        for _ in range(_REWEIGHTINGS):
+            weight = np.repeat(1.0 / np.maximum(self.mahalanobis_residuals(lenses[which]), 0.1), 2)
+            normal = (design.T * weight) @ design + sparse.diags_array(1.0 - seen)
+            right = design.T @ (weight * self._whitened(self.distortion).ravel())
+            lenses = np.where(seen, np.asarray(sparse_linalg.spsolve(normal.tocsc(), right)), lenses)
+        return lenses
+
+    @cached_property
+    def _whitening(self) -> FloatArray:
+        """W (L, 2, 2), with W'W the inverse of each covariance."""
+        covariance = self.covariance + _MIN_STD**2 * np.eye(2) + _COMMON_STD**2
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+    def _whitened(self, values: FloatArray) -> FloatArray:
+        return np.asarray(np.einsum("lij,lj->li", self._whitening, values))
+
+
+def _votes(pairs: Sequence[PairRegistration], threshold: float) -> list[OwnLenses]:
+    """λ of both images of each pair, from what lies not too far from where one λ puts it."""
+    lenses: list[OwnLenses] = []
+    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
+        block = pairs[start : start + _PAIRS_AT_ONCE]
+        points = [_near(pair, threshold) for pair in block]
+        cameras = [(pair.relation.camera, pair.relation.camera2) for pair in block]
+        relations = [pair.relation for pair in block]
+        lenses += own_lenses(relations, Measurements.of_pairs(points, cameras), threshold)
+    return lenses
+
+
+def _near(pair: PairRegistration, threshold: float) -> tuple[FloatArray, FloatArray]:
+    """Matches not too far from where one λ puts them, evenly spread, pixels."""
+    matched = pair.correspondences
+    apart = np.linalg.norm(pair.relation.transfer(matched.points1) - matched.points2, axis=1)
+    near = np.flatnonzero(apart < _MAX_DISTANCE * threshold)
+    near = near[spread_choice(matched.points1[near], _MAX_MATCHES)]
+    return matched.points1[near], matched.points2[near]
+
 
 _STARTS = 5  # divisions that are begun with
 _ROUNDS = 3
@@ -49,7 +159,7 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     if not len(votes):
         return None
     count, gap = len(cameras), max(_MIN_GAP, _MIN_GAP_PX / min(camera.scale for camera in cameras))
-    divisions = [found for found in _divisions(count, votes) if abs(found[1][1] - found[1][0]) >= gap]
+    divisions = [division for division in _divisions(count, votes) if abs(division[1][1] - division[1][0]) >= gap]
     if not divisions:
         return None
     second, lenses = min(
@@ -98,13 +208,13 @@ def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> d
     linked = [pair for pair in pairs if pair.relation]
     sizes = []
     for second in (False, True):
-        own = [pair for pair in linked if mixed.second[[pair.image1, pair.image2]].tolist() == [second] * 2]
-        members = {image for pair in own for image in pair.images}
-        sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in own)))
+        of_lens = [pair for pair in linked if mixed.second[[pair.image1, pair.image2]].tolist() == [second] * 2]
+        members = {image for pair in of_lens for image in pair.images}
+        sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in of_lens)))
     kept = sizes[1] > sizes[0]
-    there, here = mixed.distortion[not kept], mixed.distortion[kept]
+    left_out, used = mixed.distortion[not kept], mixed.distortion[kept]
     reason = (
-        f"comes from another lens or zoom setting (λ about {there:.3f}, that of the others {here:.3f}); "
+        f"comes from another lens or zoom setting (λ about {left_out:.3f}, that of the others {used:.3f}); "
         "stitch those of each on their own"
     )
     return {int(k): reason for k in np.flatnonzero(mixed.second != kept)}
@@ -113,10 +223,10 @@ def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> d
 def _divisions(count: int, votes: Votes) -> Iterator[tuple[BoolArray, FloatArray]]:
     """Images of the second of two lenses, and λ of both, by the widest gaps between λ of each image on its own."""
     every = np.stack([votes.image1, votes.image2], axis=1)
-    own = votes.fitted(every, np.full(count, np.median(votes.distortion)))
-    levels = np.unique(own[every])
+    of_images = votes.fitted(every, np.full(count, np.median(votes.distortion)))
+    levels = np.unique(of_images[every])
     for cut in np.argsort(levels[:-1] - levels[1:], kind="stable")[:_STARTS]:
-        second, lenses = own > levels[cut], levels[[cut, cut + 1]]
+        second, lenses = of_images > levels[cut], levels[[cut, cut + 1]]
         for _ in range(_ROUNDS):
             lenses = votes.fitted(votes.which(second), lenses)
             second ^= _margins(count, votes, second, lenses) < 0.0

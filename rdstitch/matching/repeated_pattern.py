@@ -60,24 +60,24 @@ def match_pattern(features1: Features, features2: Features) -> Correspondences:
     if features1.binary or features2.binary or min(len(features1), len(features2)) <= _PARTNERS:
         return nothing
     half = float(np.hypot(*(features1.image_size or np.ptp(features1.points, axis=0)))) / 2.0
-    own, partner, distance = _partners(features1, features2)
-    z1, z2 = (_complex(f.points)[index] / half for f, index in ((features1, own), (features2, partner)))
-    turn = features2.angle[partner] - features1.angle[own]
-    motion = features2.scale[partner] / features1.scale[own] * np.exp(1j * turn)
+    keypoint, partner, distance = _partners(features1, features2)
+    z1, z2 = (_complex(f.points)[index] / half for f, index in ((features1, keypoint), (features2, partner)))
+    turn = features2.angle[partner] - features1.angle[keypoint]
+    motion = features2.scale[partner] / features1.scale[keypoint] * np.exp(1j * turn)
     likely = np.argsort(distance, kind="stable")[: len(distance) // 2]
     tried = likely[np.linspace(0, len(likely) - 1, min(_HYPOTHESES, len(likely))).astype(np.intp)]
-    support = np.array([len(np.unique(own[_agreeing(z1, z2, motion, index)])) for index in tried])
-    best, error = np.zeros(len(own), dtype=np.bool_), np.full(len(own), np.inf)
+    support = np.array([len(np.unique(keypoint[_agreeing(z1, z2, motion, index)])) for index in tried])
+    best, error = np.zeros(len(keypoint), dtype=np.bool_), np.full(len(keypoint), np.inf)
     for index in tried[np.argsort(-support, kind="stable")[:_REFINED]]:
         agreeing, errors = _refined(z1, z2, _agreeing(z1, z2, motion, int(index)))
-        if len(np.unique(own[agreeing])) > len(np.unique(own[best])):
+        if len(np.unique(keypoint[agreeing])) > len(np.unique(keypoint[best])):
             best, error = agreeing, errors
     chosen = np.flatnonzero(best)[np.argsort(error[best], kind="stable")]
-    for index in (own, partner):  # each keypoint once, with the partner that fits best
+    for index in (keypoint, partner):  # each keypoint once, with the partner that fits best
         chosen = chosen[np.sort(np.unique(index[chosen], return_index=True)[1])]
     if len(chosen) < _MIN_MATCHES:
         return nothing
-    indices = np.column_stack([own[chosen], partner[chosen]])
+    indices = np.column_stack([keypoint[chosen], partner[chosen]])
     return Correspondences.of(features1, features2, indices, error[chosen] / _TOLERANCES[-1])
 
 
@@ -93,10 +93,10 @@ def _partners(features1: Features, features2: Features) -> tuple[IntArray, IntAr
     squared = _squared_distances(features1, features2)
     nearest = np.argpartition(squared, _PARTNERS, axis=1)[:, :_PARTNERS]
     distance = np.sqrt(np.take_along_axis(squared, nearest, axis=1).astype(np.float64)).ravel()
-    own, partner = np.repeat(np.arange(len(features1)), _PARTNERS), nearest.ravel()
-    scale = np.abs(np.log(features2.scale[partner] / features1.scale[own]))
+    keypoint, partner = np.repeat(np.arange(len(features1)), _PARTNERS), nearest.ravel()
+    scale = np.abs(np.log(features2.scale[partner] / features1.scale[keypoint]))
     kept = scale < np.log(_MAX_SCALE)
-    return own[kept], partner[kept], distance[kept]
+    return keypoint[kept], partner[kept], distance[kept]
 
 
 def _complex(points: FloatArray) -> NDArray[np.complex128]:

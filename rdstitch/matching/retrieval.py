@@ -62,10 +62,10 @@ class Vocabulary:
         words = np.repeat(top[:, None], branches, axis=1)
         nearest = _nearest(descriptors, top)
         for branch in range(branches):
-            own = descriptors[nearest == branch].astype(np.float32)
-            if len(own):
-                found = _lloyd(own, min(branches, len(own)), random)
-                words[branch, : len(found)] = found
+            members = descriptors[nearest == branch].astype(np.float32)
+            if len(members):
+                centres = _lloyd(members, min(branches, len(members)), random)
+                words[branch, : len(centres)] = centres
         return cls(top, words)
 
     @property
@@ -111,8 +111,8 @@ def _weighted_words(features: FeatureStore, seed: int) -> "sparse.csr_array | No
     starts = np.cumsum(counts) - counts
     parts = np.split(chosen, np.searchsorted(chosen, starts[1:]))
     vocabulary = Vocabulary.learned(_training(features, parts, starts), branches, random)
-    described = (_describing(found) for found in features)
-    words = [vocabulary.assign(found) if len(found) else np.empty(0, np.intp) for found in described]
+    described = (_describing(of_image) for of_image in features)
+    words = [vocabulary.assign(of_image) if len(of_image) else np.empty(0, np.intp) for of_image in described]
     image, word = np.repeat(np.arange(len(counts)), counts), np.concatenate(words)
     ones = np.ones(total, dtype=np.float32)
     used = sparse.coo_array((ones, (image, word)), shape=(len(counts), vocabulary.size)).tocsr()
@@ -128,12 +128,12 @@ def _training(features: FeatureStore, parts: list[IntArray], starts: IntArray) -
     run.
     """
     sample, filled = np.empty((0, 0), dtype=np.float16), 0
-    for found, part, start in zip(features, parts, starts, strict=True):
-        own = _describing(found)[part - start]
+    for of_image, part, start in zip(features, parts, starts, strict=True):
+        chosen = _describing(of_image)[part - start]
         if not sample.size:
-            sample = np.empty((sum(map(len, parts)), own.shape[1]), dtype=np.float16)
-        sample[filled : filled + len(own)] = np.clip(own, -_LARGEST, _LARGEST)
-        filled += len(own)
+            sample = np.empty((sum(map(len, parts)), chosen.shape[1]), dtype=np.float16)
+        sample[filled : filled + len(chosen)] = np.clip(chosen, -_LARGEST, _LARGEST)
+        filled += len(chosen)
     return sample
 
 
@@ -166,9 +166,11 @@ def _compare(weights: "sparse.csr_array") -> Similarity:
 
 def _with_shared_neighbours(best: IntArray, excess: FloatArray) -> "sparse.csr_array":
     """Similarities (N, N), raised where images are alike to the same others."""
-    own = _symmetric(best, excess)
+    direct = _symmetric(best, excess)
     neighbours = _unit_rows(_symmetric(best[:, :_SHARED_NEIGHBOURS], excess[:, :_SHARED_NEIGHBOURS]))
-    return sparse.csr_array(own + _SHARED_NEIGHBOUR_WEIGHT * float(np.mean(excess[:, 0])) * (neighbours @ neighbours.T))
+    return sparse.csr_array(
+        direct + _SHARED_NEIGHBOUR_WEIGHT * float(np.mean(excess[:, 0])) * (neighbours @ neighbours.T)
+    )
 
 
 def _symmetric(columns: IntArray, values: FloatArray) -> "sparse.csr_array":

@@ -45,30 +45,30 @@ def over_rough_ground(pairs: Sequence[PairRegistration], threshold: float) -> Se
         The same where the ground is no rougher than what is found of it anyway. Otherwise homographies fit all of
         the inliers, and λ stays that of the planes.
     """
-    found = [pair for pair in pairs if pair.relation]
-    inliers = sum(int(pair.relation.inliers.sum()) for pair in found)
-    if sum(len(pair.relation.inliers) for pair in found) - inliers < _ROUGH * inliers:
+    related = [pair for pair in pairs if pair.relation]
+    inliers = sum(int(pair.relation.inliers.sum()) for pair in related)
+    if sum(len(pair.relation.inliers) for pair in related) - inliers < _ROUGH * inliers:
         return pairs
-    rough = {pair.images: _continued(pair, threshold) for pair in found}
-    if sum(int(own.sum()) for own in rough.values()) - inliers < _ROUGH * inliers:
+    rough = {pair.images: _continued(pair, threshold) for pair in related}
+    if sum(int(explained.sum()) for explained in rough.values()) - inliers < _ROUGH * inliers:
         return pairs
     return [_fitted(pair, rough[pair.image1, pair.image2]) if pair.relation else pair for pair in pairs]
 
 
 def _continued(pair: PairRegistration, threshold: float) -> BoolArray:
     """The inliers of a pair together with the matches that continue them, shape (N,)."""
-    matched, found = pair.correspondences, pair.relation.inliers
+    matched, inliers = pair.correspondences, pair.relation.inliers
     parallax = matched.points2 - pair.relation.transfer(matched.points1)
     tree = spatial.cKDTree(matched.points1)
-    distances, neighbours = tree.query(matched.points1, k=min(_NEIGHBOURS + 1, len(found)))
+    distances, neighbours = tree.query(matched.points1, k=min(_NEIGHBOURS + 1, len(inliers)))
     with np.errstate(invalid="ignore"):
         change = np.linalg.norm(parallax[:, None] - parallax[neighbours], axis=2)
         continuing = change <= threshold + _STEEPEST * distances
     while True:
-        more = found | (continuing & found[neighbours]).any(axis=1)
-        if (more == found).all():
-            return found
-        found = more
+        more = inliers | (continuing & inliers[neighbours]).any(axis=1)
+        if (more == inliers).all():
+            return inliers
+        inliers = more
 
 
 def _fitted(pair: PairRegistration, inliers: BoolArray) -> PairRegistration:

@@ -52,7 +52,7 @@ def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], t
 
     The latter were matched otherwise at first; once the others are gone, they would find what is static, too.
     """
-    moving = [np.ones(len(found), dtype=np.bool_) for found in features.items]
+    moving = [np.ones(count, dtype=np.bool_) for count in features.counts]
     begun = [np.empty((0, 2))]
     for pair in pairs:
         matched = pair.correspondences.take(np.flatnonzero(_static_matches(pair, threshold)))
@@ -62,10 +62,10 @@ def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], t
     places, radius = np.concatenate(begun), threshold * _MAX_STATIC_MOTION
     confirmations = spatial.cKDTree(places).query_ball_point(places, radius, return_length=True)
     static = spatial.cKDTree(places[confirmations >= _MIN_CONFIRMATIONS])
-    for found, kept in zip(features, moving, strict=True):
-        kept &= ~np.isfinite(static.query(found.points, distance_upper_bound=radius)[0])
+    for loaded, kept in zip(features, moving, strict=True):
+        kept &= ~np.isfinite(static.query(loaded.points, distance_upper_bound=radius)[0])
     return FeatureStore(
-        tuple(found.take(np.flatnonzero(kept)) for found, kept in zip(features.items, moving, strict=True))
+        tuple(stored.take(np.flatnonzero(kept)) for stored, kept in zip(features.items, moving, strict=True))
     )
 
 

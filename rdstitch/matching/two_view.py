@@ -109,7 +109,7 @@ def estimate_pairs(
     tasks: Sequence[EstimationTask], *, options: EstimationOptions, cache: Cache
 ) -> list[RadialHomography]:
     """Estimate the two-view geometry of pairs, in lockstep."""
-    inputs = [(one, two, found.key(cache), options, *tilts) for one, two, found, *tilts in tasks]
+    inputs = [(one, two, matches.key(cache), options, *tilts) for one, two, matches, *tilts in tasks]
 
     def estimate(places: list[int]) -> list[RadialHomography]:
         pairs = [_pair_matches(*tasks[k]) for k in places]
@@ -123,7 +123,8 @@ def _pair_matches(
     camera: Camera, camera2: Camera, matches: StoredMatches, tilt1: Tilt | None, tilt2: Tilt | None
 ) -> PairMatches:
     """Matches of a pair as estimation takes them."""
-    found = matches.load()
-    own = replace(camera.without_lens(), focal=camera.focal, focal_source=camera.focal_source).with_focal()
+    putative = matches.load()
+    first = replace(camera.without_lens(), focal=camera.focal, focal_source=camera.focal_source).with_focal()
     known = None if tilt1 is None or tilt2 is None else np.array([tilt1, tilt2])
-    return PairMatches(found.points1, found.points2, own, own.resized(camera2.image_size), -found.ratio, known)
+    second = first.resized(camera2.image_size)
+    return PairMatches(putative.points1, putative.points2, first, second, -putative.ratio, known)

@@ -91,8 +91,8 @@ class Pairing:
             return []
         known = self.estimation.distortion
         lens = distortion if known is None else known
-        found = self._relate(chosen, self._match(chosen, "matching", shared or {}), lens, "registering pairs")
-        return found if known is not None or distortion is None else [_without_vote(pair) for pair in found]
+        registered = self._relate(chosen, self._match(chosen, "matching", shared or {}), lens, "registering pairs")
+        return registered if known is not None or distortion is None else [_without_vote(pair) for pair in registered]
 
     def estimate_candidates(self, candidates: Sequence[Pair]) -> list[PairRegistration]:
         """Estimate the candidate pairs that share something at first sight; all of them where none of those holds."""
@@ -166,8 +166,8 @@ class Pairing:
         how = self.ratio, None if self.network is None else self.cache.file(self.network)
         run = partial(match_pairs, matcher=self.matcher, how=how, cache=self.store)
         done: list[StoredMatches] = []
-        for found in in_order(self.executor, run, batches(tasks, _PAIRS_MATCHED_AT_ONCE, _MIN_BATCHES)):
-            done += found
+        for matches in in_order(self.executor, run, batches(tasks, _PAIRS_MATCHED_AT_ONCE, _MIN_BATCHES)):
+            done += matches
             self.progress(stage, len(done), len(pairs))
         return done
 
@@ -183,8 +183,8 @@ class Pairing:
         options = replace(self.estimation, solver=solver, distortion=distortion)
         tilts: Sequence[Tilt | None] = self.tilts or [None] * len(self.cameras)
         tasks = [
-            (self.cameras[i], self.cameras[j], found, tilts[i], tilts[j])
-            for (i, j), found in zip(pairs, matched, strict=True)
+            (self.cameras[i], self.cameras[j], matches, tilts[i], tilts[j])
+            for (i, j), matches in zip(pairs, matched, strict=True)
         ]
         run = partial(estimate_pairs, options=options, cache=self.cache)
         relations: list[RadialHomography] = []
@@ -193,7 +193,7 @@ class Pairing:
             if stage is not None:
                 self.progress(stage, len(relations), len(pairs))
         every = zip(pairs, matched, relations, strict=True)
-        return [PairRegistration(*images, found, relation) for images, found, relation in every]
+        return [PairRegistration(*images, matches, relation) for images, matches, relation in every]
 
 
 def _without_vote(pair: PairRegistration) -> PairRegistration:

@@ -19,8 +19,7 @@ from rdstitch.compositing import (
     compose_to_file,
     plan_composite,
 )
-from rdstitch.compositing.blocks import Block, BlockRunner
-from rdstitch.compositing.tiles import OutputStrip
+from rdstitch.compositing.tiles import Block, BlockRunner, OutputStrip
 from rdstitch.errors import OutputError
 from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, world_file_paths

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
-from rdstitch.compositing.near_part import NearPart
-from rdstitch.compositing.placed_image import Displacement, PlacedImage
+from rdstitch.compositing.canvas import NearPart
+from rdstitch.compositing.source_images import Displacement, PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference, has_place

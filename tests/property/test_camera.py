@@ -11,7 +11,7 @@ from rdstitch.alignment.motion_models.homography import _TRACELESS
 from rdstitch.camera import Camera
 from rdstitch.division_model import distort, undistort, valid_radius
 from rdstitch.errors import ArgumentError
-from rdstitch.matching.thinning import spread_choice
+from rdstitch.matching.links import spread_choice
 from rdstitch.orientation import inverse, turned, turning_matrix
 from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt, tilt_from_normal
 

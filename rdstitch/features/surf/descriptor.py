@@ -14,10 +14,19 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Features
-from rdstitch.features.options import FeatureOptions
-from rdstitch.features.surf.hessian import Blobs, Grey, find_blobs, pyramid
-from rdstitch.features.surf.refinement import apply_kernels, integer_kernels, refine, sample_patches
+from rdstitch.features.surf.hessian import (
+    Blobs,
+    Grey,
+    apply_kernels,
+    find_blobs,
+    integer_kernels,
+    pyramid,
+    refine,
+    sample_patches,
+)
 
+_THRESHOLD = 100.0  # determinant of the Hessian from which on a blob counts, grey levels²
+_OCTAVES, _LAYERS = 4, 3  # of scale, and scales per octave
 _RADIUS = 6  # of the disc of gradients, units of s
 _GRADIENT_SIGMA = 1.5  # of the derivatives, units of s; about as wide as the paper's wavelets of 4s
 _GRADIENT_WEIGHT_SIGMA = 2.5  # of the gradients' weight, units of s
@@ -93,9 +102,9 @@ _WINDOW_SPECTRUM = _window_spectrum()
 
 
 def describe_patches(
-    levels: list[Grey], points: FloatArray, scale: FloatArray, angle: FloatArray, extended: bool
+    levels: list[Grey], points: FloatArray, scale: FloatArray, angle: FloatArray
 ) -> NDArray[np.float32]:
-    """Descriptors of unit length, shape (N, 64), or (N, 128) if extended; of no contrast: zeros.
+    """Descriptors of unit length, shape (N, 64); of no contrast: zeros.
 
     Parameters
     ----------
@@ -107,16 +116,14 @@ def describe_patches(
         The s of the paper, pixels.
     angle : ndarray of shape (N,)
         Orientation, radians.
-    extended : bool
-        Sum responses of either sign of the other direction separately.
     """
-    descriptors = np.empty((len(points), _CELLS**2 * (8 if extended else 4)), np.float32)
+    descriptors = np.empty((len(points), 4 * _CELLS**2), np.float32)
     for start in range(0, len(points), _DESCRIBED_AT_ONCE):
         part = slice(start, start + _DESCRIBED_AT_ONCE)
         patches = sample_patches(
             levels, points[part], scale[part] / _SUPERSAMPLING, angle[part], _SUPERSAMPLING * (_SIDE + 1)
         )
-        descriptors[part] = _describe(_shrink(patches), extended)
+        descriptors[part] = _describe(_shrink(patches))
     return descriptors
 
 
@@ -129,21 +136,16 @@ def _shrink(patches: NDArray[np.uint8]) -> NDArray[np.float32]:
     return shrunk.astype(np.float32)
 
 
-def _describe(patches: NDArray[np.float32], extended: bool) -> NDArray[np.float32]:
+def _describe(patches: NDArray[np.float32]) -> NDArray[np.float32]:
     """Descriptors of patches (N, 21, 21)."""
     # Haar wavelets of side 2s, at steps of s.
     down = patches[:, 1:] + patches[:, :-1]
     du = (down[:, :, 1:] - down[:, :, :-1]) * _RESPONSE_WEIGHTS
     right = patches[:, :, 1:] + patches[:, :, :-1]
     dv = (right[:, 1:] - right[:, :-1]) * _RESPONSE_WEIGHTS
-    if extended:
-        parts = []
-        for values, other in ((du, dv), (dv, du)):
-            positive, negative = np.where(other >= 0, values, 0), np.where(other < 0, values, 0)
-            parts += [positive, np.abs(positive), negative, np.abs(negative)]
-    else:
-        parts = [du, dv, np.abs(du), np.abs(dv)]
-    cells = np.stack([_cell_sums(values) for values in parts], axis=-1).reshape(len(patches), -1)
+    cells = np.stack([_cell_sums(values) for values in (du, dv, np.abs(du), np.abs(dv))], axis=-1).reshape(
+        len(patches), -1
+    )
     norm: NDArray[np.float32] = np.sqrt((cells**2).sum(axis=1, keepdims=True))
     return np.divide(cells, norm, out=np.zeros_like(cells), where=norm > 0)
 
@@ -170,17 +172,12 @@ class SurfDetection:
 
     levels: list[Grey]
     blobs: Blobs
-    upright: bool
-    extended: bool
 
     @classmethod
-    def find(cls, grey: Grey, options: FeatureOptions) -> Self:
+    def find(cls, grey: Grey) -> Self:
         """Find the blobs of an image."""
-        blobs = find_blobs(grey, options.surf_threshold, options.surf_octaves, options.surf_layers)
-        levels = pyramid(grey, options.surf_octaves + 3)
-        if options.surf_refine:
-            blobs = refine(levels, blobs)
-        return cls(levels, blobs, options.surf_upright, options.surf_extended)
+        levels = pyramid(grey, _OCTAVES + 3)
+        return cls(levels, refine(levels, find_blobs(grey, _THRESHOLD, _OCTAVES, _LAYERS)))
 
     @property
     def points(self) -> FloatArray:
@@ -200,10 +197,10 @@ class SurfDetection:
     def describe(self, chosen: NDArray[np.intp]) -> Features:
         """Orient and describe the chosen blobs."""
         blobs = self.blobs.take(chosen)
-        angle = np.zeros(len(blobs)) if self.upright else orientations(self.levels, blobs.points, blobs.scale)
+        angle = orientations(self.levels, blobs.points, blobs.scale)
         return Features(
             points=blobs.points,
-            descriptors=describe_patches(self.levels, blobs.points, blobs.scale, angle, self.extended),
+            descriptors=describe_patches(self.levels, blobs.points, blobs.scale, angle),
             scale=blobs.size,
             angle=angle,
             response=blobs.response,

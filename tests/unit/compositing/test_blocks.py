@@ -14,13 +14,12 @@ from rdstitch import Composer
 from rdstitch.cache import Cache, Stored
 from rdstitch.compositing import PlacedImage
 from rdstitch.compositing import plan as planning
-from rdstitch.compositing.blocks import Block
 from rdstitch.compositing.compositor import compose
-from rdstitch.compositing.masked_pixels import OPACITY_BYTES
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.plan import CompositePlan, default_memory, plan_composite
+from rdstitch.compositing.source_images import OPACITY_BYTES
 from rdstitch.compositing.tables import CompositeTables
-from rdstitch.compositing.tiles import OutputStrip
+from rdstitch.compositing.tiles import Block, OutputStrip
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.io import DecodedImage
 from rdstitch.options import StitchOptions

@@ -10,7 +10,7 @@ from rdstitch.arrays import BoolArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import plan_canvas
 from rdstitch.compositing.boxes import Box, aligned, bounds, cut, encloses, grown, intersection, without
-from rdstitch.compositing.crop import crop_box, crop_rows, largest_rectangle
+from rdstitch.compositing.survey import crop_box, crop_rows, largest_rectangle
 from rdstitch.errors import ArgumentError, LimitError
 
 FLAT = Camera((400, 300))

@@ -20,9 +20,7 @@ from scipy.spatial import KDTree
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose
 from rdstitch.compositing.image_cache import ImageCache
-from rdstitch.compositing.masked_pixels import filled
-from rdstitch.compositing.placed_image import PlacedImage
-from rdstitch.compositing.source_images import ImageOnDisk, ImageReader, prepare_image
+from rdstitch.compositing.source_images import ImageOnDisk, ImageReader, PlacedImage, filled, prepare_image
 from rdstitch.errors import InputError
 from rdstitch.io import DecodedImage
 from rdstitch.io.read import reduced

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import CompositeOptions, compose, gain_compensation, overlap_cells, plan_canvas
+from rdstitch.compositing import CompositeOptions, compose, gain_compensation, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
-from rdstitch.compositing.overlap_cells import compare_overlaps
+from rdstitch.compositing.gain_compensation import compare_overlaps
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
-from rdstitch.compositing.placed_image import PlacedImage
-from rdstitch.compositing.source_images import ImageReader
+from rdstitch.compositing.source_images import ImageReader, PlacedImage
 from rdstitch.compositing.static_pixels import static_pixels
 from rdstitch.compositing.survey import Survey, survey_images
 from rdstitch.compositing.warp import locate, plan_warp
@@ -71,7 +70,7 @@ def test_what_is_compared_is_linear_in_the_number_of_images() -> None:
 def test_gains_of_thousands_of_overlaps_take_a_few_cells_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
     survey, images = _row(60)
     of_all = gain_compensation.estimate_exposure(survey, images, "gain").log_gain
-    monkeypatch.setattr(overlap_cells, "_MAX_CELLS", 600)
+    monkeypatch.setattr(gain_compensation, "_MAX_CELLS", 600)
     cells = compare_overlaps(survey)
     assert 59 <= len(cells.pair) <= 600
     np.testing.assert_allclose(gain_compensation.estimate_exposure(survey, images, "gain").log_gain, of_all, atol=1e-3)

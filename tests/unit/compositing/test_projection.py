@@ -9,8 +9,7 @@ import pytest
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
-from rdstitch.compositing.canvas import plan_canvas
-from rdstitch.compositing.near_part import NearPart, near_parts
+from rdstitch.compositing.canvas import NearPart, near_parts, plan_canvas
 from rdstitch.compositing.panorama_canvas import (
     center_of_view,
     choose_projection,

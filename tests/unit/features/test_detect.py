@@ -15,9 +15,8 @@ from rdstitch.errors import ArgumentError
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, View, detect, detect_view, match
 from rdstitch.features.crossings import find_crossings
 from rdstitch.features.detect import spread, strongest
-from rdstitch.features.opencv import OpenCVDetection
+from rdstitch.features.opencv import OpenCVDetection, SiftTilesDetection
 from rdstitch.features.prepared_image import halving, prepare
-from rdstitch.features.sift_tiles import SiftTilesDetection
 from rdstitch.synthetic import ground
 
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze")
@@ -177,8 +176,6 @@ def test_bad_arguments_are_refused(image: NDArray[np.uint8]) -> None:
         {"kind": "surfing"},
         {"max_features": 0},
         {"work_megapixels": 0.0},
-        {"spread_cell": 0.0},
-        {"surf_layers": 0},
     ):
         with pytest.raises(ArgumentError):
             FeatureOptions(**options)

@@ -5,9 +5,8 @@ import itertools
 import numpy as np
 
 from rdstitch.camera import Camera
-from rdstitch.matching.links import Link, in_alternate_directions
+from rdstitch.matching.links import Link, in_alternate_directions, spread_choice
 from rdstitch.matching.match_graph import connected_components, spanning_forest, spanning_tree
-from rdstitch.matching.thinning import spread_choice
 from rdstitch.radial_homography import RadialHomography
 
 

@@ -11,8 +11,7 @@ from rdstitch.camera import Camera
 from rdstitch.features import Correspondences
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.feature_store import StoredMatches
-from rdstitch.matching.lens_votes import Votes
-from rdstitch.matching.mixed_lenses import TwoLenses, two_lenses
+from rdstitch.matching.mixed_lenses import TwoLenses, Votes, two_lenses
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust import estimate_radial_homography
 

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from rdstitch.features import FeatureOptions, detect, match
 from rdstitch.features.surf.descriptor import describe_patches, orientations
-from rdstitch.features.surf.hessian import find_blobs, pyramid, to_level
-from rdstitch.features.surf.refinement import refine
+from rdstitch.features.surf.hessian import find_blobs, pyramid, refine, to_level
 from rdstitch.synthetic import ground
 
 Grey = NDArray[np.uint8]
@@ -102,22 +101,21 @@ def test_orientation_turns_with_the_image(degrees: float) -> None:
     assert np.mean(np.abs(difference) < np.radians(10)) > 0.9
 
 
-@pytest.mark.parametrize("extended", [False, True])
-def test_descriptors_follow_rotation_scale_and_contrast(extended: bool) -> None:
+def test_descriptors_follow_rotation_scale_and_contrast() -> None:
     grey = texture()
     rng = np.random.default_rng(1)
     points, scale, angle = rng.uniform((150, 110), (330, 290), (60, 2)), rng.uniform(1.6, 4, 60), rng.uniform(0, 6, 60)
-    reference = describe_patches(pyramid(grey, 7), points, scale, angle, extended)
-    assert reference.shape == (60, 128 if extended else 64)
+    reference = describe_patches(pyramid(grey, 7), points, scale, angle)
+    assert reference.shape == (60, 64)
     np.testing.assert_allclose(np.linalg.norm(reference, axis=1), 1.0, rtol=1e-5)
     between_different = np.linalg.norm(reference - np.roll(reference, 1, axis=0), axis=1)
 
     other, motion = turned(grey, 25.0)
     moved = points @ motion[:, :2].T + motion[:, 2]
-    rotated = describe_patches(pyramid(other, 7), moved, scale, angle - np.radians(25.0), extended)
+    rotated = describe_patches(pyramid(other, 7), moved, scale, angle - np.radians(25.0))
     doubled = np.asarray(cv2.resize(grey, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), np.uint8)
-    scaled = describe_patches(pyramid(doubled, 8), to_level(points, -1), scale * 2, angle, extended)
-    dimmed = describe_patches(pyramid(np.rint(grey * 0.5 + 40).astype(np.uint8), 7), points, scale, angle, extended)
+    scaled = describe_patches(pyramid(doubled, 8), to_level(points, -1), scale * 2, angle)
+    dimmed = describe_patches(pyramid(np.rint(grey * 0.5 + 40).astype(np.uint8), 7), points, scale, angle)
     for descriptors in (rotated, scaled, dimmed):
         difference = np.linalg.norm(descriptors - reference, axis=1)
         assert np.median(difference) < 0.15 * np.median(between_different)
@@ -133,27 +131,4 @@ def test_matches_survive_any_rotation(degrees: float) -> None:
     assert (error < 1.0).sum() > 180
     assert np.mean(error < 3.0) > 0.95
     assert np.median(error) < 0.35
-
-
-def test_options_take_effect() -> None:
-    grey = texture()
-    features = {
-        name: detect(grey, FeatureOptions(kind="surf", **{name: value}))  # type: ignore[arg-type]
-        for name, value in {
-            "surf_upright": True,
-            "surf_extended": True,
-            "surf_refine": False,
-            "surf_threshold": 1000.0,
-            "surf_octaves": 1,
-            "surf_layers": 1,
-        }.items()
-    }
-    plain = detect(grey, FeatureOptions(kind="surf"))
-    assert plain.angle.any()
-    assert not features["surf_upright"].angle.any()
-    assert features["surf_extended"].descriptors.shape[1] == 128
-    assert len(features["surf_refine"]) > len(plain)
-    assert 0 < len(features["surf_threshold"]) < len(plain)
-    assert 0 < len(features["surf_layers"]) < len(plain)
-    assert features["surf_octaves"].scale.max() < 40 < plain.scale.max()
-    assert set(plain.laplacian_sign) == {-1, 1}
+    assert set(detect(grey, options).laplacian_sign) == {-1, 1}
