@@ -13,7 +13,7 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.division_model import distorted_ratio
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
-from rdstitch.robust.loss import loss_ratio
+from rdstitch.robust.loss import loss_ratio, robust_weight
 from rdstitch.robust.measurements import Measurements
 
 _PAIRS = np.triu_indices(3)
@@ -139,16 +139,16 @@ def entry_equations(
 ) -> BatchedNormalEquations:
     """The loss with its scale ``c`` (B,), pixels, and its normal equations by the entries of H, then by the lens."""
     squared = found.squared
-    relative = loss_ratio(squared, scale[:, None])
+    relative, factor = (loss(squared, scale[:, None]) for loss in (loss_ratio, robust_weight))
     lost, useless = found.lost & present, found.lost | ~present
-    relative[useless] = 0.0
+    relative[useless] = factor[useless] = 0.0
     cost = (squared * relative).sum(axis=1) + scale**2 * lost.sum(axis=1)
     squared[useless] = np.inf
 
     lens = found.by_lens if free_lens else found.by_lens[:, :, :0]
     extra = lens.shape[2]
     columns = np.concatenate([found.by_image, lens, found.error[:, :, None]], axis=2)
-    weight = found.precision * (relative * relative)[:, None]
+    weight = found.precision * factor[:, None]
     xx, xy, yy = weight[:, :1], weight[:, 1:2], weight[:, 2:]
     across, down = columns[:, 0], columns[:, 1]
     left_across, left_down = xx * across + xy * down, xy * across + yy * down
@@ -177,9 +177,9 @@ def entry_equations(
 
 def influence(found: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool) -> FloatArray:
     """Each match's share of the gradient by the entries of H and the lens, (B, N, 9 + E)."""
-    relative = loss_ratio(found.squared, scale[:, None])
-    relative[~present | found.lost] = 0.0
-    weight = found.precision * (relative * relative)[:, None]
+    factor = robust_weight(found.squared, scale[:, None])
+    factor[~present | found.lost] = 0.0
+    weight = found.precision * factor[:, None]
     xx, xy, yy = weight[:, 0], weight[:, 1], weight[:, 2]
     dx, dy = found.error[:, 0], found.error[:, 1]
     left = np.stack([xx * dx + xy * dy, xy * dx + yy * dy], axis=1)[:, :, None]

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta, Struct, field
 
 from rdstitch.camera import CameraRecord, FocalSource, LensRecord
-from rdstitch.compositing.projection import ProjectionName
+from rdstitch.choices import ProjectionName
 from rdstitch.records import Count, Matrix, NonNegative, Pair, Size, Triple, check_invertible
 from rdstitch.sidecar.write import VERSION
 

@@ -7,8 +7,9 @@ import pytest
 
 from rdstitch import StitchOptions
 from rdstitch.alignment import LENSES, MODELS
+from rdstitch.choices import LensName, ModelName, ProjectionName
+from rdstitch.compositing.projection import PROJECTIONS
 from rdstitch.errors import ArgumentError
-from rdstitch.options import LensName, ModelName
 
 
 def test_text_is_as_good_as_a_path() -> None:
@@ -45,3 +46,4 @@ def test_what_contradicts_itself_is_refused(wrong: dict[str, Any], named: str) -
 def test_the_types_name_what_there_is() -> None:
     assert get_args(LensName) == ("auto", *LENSES)
     assert get_args(ModelName) == ("auto", *MODELS)
+    assert get_args(ProjectionName) == ("auto", *PROJECTIONS)
