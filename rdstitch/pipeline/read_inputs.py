@@ -17,7 +17,6 @@ from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.process_memory import return_freed_memory
-from rdstitch.stage.flat_field import estimate_illumination
 
 
 def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
@@ -76,6 +75,8 @@ def check_size(sources: Sequence[Source]) -> None:
 
 def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
     """The tiles, which are read without the illumination that all have; and what there is to say of that."""
+    from rdstitch.stage.flat_field import estimate_illumination
+
     if wanted == "off":
         return list(sources), []
     if wanted != "auto":
