@@ -4,10 +4,11 @@ import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
 from rdstitch.alignment import LENSES, MODELS
 from rdstitch.camera import Camera
+from rdstitch.choices import LensName, ModelName, SolverName
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.executors import LOCAL, open_executor
@@ -15,10 +16,7 @@ from rdstitch.features import FeatureOptions
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.local_alignment import MAX_CELLS, LocalAlignmentMode
 from rdstitch.machine import processor_count
-from rdstitch.robust import SOLVERS, EstimationOptions, SolverName
-
-LensName = Literal["auto", "division", "division-center", "division2", "division3"]
-ModelName = Literal["auto", "rigid", "similarity", "tilting", "pose", "homography", "rotation"]
+from rdstitch.robust import SOLVERS, EstimationOptions
 
 _SELECT_MODEL_BELOW = 50
 """Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from rdstitch.arrays import FloatArray
 from rdstitch.division_model import distort
@@ -217,20 +218,12 @@ def rotation_instances(
     def draw(which: np.ndarray) -> FloatArray:
         direction, by = rng.uniform(-np.pi, np.pi, len(which)), rng.uniform(*angle, len(which))
         turned = rng.uniform(-roll, roll, len(which))
-        about = np.stack([np.cos(direction), np.sin(direction), np.zeros(len(which))], axis=-1)
-        rotation = _about(about, by) @ _about(np.tile([0.0, 0.0, 1.0], (len(which), 1)), turned)
+        about = np.stack([by * np.cos(direction), by * np.sin(direction), 0.0 * by], axis=-1)
+        turns = Rotation.from_rotvec(about) * Rotation.from_rotvec(turned[:, None] * np.array([0.0, 0.0, 1.0]))
+        rotation = turns.as_matrix()
         return np.asarray(rotation * (k[which][:, :, None] / k[which][:, None, :]))
 
     # In front of image 1 every ray counts, however oblique: there is no plane that it should meet.
     ahead = np.tile([0.0, 0.0, 1.0], (count, 1))
     x1, x2, h = _visible_points(rng, lam, ahead, points, half_size, overlap, noise, draw)
     return RotationInstances(x1, x2, h, lam, h * (k[:, None, :] / k[:, :, None]), length)
-
-
-def _about(axes: FloatArray, angles: FloatArray) -> FloatArray:
-    """Rotations (B, 3, 3) about unit axes (B, 3) by angles (B,) (Rodrigues)."""
-    x, y, z = axes.T
-    zero = np.zeros_like(x)
-    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    sine, versine = np.sin(angles)[:, None, None], (1.0 - np.cos(angles))[:, None, None]
-    return np.asarray(np.eye(3) + sine * cross + versine * (cross @ cross))

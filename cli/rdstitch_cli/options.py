@@ -5,11 +5,12 @@ import sys
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import click
 from click.core import ParameterSource
 
+from rdstitch.choices import FEATURES, LensName, ModelName, ProjectionName, SolverName
 from rdstitch_cli.option_texts import TEXTS, option
 from rdstitch_cli.parameter_types import (
     ANGLE,
@@ -29,11 +30,8 @@ from rdstitch_cli.terminal import Reporter
 Command = TypeVar("Command", bound=Callable[..., Any])
 Decorator = Callable[[Command], Command]
 
-FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "aliked")
-SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-point", "five-point")
-LENSES = ("auto", "division", "division-center", "division2", "division3")
-PROJECTIONS = ("auto", "plane", "cylinder", "sphere", "mercator", "panini", "stereographic")
-MODELS = ("auto", "rigid", "similarity", "tilting", "pose", "homography", "rotation")
+SOLVERS = tuple(name.replace("_", "-") for name in get_args(SolverName))
+LENSES, PROJECTIONS, MODELS = get_args(LensName), get_args(ProjectionName), get_args(ModelName)
 
 IMAGE = UserPath()
 

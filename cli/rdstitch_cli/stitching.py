@@ -18,11 +18,11 @@ from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.camera import Camera
+    from rdstitch.choices import SolverName
     from rdstitch.compositing import CompositePlan
     from rdstitch.options import StitchOptions
     from rdstitch.outputs import Outputs
     from rdstitch.registration import Registration
-    from rdstitch.robust import SolverName
     from rdstitch.stitch_result import StitchResult
 
 

@@ -9,7 +9,6 @@ third of the frames and at the end.
 
 import time
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -57,7 +56,7 @@ def main(
 ) -> None:
     """Print the figures."""
     cv2.setNumThreads(1)
-    drive = replace(floor_drive(path, frames, seed=3, overlap=overlap), samples=1)
+    drive = floor_drive(path, frames, seed=3, overlap=overlap)
     truth, options = true_path(drive), StitchOptions(workers=workers)
     with TemporaryDirectory() if folder is None else nullcontext(folder) as kept:
         images = Path(kept)

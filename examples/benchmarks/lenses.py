@@ -19,10 +19,11 @@ import numpy as np
 from examples.benchmarks.driver import run
 from examples.judging import registration_error
 from rdstitch.camera import Camera
+from rdstitch.choices import LensName
 from rdstitch.errors import RdstitchError
 from rdstitch.executors import open_executor
 from rdstitch.inputs.source import read_sources
-from rdstitch.options import LensName, StitchOptions
+from rdstitch.options import StitchOptions
 from rdstitch.pipeline.register import register
 from rdstitch.synthetic import BrownLens, FisheyeLens, Sequence, grid_poses, ground, sequence_over
 from rdstitch.synthetic.lenses import Lens

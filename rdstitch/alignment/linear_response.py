@@ -16,7 +16,7 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmen
 from rdstitch.alignment.link_equations import LinearizedErrors, linearized_errors
 from rdstitch.alignment.normal_equations import SparseNormalEquations, link_derivatives
 from rdstitch.arrays import FloatArray
-from rdstitch.robust.loss import ALIGNMENT_WIDTH, loss_ratio, robust_weight
+from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_slope, robust_weight
 
 Fields = Callable[[LinearizedErrors], FloatArray]
 """Changes (m, 2, C) of the errors of some links, pixels."""
@@ -37,9 +37,7 @@ class LinearResponse:
         """At the solution."""
         width = ALIGNMENT_WIDTH * adjusted.sigma
         weight = robust_weight(adjusted.squared, width)
-        # In two dimensions w r changes by w + r² dw/dr², the mean over all directions; w is the square of the ratio.
-        slope = weight * (2.0 * loss_ratio(adjusted.squared, width) - 1.0)
-        curvature = float(np.clip(slope.sum() / max(weight.sum(), 1e-300), 0.1, 1.0))
+        curvature = float(np.clip(robust_slope(adjusted.squared, width).sum() / max(weight.sum(), 1e-300), 0.1, 1.0))
         normal = replace(adjuster, overdispersion=adjuster.overdispersion / curvature).normal_equations(adjusted)
         return cls(adjuster, adjusted, weight * adjuster.weight(adjusted.sigma), curvature, normal)
 

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_origin, get_type_hints
 
-from rdstitch.compositing.projection import ProjectionName
+from rdstitch.choices import ProjectionName
 from rdstitch.compositing.upright import UprightOptions
 from rdstitch.errors import ArgumentError
 

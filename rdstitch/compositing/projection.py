@@ -7,13 +7,12 @@ Directions have x to the right, y down, z ahead. Longitude ``atan2(x, z)`` grows
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-
-ProjectionName = Literal["auto", "plane", "cylinder", "sphere", "mercator", "panini", "stereographic"]
+from rdstitch.choices import ProjectionName
 
 TURN = 2.0 * np.pi
 _MAX_STRETCH = 16.0  # of any projection, whatever is requested

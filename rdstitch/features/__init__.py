@@ -4,11 +4,10 @@ from rdstitch.features.detect import detect, detect_view
 from rdstitch.features.keypoints import Correspondences, Features, PackedFeatures
 from rdstitch.features.learned import LightGlue
 from rdstitch.features.match import Matcher, match, match_near, match_overlap
-from rdstitch.features.options import KINDS, FeatureOptions
+from rdstitch.features.options import FeatureOptions
 from rdstitch.features.prepared_image import View
 
 __all__ = [
-    "KINDS",
     "Correspondences",
     "FeatureOptions",
     "Features",

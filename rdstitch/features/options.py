@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Self
 
+from rdstitch.choices import FEATURES
 from rdstitch.errors import ArgumentError
 
-KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "aliked")
 WORK_MEGAPIXELS = 0.6
 """10⁶ pixels to which images of a large set are halved unless it is said otherwise."""
 MAX_FEATURES = 2000
@@ -61,8 +61,8 @@ class FeatureOptions:
     aliked_size: int = 640
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ArgumentError(f"unknown kind of features {self.kind!r}; known are {', '.join(KINDS)}")
+        if self.kind not in FEATURES:
+            raise ArgumentError(f"unknown kind of features {self.kind!r}; known are {', '.join(FEATURES)}")
         if self.kind == "aliked" and self.aliked_model is None:
             raise ArgumentError("features 'aliked' need the ONNX file of the network (--aliked-model)")
         if self.aliked_size < 1:

@@ -8,12 +8,13 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
+from rdstitch.choices import SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
-from rdstitch.robust.options import EstimationOptions, SolverName
+from rdstitch.robust.options import EstimationOptions
 from rdstitch.robust.pair_models import PlanarPairModel
 from rdstitch.robust.ransac import ransac
 from rdstitch.robust.verification import MIN_PLACES, places, rejection_reason

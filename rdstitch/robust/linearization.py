@@ -13,7 +13,7 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.division_model import distorted_ratio
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
-from rdstitch.robust.loss import loss_ratio
+from rdstitch.robust.loss import loss_ratio, robust_weight
 from rdstitch.robust.measurements import Measurements
 
 _PAIRS = np.triu_indices(3)  # entries of a symmetric matrix of 3 x 3 that determine it
@@ -137,16 +137,16 @@ def entry_equations(
 ) -> BatchedNormalEquations:
     """The loss with its scale ``c`` (B,), pixels, and its normal equations by the entries of H, then by the lens."""
     squared = transferred.squared
-    relative = loss_ratio(squared, scale[:, None])
+    relative, factor = (loss(squared, scale[:, None]) for loss in (loss_ratio, robust_weight))
     lost, useless = transferred.lost & present, transferred.lost | ~present
-    relative[useless] = 0.0
+    relative[useless] = factor[useless] = 0.0
     cost = (squared * relative).sum(axis=1) + scale**2 * lost.sum(axis=1)
     squared[useless] = np.inf
 
     lens = transferred.by_lens if free_lens else transferred.by_lens[:, :, :0]
     extra = lens.shape[2]
     columns = np.concatenate([transferred.by_image, lens, transferred.error[:, :, None]], axis=2)
-    weight = transferred.precision * (relative * relative)[:, None]
+    weight = transferred.precision * factor[:, None]
     xx, xy, yy = weight[:, :1], weight[:, 1:2], weight[:, 2:]
     across, down = columns[:, 0], columns[:, 1]
     left_across, left_down = xx * across + xy * down, xy * across + yy * down
@@ -175,9 +175,9 @@ def entry_equations(
 
 def influence(transferred: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool) -> FloatArray:
     """Each match's share of the gradient by the entries of H and the lens, (B, N, 9 + E)."""
-    relative = loss_ratio(transferred.squared, scale[:, None])
-    relative[~present | transferred.lost] = 0.0
-    weight = transferred.precision * (relative * relative)[:, None]
+    factor = robust_weight(transferred.squared, scale[:, None])
+    factor[~present | transferred.lost] = 0.0
+    weight = transferred.precision * factor[:, None]
     xx, xy, yy = weight[:, 0], weight[:, 1], weight[:, 2]
     dx, dy = transferred.error[:, 0], transferred.error[:, 1]
     left = np.stack([xx * dx + xy * dy, xy * dx + yy * dy], axis=1)[:, :, None]

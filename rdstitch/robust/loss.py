@@ -23,9 +23,15 @@ def loss_ratio(squared: FloatArray, width: FloatArray | float) -> FloatArray:
     return ratio
 
 
-def robust_weight(squared: FloatArray, width: float) -> FloatArray:
+def robust_weight(squared: FloatArray, width: FloatArray | float) -> FloatArray:
     """What an error counts in the normal equations: the derivative of the loss by the error's square."""
     return loss_ratio(squared, width) ** 2
+
+
+def robust_slope(squared: FloatArray, width: float) -> FloatArray:
+    """How much a weighted error grows with the error: its derivative, in the mean over all directions of the plane."""
+    ratio = loss_ratio(squared, width)
+    return ratio**2 * (2.0 * ratio - 1.0)
 
 
 def robust_cost(squared: FloatArray, width: float) -> FloatArray:

@@ -2,12 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
 
+from rdstitch.choices import SOLVERS
 from rdstitch.errors import ArgumentError
-
-SolverName = Literal["auto", "two_point", "three_point", "three_point_similarity", "four_point", "five_point"]
-SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 
 
 @dataclass(frozen=True)

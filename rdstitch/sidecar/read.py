@@ -15,8 +15,8 @@ from msgspec import Meta, Struct, field
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera, CameraRecord, FocalSource, LensRecord
+from rdstitch.choices import ProjectionName
 from rdstitch.compositing import CompositeOptions
-from rdstitch.compositing.projection import ProjectionName
 from rdstitch.crs import Crs
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.georeference import Georeference, Residual

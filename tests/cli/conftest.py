@@ -7,7 +7,7 @@ import pytest
 from rdstitch_cli.main import run
 
 from rdstitch.synthetic import Sequence
-from tests.cli.running import Outcome, Run, check_sidecar, flight
+from tests.cli.running import CACHED, Outcome, Run, check_sidecar, flight
 
 
 @pytest.fixture(scope="session")
@@ -26,6 +26,15 @@ def frames(sequence: Sequence, tmp_path_factory: pytest.TempPathFactory) -> list
 def stranger(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An image of other ground."""
     return flight(9, 1).write(tmp_path_factory.mktemp("stranger"), "stranger_{}.png")[0]
+
+
+@pytest.fixture(scope="session")
+def stitched(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mosaic of ``frames`` with some options; never written to."""
+    output = tmp_path_factory.mktemp("stitched") / "field.tif"
+    arguments = ("mosaic", *frames, "-o", output, "--scale", "0.8", "--rotate", "10", *CACHED)
+    assert run([str(argument) for argument in arguments]) == 0
+    return output
 
 
 @pytest.fixture

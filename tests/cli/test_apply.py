@@ -17,17 +17,6 @@ from rdstitch.io import read_image
 from tests.cli.running import CACHED, Outcome, Run
 
 
-@pytest.fixture(scope="module")
-def stitched(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A mosaic of ``frames`` with some options; never written to."""
-    from rdstitch_cli.main import run
-
-    folder = tmp_path_factory.mktemp("stitched")
-    arguments = ["mosaic", *map(str, frames), "-o", str(folder / "field.tif"), "--scale", "0.8", "--rotate", "10"]
-    assert run([*arguments, *CACHED]) == 0
-    return folder / "field.tif"
-
-
 def _sidecar(image: Path) -> Path:
     return image.with_name(image.name + ".json")
 

@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rdstitch_cli.options import FEATURES
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import CameraRecord
-from rdstitch.features import KINDS
 from rdstitch.records import convert
 from tests.cli.running import Run, transfers
 from tests.sampled import sampled
@@ -59,7 +57,3 @@ def test_every_kind_reproduces_the_default(rdstitch: Run, tmp_path: Path, defaul
     here, there = overlap(found), overlap(default)
     assert abs(np.isfinite(here).mean() - np.isfinite(there).mean()) < 0.01
     assert np.nanmedian(np.linalg.norm(here - there, axis=1)) < 1.5
-
-
-def test_the_command_line_offers_every_kind() -> None:
-    assert FEATURES == KINDS

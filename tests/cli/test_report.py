@@ -141,9 +141,7 @@ def test_calibrate_has_no_mosaic(rdstitch: Run, frames: list[Path], tmp_path: Pa
     assert _checked(report.read_text(encoding="utf-8")).headings == headings
 
 
-@pytest.mark.parametrize(
-    ("command", "output"), [("pano", "out.png"), ("mosaic", "out.png"), ("calibrate", "lens.json")]
-)
+@pytest.mark.parametrize(("command", "output"), [("mosaic", "out.png"), ("calibrate", "lens.json")])
 def test_what_is_refused_is_shown(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, output: str
 ) -> None:

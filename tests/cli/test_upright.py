@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -14,12 +15,11 @@ from rdstitch.errors import ArgumentError
 from rdstitch.options import StitchOptions
 from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.radial_homography import to_plane
-from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over
+from rdstitch.synthetic import ImageTexture, Photometry, Sequence, ground, sequence_over
 from rdstitch.synthetic.poses import Poses
 from rdstitch.synthetic.textures import Texture
 from tests.cli.running import CACHED, Run
 from tests.drone_xmp import euler_angles, xmp_of
-from tests.lined_texture import LinedTexture
 
 LENS = Camera((400, 300), -0.1, focal=420.0, focal_source="option")
 TILT, ROLL = (0.4, 0.25), 0.08
@@ -28,10 +28,14 @@ KNOWN = ("--lambda", "-0.1", "--focal", "420", "--reference", "frame_0000.png")
 
 def _lined(size: tuple[int, int]) -> Texture:
     """Joints 70 texels apart, each third of the vertical ones left out."""
-    width, height = size
-    across = [((0.0, y), (width - 1.0, y)) for y in np.arange(20.0, height, 70.0)]
-    down = [((x, 0.0), (x, height - 1.0)) for k, x in enumerate(np.arange(30.0, width, 70.0)) if k % 3]
-    return LinedTexture(ground(size, 4), np.array(across + down), width=4.0)
+    (width, height), white = size, (255.0, 255.0, 255.0)
+    plane = np.rint(255.0 * ground(size, 4).region(0, 0, width, height)).astype(np.uint8)
+    for y in range(20, height, 70):
+        cv2.line(plane, (0, y), (width, y), white, 4, cv2.LINE_AA)
+    for k, x in enumerate(range(30, width, 70)):
+        if k % 3:
+            cv2.line(plane, (x, 0), (x, height), white, 4, cv2.LINE_AA)
+    return ImageTexture(plane)
 
 
 def _taken(plane: Any, folder: Path) -> tuple[Sequence, list[Path]]:

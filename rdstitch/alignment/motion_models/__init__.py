@@ -18,13 +18,15 @@ rotation   R                                               a turn about the cent
 ========== =============================================== ===================================================
 
 A model is one class, with what it is capable of (:class:`MotionModel`); nothing else asks for a model by its name. A
-new one is a class in a file of its own, and its entry in :data:`MODELS`.
+new one is one more of :data:`PLANAR_MODELS`, or a class in a file of its own with its entry in :data:`MODELS`; its name
+is a word of :mod:`rdstitch.choices`.
 """
 
 from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel, inverses
 from rdstitch.alignment.motion_models.homography import HOMOGRAPHY
 from rdstitch.alignment.motion_models.planar import (
     LOG_HEIGHT,
+    PLANAR_MODELS,
     POSE,
     PSI,
     RIGID,
@@ -38,9 +40,7 @@ from rdstitch.alignment.motion_models.planar import (
 )
 from rdstitch.alignment.motion_models.rotation import ROTATION
 
-MODELS: dict[str, MotionModel] = {
-    model.name: model for model in (RIGID, SIMILARITY, TILTING, POSE, HOMOGRAPHY, ROTATION)
-}
+MODELS: dict[str, MotionModel] = {model.name: model for model in (*PLANAR_MODELS, HOMOGRAPHY, ROTATION)}
 """All by name, in the order in which they are tried."""
 
 __all__ = [

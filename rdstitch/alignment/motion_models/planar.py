@@ -159,3 +159,6 @@ RIGID = PlanarModel("rigid", (YAW, X, Y))
 SIMILARITY = PlanarModel("similarity", (YAW, X, Y, LOG_HEIGHT))
 TILTING = PlanarModel("tilting", (YAW, X, Y, LOG_HEIGHT, PSI, THETA))
 POSE = PlanarModel("pose", (YAW, X, Y, LOG_HEIGHT, PSI, THETA), any_tilt=True)
+
+PLANAR_MODELS = (RIGID, SIMILARITY, TILTING, POSE)
+"""From the least to the most free."""

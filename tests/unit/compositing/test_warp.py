@@ -51,6 +51,19 @@ def test_coordinates_are_exact_to_what_resampling_rounds(distortion: float, scal
         assert warp.step >= (8 if scale == 1.0 else 2)
 
 
+def test_a_box_anywhere_gives_the_same_coordinates() -> None:
+    lens = Camera((640, 480), distortion=-0.3)
+    warp = plan_warp(lens, np.eye(3), plan_canvas([lens], np.eye(3)[None]), 0)
+    whole, part = locate(warp, (-40, -40, 700, 600)), locate(warp, (33, 57, 201, 190))
+    cut = whole.on(part.box)
+    np.testing.assert_array_equal(part.maps, cut.maps)
+    np.testing.assert_array_equal(part.maps, [axis[97:230, 73:241] for axis in whole.maps])
+    np.testing.assert_array_equal(part.inside, whole.inside[97:230, 73:241])
+    assert cut.lattice is whole.lattice
+    beyond = part.on((0, 0, 300, 200))
+    np.testing.assert_array_equal(beyond.maps, whole.on(beyond.box).maps)
+
+
 def test_coverage_ends_half_a_pixel_outside() -> None:
     """Shifted by 0.3 px the image still covers as many px; by 0.7 px it does too, one further on."""
     lens = Camera((50, 40))

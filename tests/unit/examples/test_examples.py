@@ -1,10 +1,14 @@
-"""Every example is described in one place, and says itself how it is run."""
+"""Examples are described in one place and say how they are run; every figure of the paper is made."""
 
 import runpy
 import sys
+from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from examples.paper.common.report import Effort, Settings
 
 _ROOT = Path(__file__).parents[3]
 _FOLDER = _ROOT / "examples"
@@ -36,3 +40,18 @@ def test_every_folder_and_shell_script_is_in_the_list() -> None:
     folders = {path.name for path in _FOLDER.iterdir() if path.is_dir() and not path.name.startswith("__")}
     assert [name for name in sorted(folders) if f"[{name}/]" not in text and f"examples.{name} " not in text] == []
     assert [path.name for path in sorted(_FOLDER.rglob("*.sh")) if f"`batch/{path.name} " not in text] == []
+
+
+TINY = Settings(Effort.TINY, Path("no real images"))
+SLOW = ("figure10", "homography_estimation", "panoramas", "end_to_end")
+FIGURES = [f"figure{n}" for n in (2, 3, 4, 5, 7, 8, 9)] + ["runtime"]
+
+
+@pytest.mark.parametrize("name", [*FIGURES, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
+def test_every_figure_is_made(name: str) -> None:
+    report = import_module(f"examples.paper.{name}").run(TINY)
+    assert report.tables
+    for table in report.tables:
+        numbers = [value for row in table.rows for value in row if isinstance(value, float)]
+        assert table.rows
+        assert np.isfinite(numbers).all()

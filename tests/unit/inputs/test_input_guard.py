@@ -1,15 +1,31 @@
-"""Files that change during a run, images that a decoder doubts, and those that need too much memory."""
+"""Inputs are guarded, decoded once, and taken as they arrive."""
 
+import io
 import os
+import pickle
+from collections.abc import Iterator
+from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from numpy.typing import NDArray
+from PIL import ExifTags, Image
 
-from rdstitch.errors import InputError, LimitError
+from rdstitch.camera import Camera
+from rdstitch.errors import ArgumentError, InputError, LimitError
+from rdstitch.inputs import source as sources
+from rdstitch.inputs.arrivals import Arrivals
+from rdstitch.inputs.decoded_image_cache import DecodedImageCache
+from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.io import Metadata, write_image
+from rdstitch.io import read as reading
+from rdstitch.io.read import DecodedImage, read_image
+from tests.videos import write_video
 
 
 def _save(path: Path, seed: int) -> None:
@@ -87,3 +103,182 @@ def test_an_image_that_needs_too_much_memory(tmp_path: Path) -> None:
     _source(path, max_memory=3_000_000)
     with pytest.raises(LimitError, match=r"a\.png: 1000 x 500 pixels need 3 MB .* --max-memory allows 3 MB"):
         _source(path, max_memory=2_999_999)
+
+
+SIZE = (1500, 1000)  # halved once for a look at it
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Source:
+    pixels = np.random.default_rng(0).integers(0, 256, (SIZE[1], SIZE[0], 3)).astype(np.uint8)
+    write_image(tmp_path / "a.jpg", pixels)
+    return Source(tmp_path / "a.jpg", Metadata(SIZE), Camera(SIZE))
+
+
+def test_a_source_can_be_sent_elsewhere(source: Source) -> None:
+    kept = replace(source, decoded_images=DecodedImageCache())
+    kept.read(keep=True)
+    for other in (pickle.loads(pickle.dumps(kept)), deepcopy(kept)):
+        assert other == kept
+        np.testing.assert_array_equal(other.read().pixels, kept.read().pixels)
+
+
+@pytest.fixture
+def read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    seen: list[int] = []
+
+    def noted(path: Path, reduction: int, metadata: Metadata) -> DecodedImage:
+        seen.append(reduction)
+        return read_image(path, reduction, metadata)
+
+    monkeypatch.setattr(sources, "read_image", noted)
+    return seen
+
+
+def _image(values: NDArray[np.uint8]) -> DecodedImage:
+    return DecodedImage(values, None, Metadata(values.shape[::-1]))
+
+
+def test_an_image_is_decoded_once_for_all_stages(source: Source, read: list[int]) -> None:
+    shelved = replace(source, decoded_images=DecodedImageCache())
+    looks = [shelved.read(reduction, keep=True).pixels for reduction in (2, 4, 8)]
+    last = shelved.read(8).pixels
+    assert read == [2]
+    np.testing.assert_array_equal(last, looks[2])
+    shelved.read(8)
+    assert read == [2, 2]
+
+
+def test_what_is_on_the_shelf_changes_no_px(source: Source) -> None:
+    shelved = replace(source, decoded_images=DecodedImageCache())
+    shelved.read(2, keep=True)
+    for reduction in (1, 2, 4, 8):
+        with_shelf, without = (s.read(reduction, keep=True).pixels for s in (shelved, source))
+        np.testing.assert_array_equal(with_shelf, without)
+
+
+def test_tags_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    pixels = np.random.default_rng(0).integers(0, 256, (9, 16, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", exif=exif)
+    source = read_sources([tmp_path / "a.jpg"], skip_bad=False)[0][0]
+    expected = read_image(tmp_path / "a.jpg")
+    monkeypatch.setattr(reading, "metadata_of", None)
+    image = source.read()
+    assert image.metadata is source.metadata
+    np.testing.assert_array_equal(image.pixels, expected.pixels)
+
+
+def test_a_larger_size_is_read_from_the_file(source: Source, read: list[int]) -> None:
+    shelved = replace(source, decoded_images=DecodedImageCache())
+    shelved.read(2, keep=True)
+    assert shelved.read().pixels.shape == (SIZE[1], SIZE[0], 3)
+    assert read == [2, 1]
+
+
+def test_masks_are_kept_apart(source: Source, tmp_path: Path) -> None:
+    mask = np.full((SIZE[1], SIZE[0]), 255, np.uint8)
+    mask[:600] = 0
+    write_image(tmp_path / "mask.png", mask)
+    shelved = replace(source, decoded_images=DecodedImageCache())
+    masked = replace(shelved, mask=tmp_path / "mask.png")
+    assert shelved.read(2, keep=True).alpha is None
+    alpha = masked.read(4, keep=True).alpha
+    np.testing.assert_array_equal(alpha, np.repeat([0, 255], [150, 100])[:, None].repeat(375, axis=1))
+    assert shelved.read(2).alpha is None
+
+
+def test_images_for_which_there_is_no_room_are_not_kept() -> None:
+    decoded_images = DecodedImageCache(room=250)
+    large, small = (_image(np.zeros((10, n), np.uint8)) for n in (20, 5))
+    decoded_images.put("large", large)
+    decoded_images.put("other", large)
+    decoded_images.put("small", small)
+    assert decoded_images.take("other") is None
+    assert decoded_images.take("large") is large
+    assert decoded_images.take("large") is None
+    decoded_images.put("other", large)
+    assert decoded_images.take("other") is large
+    assert decoded_images.take("small") is small
+
+
+def _nowhere() -> Path:
+    raise AssertionError("nothing needs to be written")
+
+
+def _arriving(file: Path, level: int = 100) -> Path:
+    assert cv2.imwrite(str(file), np.full((12, 16), level, np.uint8))
+    return file
+
+
+def _names(frames: Iterator[Frame]) -> list[str]:
+    return [frame.path.name for frame in frames]
+
+
+def test_what_is_in_a_folder_comes_in_natural_order_and_then_it_ends(tmp_path: Path) -> None:
+    for name in ("f10.png", "f9.png", ".hidden.png", "notes.txt"):
+        _arriving(tmp_path / name) if name.endswith("png") else (tmp_path / name).write_text("")
+    arrivals = Arrivals(tmp_path, frames_folder=_nowhere, idle=0.01)
+    assert _names(iter(arrivals)) == ["f9.png", "f10.png"]
+    assert arrivals.inputs == [str(tmp_path)]
+
+
+def test_a_file_that_rdstitch_wrote_is_none(tmp_path: Path) -> None:
+    _arriving(tmp_path / "out.png")
+    (tmp_path / "out.png.json").write_text('{"format": "rdstitch sidecar", "output": {"file": "out.png"}}')
+    _arriving(tmp_path / "frame.png")
+    assert _names(iter(Arrivals(tmp_path, frames_folder=_nowhere, idle=0.01))) == ["frame.png"]
+
+
+def test_names_that_do_not_come_are_waited_for_no_longer_than_that() -> None:
+    reading, writing = os.pipe()
+    try:
+        os.write(writing, b"one.png\n\n")
+        stream = os.fdopen(reading, encoding="utf-8", closefd=False)
+        assert _names(iter(Arrivals("-", frames_folder=_nowhere, names=stream, idle=0.1))) == ["one.png"]
+    finally:
+        os.close(writing)
+    with pytest.raises(ArgumentError, match="no list"):
+        Arrivals("-", frames_folder=_nowhere)
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """Six frames, ever lighter, at 5 frames a second."""
+    return write_video(tmp_path / "drive.avi", (np.full((48, 64, 3), 40 * level, np.uint8) for level in range(6)))
+
+
+def test_every_nth_frame_of_a_video_with_its_number_and_time(video: Path) -> None:
+    arrivals = Arrivals(video, frames_folder=_nowhere, every=2)
+    frames = list(arrivals)
+    assert [frame.number for frame in frames] == [0, 2, 4]
+    assert [frame.timestamp for frame in frames] == pytest.approx([0.0, 0.4, 0.8])
+    assert [frame.path.name for frame in frames] == ["drive_000000.png", "drive_000002.png", "drive_000004.png"]
+    images = [frame.image for frame in frames]
+    assert [int(np.median(image.pixels)) for image in images if image] == pytest.approx([0, 80, 160], abs=3)
+    assert arrivals.inputs == [str(video)]
+
+
+def test_frames_of_a_stream_are_kept_since_they_come_only_once(video: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    arrivals = Arrivals(f"file://{video}", frames_folder=lambda: folder)
+    frames = list(arrivals)
+    if not frames:
+        pytest.skip("this OpenCV opens no addresses")
+    kept = [frame for frame in arrivals.inputs if isinstance(frame, Frame)]
+    assert [frame.number for frame in kept] == [0, 1, 2, 3, 4, 5]
+    assert all(frame.path.parent == folder and frame.path.exists() for frame in kept)
+    assert [frame.timestamp for frame in kept] == [frame.timestamp for frame in frames]
+
+
+def test_what_cannot_be_followed_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be followed"):
+        Arrivals(tmp_path / "nothing", frames_folder=_nowhere)
+    with pytest.raises(InputError, match="cannot be followed"):
+        Arrivals(_arriving(tmp_path / "image.png"), frames_folder=_nowhere)
+    with pytest.raises(InputError, match="cannot open"):
+        next(iter(Arrivals("tcp://127.0.0.1:9", frames_folder=_nowhere)))
+    empty = io.StringIO("")
+    assert list(Arrivals("-", frames_folder=_nowhere, names=empty)) == []

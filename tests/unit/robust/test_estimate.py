@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rdstitch.camera import Camera
+from rdstitch.choices import SOLVERS, SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
-from rdstitch.robust.options import SOLVERS, SolverName
 from tests.correspondences import correspondences
 
 MATCHES = correspondences(150, seed=4, outliers=0.3)
