@@ -58,7 +58,7 @@ def test_a_frame_that_shows_nothing_known_says_so(drive: Sequence) -> None:
 def test_what_cannot_be_read_is_a_pose_without_a_place(tmp_path: Path) -> None:
     (tmp_path / "broken.png").write_bytes(b"no image")
     pose = _tracker().add(tmp_path / "broken.png")
-    assert "no image in a format" in pose.reason
+    assert "not an image in a supported format" in pose.reason
     assert not pose
 
 
