@@ -16,9 +16,8 @@ from rdstitch.pipeline.aligner import AlignedPairs, Aligner, Purpose, impossible
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
 from rdstitch.verification.evidence import Evidence
-from rdstitch.verification.findings import Finding
+from rdstitch.verification.findings import Finding, messages_of
 from rdstitch.verification.limits import limit
-from rdstitch.verification.messages import messages_of
 from rdstitch.verification.second_motion import planes_of_pairs
 from rdstitch.verification.verdict import RefusedError, judge
 

@@ -13,7 +13,7 @@ from rdstitch.choices import LensName, ModelName, ProjectionName
 from rdstitch.compositing.projection import PROJECTIONS
 from rdstitch.errors import ArgumentError
 from rdstitch.messages import Message, left_out, told_once
-from rdstitch.verification.messages import TEXTS
+from rdstitch.verification.findings import TEXTS
 from rdstitch.verification.verdict import RefusedError
 
 

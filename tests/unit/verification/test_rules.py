@@ -13,9 +13,8 @@ from rdstitch.messages import Message
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import Evidence
-from rdstitch.verification.findings import Finding
+from rdstitch.verification.findings import TEXTS, Finding, messages_of
 from rdstitch.verification.limits import LIMITS
-from rdstitch.verification.messages import TEXTS, messages_of
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.second_motion import MotionComparison, SecondMotion

@@ -23,8 +23,7 @@ from rdstitch.registration import Registration
 from rdstitch.synthetic import Photometry, camera_rotations, turning_sequence
 from rdstitch.verification import evidence, verdict
 from rdstitch.verification.evidence import Evidence
-from rdstitch.verification.findings import Finding
-from rdstitch.verification.messages import messages_of
+from rdstitch.verification.findings import Finding, messages_of
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.second_motion import MotionComparison, SecondMotion
