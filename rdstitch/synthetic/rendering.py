@@ -79,6 +79,9 @@ class Sequence:
         Height of the ground above the plane; a plane if not given.
     seed : int
         Of the noise.
+    samples : int, optional
+        Samples along each side of a pixel; if not given, as many as the texture needs, at least 2. With 1, large
+        images are rendered faster, and alias a little.
     """
 
     texture: Texture
@@ -87,6 +90,7 @@ class Sequence:
     photometry: Photometry = field(default_factory=Photometry)
     relief: Relief | None = None
     seed: int = 0
+    samples: int | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -200,7 +204,7 @@ class Sequence:
         # Within a pixel the lens and the perspective are linear to a few 1e-4 pixels.
         along = (wide[1:-1, 2:] - wide[1:-1, :-2]) / 2.0
         down = (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2.0
-        count = _samples_per_side(along, down)
+        count = self.samples or _samples_per_side(along, down)
         offsets = (np.arange(count) + 0.5) / count - 0.5
         total = np.zeros((*foot.shape[:2], self.texture.channels), dtype=np.float32)
         for dv in offsets:
