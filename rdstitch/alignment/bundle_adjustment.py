@@ -159,7 +159,7 @@ class BundleAdjuster:
     def covariance(self, adjusted: BundleAdjustmentResult) -> FloatArray:
         """Of the named parameters and the free ones of the lens (S', S'), as far as the overdispersion is right."""
         derivative = self.named_parameters(adjusted.parameters.shared)[1]
-        covariance = _covariance(self.normal_equations(adjusted).shared_information())
+        covariance = inverse_information(self.normal_equations(adjusted).shared_information())
         named: FloatArray = derivative @ covariance @ derivative.T
         return named
 
@@ -284,7 +284,7 @@ class BundleAdjuster:
         """The result with its covariance."""
         state = self._evaluate(parameters, sigma, ALIGNMENT_WIDTH * sigma)
         derivative = self.named_parameters(parameters.shared)[1]
-        covariance = _covariance(self._normal_equations(state, sigma).shared_information())
+        covariance = inverse_information(self._normal_equations(state, sigma).shared_information())
         return BundleAdjustmentResult(
             parameters,
             state.matrices,
@@ -306,7 +306,7 @@ def sigma_of(squared: FloatArray) -> float:
     return max(median / RAYLEIGH_MEDIAN, _MIN_SIGMA) if np.isfinite(median) else 1e3
 
 
-def _covariance(information: FloatArray) -> FloatArray:
+def inverse_information(information: FloatArray) -> FloatArray:
     """Inverse of an information matrix; large, not infinite, for what is not determined."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
