@@ -171,7 +171,8 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         whole = replace(whole, observations=every)
     problem, _ = whole.part(chosen.right, chosen.images)
     problem, fit = adjust_over_relief(problem, choice)
-    problem, fit = with_third_coefficient(problem, fit) if options.lens_chosen else (problem, fit)
+    if len(options.lenses) > 1:
+        problem, fit = with_third_coefficient(problem, fit)
     problem, fit, disagreement = hold_positions(problem, fit)
     covariance, of_lens = covariances(problem, fit)
     fit = weigh_lens(problem, fit, covariance) if chosen.observable else fit

@@ -255,9 +255,11 @@ class BundleAdjuster:
             self.weight(sigma),
         )
         p, free, lens = self.priors, self.free.poses, self.free.lens
-        precision = self.prior_curvatures(state.parameters)
         physical, derivative = self.named_parameters(state.parameters.shared)
-        slope = np.concatenate([slopes(p.shared, physical), slopes(p.lens, state.parameters.lens)[lens]])
+        slope, precision = (
+            np.concatenate([of(p.shared, physical), of(p.lens, state.parameters.lens)[lens]])
+            for of in (slopes, curvatures)
+        )
         poses = self.model.prior_coordinates(state.parameters.poses) - p.poses
         return normal.with_priors(
             p.poses_precision[free],
@@ -265,12 +267,6 @@ class BundleAdjuster:
             derivative.T @ (precision[:, None] * derivative),
             derivative.T @ slope,
         )
-
-    def prior_curvatures(self, parameters: Parameters) -> FloatArray:
-        """Precisions (S',) of the priors on the named and the free lens parameters, as they count there."""
-        physical = self.model.physical_parameters(parameters.shared)[0]
-        lens = curvatures(self.priors.lens, parameters.lens)[self.free.lens]
-        return np.concatenate([curvatures(self.priors.shared, physical), lens])
 
     def named_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The named parameters (S,), and their derivatives by the shared ones and by the lens (S', S')."""

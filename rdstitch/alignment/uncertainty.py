@@ -18,7 +18,7 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, inverse_information
 from rdstitch.alignment.linear_response import LinearResponse
-from rdstitch.alignment.motion_models import LOG_HEIGHT, YAW, PlanarModel, X, Y
+from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import LENS
@@ -173,7 +173,7 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rou
     Of two images nothing but their errors says whether they were tilted alike, and over rough ground they say little.
     Each model counts as much as Schwarz's criterion makes it likely.
     """
-    free = problem.free_fit
+    free = problem.fit(HOMOGRAPHY)
     posterior = Posterior(problem)
     against = float(np.clip((posterior.of(free).score - posterior.of(fit).score) / 2.0, -50.0, 50.0))
     share = 1.0 / (1.0 + math.exp(against))
