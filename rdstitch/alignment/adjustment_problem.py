@@ -210,11 +210,6 @@ class Problem:
         return Fit(model, adjusted, self.free_lens, spread if model.free_tilts else 0.0, overdispersion)
 
     @cached_property
-    def free_fit(self) -> Fit:
-        """The freest motion: one homography an image."""
-        return self.fit(HOMOGRAPHY)
-
-    @cached_property
     def _link_sigma(self) -> float:
         """Standard deviation of a coordinate of the errors of links on their own, pixels."""
         squared = squared_lengths(whitened_errors(self.observations, self.homographies, self.lens))
@@ -240,8 +235,8 @@ class Problem:
         freedom = FreeParameters.fixing(model, self.count, [self.reference], self.free_lens)
         log_focal = None if shared is None or not len(shared) else float(shared[-1])
         priors = self.camera_priors.priors(model, self.count, tilt_spread, log_focal)
-        adjuster = BundleAdjuster(model, self.observations, freedom, priors, overdispersion or self.overdispersion)
-        return replace(adjuster, min_gain=self.min_gain)
+        overdispersion = overdispersion or self.overdispersion
+        return BundleAdjuster(model, self.observations, freedom, priors, overdispersion, min_gain=self.min_gain)
 
     def _chained(self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None) -> Parameters:
         """Every link on its own, chained along the tree of the links trusted most."""

@@ -25,7 +25,7 @@ from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
-from rdstitch.alignment.uncertainty import weigh_lens, with_uncertainty
+from rdstitch.alignment.uncertainty import covariances, weigh_lens
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD, Camera
 from rdstitch.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
@@ -88,7 +88,7 @@ class AlignmentTask:
     @cached_property
     def draft(self) -> Alignment:
         """Model, lens and poses by a few matches of each link; deviations are those of independent errors."""
-        return build_alignment(self._chosen, draft=True)
+        return build_alignment(self._chosen)
 
     @cached_property
     def result(self) -> Alignment:
@@ -171,16 +171,19 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         whole = replace(whole, observations=every)
     problem, _ = whole.part(chosen.right, chosen.images)
     problem, fit = adjust_over_relief(problem, choice)
-    problem, fit = with_third_coefficient(problem, fit) if options.lens_chosen else (problem, fit)
+    if len(options.lenses) > 1:
+        problem, fit = with_third_coefficient(problem, fit)
     problem, fit, disagreement = hold_positions(problem, fit)
-    fit = with_uncertainty(problem, fit)
-    fit = weigh_lens(problem, fit) if chosen.observable else fit
+    covariance, of_lens = covariances(problem, fit)
+    fit = weigh_lens(problem, fit, covariance) if chosen.observable else fit
     return replace(
         chosen,
         problem=problem,
         choice=replace(choice, fit=fit),
         lens=chosen.lens.refined(fit.free_lens),
         positions_disagree=disagreement,
+        covariance=covariance,
+        lens_covariance=of_lens,
     )
 
 

@@ -62,17 +62,20 @@ class AdjustedImages:
     options: AlignmentOptions
     positions_disagree: str = ""  # why the positions were not used; empty where they were, or where there are none
     messages: tuple[Message, ...] = ()  # on what was given
+    # covariance, lens_covariance: of what was estimated, and of all parameters of a lens; none of a draft
+    covariance: FloatArray | None = None
+    lens_covariance: FloatArray | None = None
 
 
-def build_alignment(adjustment: AdjustedImages, *, draft: bool = False) -> Alignment:
+def build_alignment(adjustment: AdjustedImages) -> Alignment:
     """The alignment, in the frame of the reference image.
 
-    A ``draft`` has no test of its shape, and nothing of what was not estimated in its deviations.
+    A draft, which has no covariances, is not tested for its shape, and has the deviations of independent errors.
     """
     problem, fit = adjustment.problem, adjustment.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
     shared, lens = fit.model.physical_parameters(adjusted.parameters.shared)[0], adjusted.parameters.lens
-    covariance = adjusted.covariance
+    covariance = adjusted.covariance if adjustment.covariance is None else adjustment.covariance
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (
         *fit.model.shared_names,
@@ -90,8 +93,8 @@ def build_alignment(adjustment: AdjustedImages, *, draft: bool = False) -> Align
     agreeing = squared <= (ALIGNMENT_WIDTH * math.hypot(sigma, EXACTNESS)) ** 2
     relief = judge_relief(coherence(observations, errors, inliers), fit.model.name, len(observations))
     considered = lens_covariance
-    if adjustment.observable and problem.free_lens[0] and not draft:
-        considered = considered_covariance(problem, fit, rough=relief.found)
+    if adjustment.lens_covariance is not None and adjustment.observable and problem.free_lens[0]:
+        considered = considered_covariance(problem, fit, adjustment.lens_covariance, rough=relief.found)
     tilt, tilt_std = ((float(values[0]), float(values[1])) if planar else None for values in (shared, std))
     focal_std = None if focal is None else float(std[names.index("log_focal")]) * focal
 
@@ -109,7 +112,7 @@ def build_alignment(adjustment: AdjustedImages, *, draft: bool = False) -> Align
     groups = _groups(adjustment)
     used = np.zeros(len(adjustment.cameras), dtype=np.bool_)
     used[adjustment.images] = True
-    homographies, poses = _in_frame_of_reference(adjustment, draft=draft)
+    homographies, poses = _in_frame_of_reference(adjustment)
     return Alignment(
         cameras=cameras,
         homographies=homographies,
@@ -132,7 +135,7 @@ def build_alignment(adjustment: AdjustedImages, *, draft: bool = False) -> Align
         rms=float(np.sqrt(squared[agreeing].mean())) if agreeing.any() else math.nan,
         links=_link_fits(adjustment, squared, agreeing),
         relief=relief,
-        shape=None if draft else _shape(adjustment),
+        shape=_shape(adjustment),
         messages=(*_warnings(adjustment, reference_camera, considered), *adjustment.messages),
     )
 
@@ -140,7 +143,7 @@ def build_alignment(adjustment: AdjustedImages, *, draft: bool = False) -> Align
 def _shape(adjustment: AdjustedImages) -> ShapeTest | None:
     """Whether the whole may be bent, with the image's index among all."""
     fit = adjustment.choice.fit
-    if fit.model.on_sphere or not adjustment.observable:
+    if fit.model.on_sphere or not adjustment.observable or adjustment.covariance is None:
         return None
     images = adjustment.images
     judged = judge_shape(adjustment.problem, fit, [adjustment.cameras[k] for k in images])
@@ -187,7 +190,7 @@ def _nearest_distortion_std(camera: Camera, covariance: FloatArray) -> float:
     return math.sqrt(max(float(gradient @ covariance @ gradient), 0.0))
 
 
-def _in_frame_of_reference(adjustment: AdjustedImages, *, draft: bool) -> tuple[FloatArray, PlanarPoses | None]:
+def _in_frame_of_reference(adjustment: AdjustedImages) -> tuple[FloatArray, PlanarPoses | None]:
     """Image-to-plane homographies of all images, and their poses where the model has them.
 
     The adjustment may have held the reference image anywhere; here it comes to the origin, with yaw zero and, as
@@ -221,7 +224,8 @@ def _in_frame_of_reference(adjustment: AdjustedImages, *, draft: bool) -> tuple[
     )
     frame = rigid_in_plane(yaw[reference], position[reference], height[reference])
     poses = PlanarPoses(yaw, position, height, tilt).relative_to(reference)
-    covariances = pose_covariances(adjustment.problem, fit) if adjustment.options.pose_covariance and not draft else ()
+    wanted = adjustment.options.pose_covariance and adjustment.covariance is not None
+    covariances = pose_covariances(adjustment.problem, fit) if wanted else ()
     aligned_poses = (poses.yaw, poses.position, poses.height, poses.tilt, *covariances)
     return of_all(frame @ np.linalg.inv(matrices)), PlanarPoses(*map(of_all, aligned_poses))
 

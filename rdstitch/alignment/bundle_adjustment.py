@@ -159,7 +159,7 @@ class BundleAdjuster:
     def covariance(self, adjusted: BundleAdjustmentResult) -> FloatArray:
         """Of the named parameters and the free ones of the lens (S', S'), as far as the overdispersion is right."""
         derivative = self.named_parameters(adjusted.parameters.shared)[1]
-        covariance = _covariance(self.normal_equations(adjusted).shared_information())
+        covariance = inverse_information(self.normal_equations(adjusted).shared_information())
         named: FloatArray = derivative @ covariance @ derivative.T
         return named
 
@@ -255,9 +255,11 @@ class BundleAdjuster:
             self.weight(sigma),
         )
         p, free, lens = self.priors, self.free.poses, self.free.lens
-        precision = self.prior_curvatures(state.parameters)
         physical, derivative = self.named_parameters(state.parameters.shared)
-        slope = np.concatenate([slopes(p.shared, physical), slopes(p.lens, state.parameters.lens)[lens]])
+        slope, precision = (
+            np.concatenate([of(p.shared, physical), of(p.lens, state.parameters.lens)[lens]])
+            for of in (slopes, curvatures)
+        )
         poses = self.model.prior_coordinates(state.parameters.poses) - p.poses
         return normal.with_priors(
             p.poses_precision[free],
@@ -265,12 +267,6 @@ class BundleAdjuster:
             derivative.T @ (precision[:, None] * derivative),
             derivative.T @ slope,
         )
-
-    def prior_curvatures(self, parameters: Parameters) -> FloatArray:
-        """Precisions (S',) of the priors on the named and the free lens parameters, as they count there."""
-        physical = self.model.physical_parameters(parameters.shared)[0]
-        lens = curvatures(self.priors.lens, parameters.lens)[self.free.lens]
-        return np.concatenate([curvatures(self.priors.shared, physical), lens])
 
     def named_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The named parameters (S,), and their derivatives by the shared ones and by the lens (S', S')."""
@@ -284,7 +280,7 @@ class BundleAdjuster:
         """The result with its covariance."""
         state = self._evaluate(parameters, sigma, ALIGNMENT_WIDTH * sigma)
         derivative = self.named_parameters(parameters.shared)[1]
-        covariance = _covariance(self._normal_equations(state, sigma).shared_information())
+        covariance = inverse_information(self._normal_equations(state, sigma).shared_information())
         return BundleAdjustmentResult(
             parameters,
             state.matrices,
@@ -306,7 +302,7 @@ def sigma_of(squared: FloatArray) -> float:
     return max(median / RAYLEIGH_MEDIAN, _MIN_SIGMA) if np.isfinite(median) else 1e3
 
 
-def _covariance(information: FloatArray) -> FloatArray:
+def inverse_information(information: FloatArray) -> FloatArray:
     """Inverse of an information matrix; large, not infinite, for what is not determined."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))

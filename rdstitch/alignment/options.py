@@ -100,11 +100,6 @@ class AlignmentOptions:
         )
 
     @property
-    def lens_chosen(self) -> bool:
-        """Whether the images choose the lens, not the caller."""
-        return self.lens == "auto" and not self.lens_known
-
-    @property
     def lenses(self) -> list[str]:
         """Lenses to be tried, from the simplest; none where the lens is given."""
         if self.lens_known:

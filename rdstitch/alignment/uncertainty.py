@@ -10,31 +10,48 @@ independent as the overdispersion of the fit says.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
+from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, inverse_information
 from rdstitch.alignment.linear_response import LinearResponse
-from rdstitch.alignment.motion_models import LOG_HEIGHT, YAW, PlanarModel, X, Y
+from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.select import Posterior
 from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, IntArray
 
-_ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 40
+_ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
 """Matches in all, and of each link at least, that say how high and how wide the hills are."""
 
 _SINGULAR = 1e-12
 """Least eigenvalue of a correlation matrix of parameters."""
 
 
-def sandwich_covariance(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> FloatArray:
-    """Covariance (S', S') of the model's named parameters and the free parameters of the lens.
+def covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray]:
+    """Covariance (P, P) of the model's named parameters and the free ones of the lens, and (5, 5) of all of a lens.
+
+    Also of those that were not freed: consider parameters (Schmidt 1966). That a lens of fewer parameters explains the
+    images does not make it the lens: what they leave open of the others, within what lenses usually have, moves λ where
+    these images show nothing.
+    """
+    free_every, named = replace(problem, free_lens=np.ones_like(problem.free_lens)), len(fit.model.shared_names)
+    every = np.arange(named + len(problem.free_lens))
+    estimated = every[np.concatenate([np.ones(named, dtype=np.bool_), problem.free_lens])]
+    of_estimated, considered = sandwich_covariances(free_every.adjuster_of(fit), fit.adjusted, (estimated, every))
+    return of_estimated, considered[named:, named:]
+
+
+def sandwich_covariances(
+    adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult, parts: Sequence[IntArray]
+) -> list[FloatArray]:
+    """Covariance (P, P) of each part of the model's named parameters and the free ones of the lens, the rest held.
 
     In no direction less than that of independent errors, nor than where errors agree within images.
     """
@@ -46,9 +63,17 @@ def sandwich_covariance(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResu
     absorbed = errors / max(errors - count, 0.25 * errors)
     noise = absorbed * _by_keypoints(observations, influence)
     correlated = _at_least(priors + noise + _by_relief(adjuster, adjusted), by_images)
+    information = response.normal.shared_information()
+    independent = replace(adjuster, overdispersion=1.0).normal_equations(adjusted).shared_information()
     derivative = adjuster.named_parameters(adjusted.parameters.shared)[1]
-    independent = replace(adjuster, overdispersion=1.0).covariance(adjusted)
-    return _at_least(independent, derivative @ correlated @ derivative.T)
+    result = []
+    for part in parts:
+        block = np.ix_(part, part)
+        # What moves all parameters moves the part as this says, where the rest is held.
+        moved = derivative[block] @ np.linalg.solve(information[block], information[part])
+        alone = derivative[block] @ inverse_information(independent[block]) @ derivative[block].T
+        result.append(_at_least(alone, moved @ correlated @ moved.T))
+    return result
 
 
 def _by_relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> FloatArray:
@@ -60,14 +85,6 @@ def _by_relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> Fl
         adjuster = replace(adjuster, observations=few, overdispersion=adjuster.overdispersion * share)
         adjusted = replace(adjusted, squared=adjuster.squared(adjusted.parameters))
     return ReliefField(LinearResponse.of(adjuster, adjusted)).covariance()
-
-
-def with_uncertainty(problem: Problem, fit: Fit) -> Fit:
-    """The fit with the covariance of its parameters."""
-    if not fit.adjusted.covariance.size:
-        return fit
-    covariance = sandwich_covariance(problem.adjuster_of(fit), fit.adjusted)
-    return replace(fit, adjusted=replace(fit.adjusted, covariance=covariance))
 
 
 def _influence(response: LinearResponse) -> tuple[FloatArray, FloatArray]:
@@ -131,21 +148,16 @@ def _by_images(observations: Observations, influence: FloatArray) -> FloatArray:
     return covariance
 
 
-def considered_covariance(problem: Problem, fit: Fit, *, rough: bool) -> FloatArray:
-    """Covariance (5, 5) of all parameters of a lens, also of those that were not freed: consider parameters (Schmidt
-    1966).
+def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *, rough: bool) -> FloatArray:
+    """The covariance (5, 5) of all parameters of a lens with what a wrong model of the motion does to them.
 
-    That a lens of fewer parameters explains the images does not make it the lens. What they leave open of the others,
-    within what lenses usually have, moves λ where these images show nothing. So does a focal length that next to no
-    lens has: something else bends the images, and λ may be what goes with the usual one. Where the ground is
-    ``rough`` that is known, and in the covariance.
+    A focal length that next to no lens has bends the images with something else, and λ may be what goes with the usual
+    one. Where the ground is ``rough`` that is known, and in the covariance.
     """
-    free_every = replace(problem, free_lens=np.ones_like(problem.free_lens))
     count = len(problem.free_lens)
-    adjuster = free_every.adjuster_of(fit)
-    covariance: FloatArray = sandwich_covariance(adjuster, fit.adjusted)[-count:, -count:]
     beside = beside_usual_focal(problem, fit)
     if not rough and abs(beside) > UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
+        adjuster = replace(problem, free_lens=np.ones_like(problem.free_lens)).adjuster_of(fit)
         together = adjuster.covariance(fit.adjusted)
         focal = len(fit.model.shared_names) - 1
         moved = together[-count:, focal] * (beside / together[focal, focal])
@@ -161,18 +173,18 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rou
     Of two images nothing but their errors says whether they were tilted alike, and over rough ground they say little.
     Each model counts as much as Schwarz's criterion makes it likely.
     """
-    free = problem.free_fit
+    free = problem.fit(HOMOGRAPHY)
     posterior = Posterior(problem)
     against = float(np.clip((posterior.of(free).score - posterior.of(fit).score) / 2.0, -50.0, 50.0))
     share = 1.0 / (1.0 + math.exp(against))
     off = free.adjusted.parameters.lens - fit.adjusted.parameters.lens
-    other = considered_covariance(problem, free, rough=rough) + np.outer(off, off)
+    other = considered_covariance(problem, free, covariances(problem, free)[1], rough=rough) + np.outer(off, off)
     mixed: FloatArray = (1.0 - share) * covariance + share * other
     return mixed
 
 
-def weigh_lens(problem: Problem, fit: Fit) -> Fit:
-    """λ where its prior and its uncertainty put it, and everything else adjusted to that.
+def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
+    """λ where its prior and its uncertainty, last in the covariance, put it, and everything else adjusted to that.
 
     The adjustment takes errors for independent, and so its data for surer than they are: where two images show depth,
     they would be believed a fisheye. A lens of more parameters is only chosen where images show it.
@@ -181,7 +193,7 @@ def weigh_lens(problem: Problem, fit: Fit) -> Fit:
         return fit
     parameters = fit.adjusted.parameters
     value = float(parameters.lens[0])
-    std = math.sqrt(float(fit.adjusted.covariance[-1, -1]))
+    std = math.sqrt(float(covariance[-1, -1]))
     weight, mean, scatter = np.array(LENS[0].parts).T
     # Of the mixture's parts the one that it comes from the most likely; each is normal, and so is what is seen.
     spread = np.hypot(scatter, std)
@@ -191,9 +203,7 @@ def weigh_lens(problem: Problem, fit: Fit) -> Fit:
         return fit
     held = replace(problem, free_lens=np.zeros_like(problem.free_lens))
     lens = np.where(problem.free_lens, weighed, parameters.lens)
-    refined = held.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread)
-    # λ stays one of the parameters whose uncertainty is estimated.
-    return replace(fit, adjusted=replace(refined.adjusted, covariance=fit.adjusted.covariance))
+    return replace(fit, adjusted=held.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread).adjusted)
 
 
 _COLUMNS = 512  # of the inverse at a time
