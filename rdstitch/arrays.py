@@ -1,7 +1,6 @@
 """The array types that travel through the library."""
 
-from dataclasses import fields
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +13,13 @@ IntArray = NDArray[np.intp]
 class Rows:
     """Base of dataclasses of arrays that have the first axis in common."""
 
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
     def take(self, rows: NDArray[Any]) -> Self:
         """The rows of some indices, in their order, or of a mask; copies."""
-        return type(self)(*(getattr(self, each.name)[rows] for each in fields(self)))  # type: ignore[arg-type]
+        return type(self)(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
     def put(self, rows: NDArray[Any], others: Self) -> None:
         """Replace some rows."""
-        for each in fields(self):  # type: ignore[arg-type]
-            getattr(self, each.name)[rows] = getattr(others, each.name)
+        for name in self.__dataclass_fields__:
+            getattr(self, name)[rows] = getattr(others, name)

@@ -65,29 +65,31 @@ def main(
                 write_image(file, drive.frame(index))
         arrivals = Arrivals(images, frames_folder=lambda: images, idle=0.5)
         preview = images / ".preview.jpg"
-        found, spent, memory, last = list[Pose](), list[float](), 0.0, time.process_time()
+        poses, spent, memory, last = list[Pose](), list[float](), 0.0, time.process_time()
         for frame in follow(arrivals, options, preview=preview, refresh=1.0):
-            found.append(frame)
+            poses.append(frame)
             spent.append((now := time.process_time()) - last)
             last = now
-            if len(found) == frames // 3:
+            if len(poses) == frames // 3:
                 memory = peak_memory()
         whole = rdstitch.trajectory([images], None, options)[0] if end else None
-    aligned = [k for k, frame in enumerate(found) if frame.tracked and frame.tracked.placement is not None]
-    known = next((k for k, frame in enumerate(found) if frame.tracked and frame.tracked.distortion_known), 0)
-    before, after = np.array(spent[:known]), np.array(spent[known:])
-    print(f"ms a frame: {1e3 * before.mean():.1f} in the {known} frames before λ is known,", end=" ")
-    print(
-        f"{1e3 * after.mean():.1f} afterwards: {1.0 / before.mean():.1f} and {1.0 / after.mean():.1f} frames a second;"
-    )
-    print(f"the slowest frame {1e3 * before.max():.0f} and {1e3 * after.max():.0f} ms")
+    aligned = [k for k, frame in enumerate(poses) if frame.tracked and frame.tracked.placement is not None]
+    unknown = [k for k, frame in enumerate(poses) if not (frame.tracked and frame.tracked.distortion_known)]
+    for name, rows in (("λ unknown", unknown), ("λ known", sorted({*range(len(poses))} - {*unknown}))):
+        if rows:
+            part = np.array(spent)[rows]
+            print(
+                f"{name}: {len(rows)} frames, {1e3 * part.mean():.1f} ms a frame ({1.0 / part.mean():.1f} frames",
+                end=" ",
+            )
+            print(f"a second), {1e3 * part.max():.0f} ms the slowest")
     for share in (0.05, 0.1, 0.25, 0.5, 1.0):
-        tracked = found[max(int(share * len(found)) - 1, 0)].tracked
+        tracked = poses[max(int(share * len(poses)) - 1, 0)].tracked
         if tracked is not None:
             print(f"after {share:4.0%} of the frames: λ - truth {tracked.distortion - DISTORTION:+.5f}", end=" ")
             print(f"± {tracked.distortion_std:.5f}")
     print(f"{len(aligned)} of {frames} frames placed, along {truth.length:.0f} heights of the camera")
-    for name, one in (("as they came", path_of(found)), ("at the end", whole)):
+    for name, one in (("as they came", path_of(poses)), ("at the end", whole)):
         if one is not None:
             error = compare_trajectories(one, truth)
             print(f"{name}: drift {error.drift:.4%} of the path, {end_error(one, truth):.3%} at its end")

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -31,6 +31,7 @@ class MinimalSolver:
     fixed_distortion: bool = False  # whether λ is known
 
 
+@lru_cache(maxsize=64)
 def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortion: float | None) -> list[MinimalSolver]:
     """The solvers that the known quantities allow, those with the fewest points first.
 

@@ -25,6 +25,7 @@ from rdstitch.planar_motion import (
 
 _TILTS, _YAW, _TX, _TY, _HEIGHT, _FOCAL = slice(0, 4), 4, 5, 6, 7, 8
 _PSI, _THETA = (0, 2), (1, 3)
+_COMPLEMENT = np.eye(9)[:, 1:]
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class HomographyPairModel:
         axis = state.copy()
         axis[:, 0] += np.copysign(1.0, axis[:, 0])
         scaled = axis * (2.0 / np.einsum("bi,bi->b", axis, axis))[:, None]
-        return np.asarray(np.eye(9)[:, 1:] - axis[:, :, None] * scaled[:, None, 1:])
+        return np.asarray(_COMPLEMENT - axis[:, :, None] * scaled[:, None, 1:])
 
     def retract(self, state: FloatArray, step: FloatArray) -> FloatArray:
         """Step along the tangent, then back to unit norm."""

@@ -4,6 +4,7 @@ The pairs go on in lockstep, each until it is confident; no pair's result depend
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -137,8 +138,10 @@ class _Lane:
     def __post_init__(self) -> None:
         self.drawn = np.zeros(len(self.data), dtype=np.intp)
         self._least_raw_cost = np.ones(len(self.data))
-        seed = [self.options.seed, self.index]
-        self._sampler = Sampler(self.solver.sample_size, self.options.max_iterations, seed)
+
+    @cached_property
+    def _sampler(self) -> Sampler:
+        return Sampler(self.solver.sample_size, self.options.max_iterations, [self.options.seed, self.index])
 
     def needed(self, best: Hypotheses, rows: IntArray, *, explore: bool = False) -> FloatArray:
         """Samples after which a better model than the best of each of some pairs is unlikely to have been missed.

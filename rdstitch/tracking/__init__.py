@@ -1,6 +1,6 @@
 """Frames registered as they arrive: each against the last keyframes, the last keyframes now and then among themselves.
 
-Memory is bounded: descriptors and matches are kept of the last keyframes only. What comes of it is for watching and
+Memory is bounded: images and matches are kept of the last keyframes only. What comes of it is for watching and
 steering; loops are closed and every pair is used when the whole sequence is registered at the end.
 """
 
