@@ -142,33 +142,18 @@ _MAX_ENLARGEMENT = 400.0  # pixels of the canvas for each of the images, where -
 
 @dataclass(frozen=True)
 class Canvas:
-    """The output image's geometry.
+    """The output image's geometry."""
 
-    Attributes
-    ----------
-    size : (int, int)
-        Width and height, pixels.
-    matrix : ndarray of shape (3, 3)
-        Affine, from plane coordinates to canvas pixels (centre of the top-left pixel at (0, 0)).
-    footprints : tuple of ndarray of shape (K, 2)
-        Outline of what is drawn of each image, canvas pixels, clockwise. Of a canvas that goes all the way round,
-        one of its places; it may reach beyond the canvas.
-    projection : Projection
-        What ``matrix`` is applied to: the places that it gives to directions.
-    period : float or None
-        Width of a full turn, pixels, where the images go all the way round; None where they do not.
-    near : tuple of NearPart or None
-        What of each image is drawn; None for all of it, empty for all of all images.
-    orientation : ndarray of shape (3, 3), or None
-        What the registered images were turned by before, as it is recorded; None where they were not.
-    """
-
-    size: tuple[int, int]
-    matrix: FloatArray
+    size: tuple[int, int]  # width and height, pixels
+    matrix: FloatArray  # (3, 3): affine, from plane coordinates to canvas pixels (centre of the top-left one at (0, 0))
+    # (K, 2) each: outline of what is drawn of each image, canvas pixels, clockwise. Of a canvas that goes all the way
+    # round, one of its places; it may reach beyond the canvas
     footprints: tuple[FloatArray, ...]
-    projection: Projection = PLANE
+    projection: Projection = PLANE  # what ``matrix`` is applied to: the places that it gives to directions
+    # width of a full turn, pixels, where the images go all the way round; None where they do not
     period: float | None = None
-    near: tuple[NearPart | None, ...] = ()
+    near: tuple[NearPart | None, ...] = ()  # what of each image is drawn; None for all of it, empty for all of all
+    # (3, 3): what the registered images were turned by before, as it is recorded; None where they were not
     orientation: FloatArray | None = None
 
     def box(self, index: int) -> Box:

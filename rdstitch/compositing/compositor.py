@@ -28,27 +28,14 @@ from rdstitch.progress import ShareProgress, unheard
 
 @dataclass(frozen=True, repr=False)
 class Composite:
-    """The stitched image.
+    """The stitched image."""
 
-    Attributes
-    ----------
-    pixels : ndarray of shape (H, W) or (H, W, C)
-        In the sample type of the images, RGB order; 0 where no image lies.
-    alpha : ndarray of shape (H, W), uint8
-        255 where an image lies, else 0.
-    canvas : Canvas
-        Geometry of ``pixels``, after cropping.
-    exposure : Exposure
-        What the images were corrected by.
-    messages : tuple of Message
-        What the user should know, such as why nothing was cropped.
-    """
-
+    # (H, W) or (H, W, C): in the sample type of the images, RGB order; 0 where no image lies
     pixels: NDArray[Any]
-    alpha: NDArray[np.uint8]
-    canvas: Canvas
-    exposure: Exposure
-    messages: tuple[Message, ...] = ()
+    alpha: NDArray[np.uint8]  # (H, W), uint8: 255 where an image lies, else 0
+    canvas: Canvas  # geometry of ``pixels``, after cropping
+    exposure: Exposure  # what the images were corrected by
+    messages: tuple[Message, ...] = ()  # what the user should know, such as why nothing was cropped
 
     def __repr__(self) -> str:
         return f"<Composite {self.canvas.size[0]} x {self.canvas.size[1]} pixels, {self.pixels.dtype}>"

@@ -36,29 +36,16 @@ _DARKEST, _BRIGHTEST = 0.02, 0.97
 
 @dataclass(frozen=True)
 class Cells:
-    """Cells that two images show.
+    """Cells that two images show."""
 
-    Attributes
-    ----------
-    pair : ndarray of shape (M,)
-        Index of the overlap, ascending.
-    images : ndarray of shape (2, M)
-    points : ndarray of shape (2, M, 2)
-        Middle of the cell, measured pixels of either image.
-    values : ndarray of shape (2, M, C)
-        Mean samples, share of the full range.
-    clipped : ndarray of shape (2, M), bool
-        Where an image is burnt out: its light is what the samples say, or more. Other cells hold no clipped sample.
-    overlap : sparse array of shape (N, N)
-        What two images have in common, share of the smaller one.
-    """
-
-    pair: IntArray
-    images: IntArray
-    points: FloatArray
-    values: FloatArray
+    pair: IntArray  # (M,): index of the overlap, ascending
+    images: IntArray  # (2, M)
+    points: FloatArray  # (2, M, 2): middle of the cell, measured pixels of either image
+    values: FloatArray  # (2, M, C): mean samples, share of the full range
+    # (2, M), bool: where an image is burnt out: its light is what the samples say, or more. Other cells hold no
+    # clipped sample
     clipped: BoolArray
-    overlap: "sparse.csr_array"
+    overlap: "sparse.csr_array"  # (N, N): what two images have in common, share of the smaller one
 
     @property
     def clear(self) -> BoolArray:
@@ -194,20 +181,12 @@ def estimate_exposure(survey: Survey, images: Sequence[PlacedImage], method: Exp
 
 @dataclass(frozen=True)
 class _Differences:
-    """What the first image of each cell is brighter by, log units, for one response of the camera.
-
-    Attributes
-    ----------
-    offset : float
-    values : ndarray of shape (M, C)
-    level : ndarray of shape (M,)
-        Share of the full range that one log unit is there.
-    """
+    """What the first image of each cell is brighter by, log units, for one response of the camera."""
 
     cells: Cells
     offset: float
-    values: FloatArray
-    level: FloatArray
+    values: FloatArray  # (M, C)
+    level: FloatArray  # (M,): share of the full range that one log unit is there
 
     @classmethod
     def of(cls, cells: Cells, offset: float) -> Self:

@@ -26,37 +26,17 @@ _SECONDS_OUT, _SECONDS_IN = 0.15, 0.03
 
 @dataclass(frozen=True)
 class CompositePlan:
-    """Sizes of the work.
+    """Sizes of the work."""
 
-    Attributes
-    ----------
-    canvas_size : (int, int)
-        pixels, before cropping.
-    images : int
-    tile_size : int
-        pixels.
-    workers : int
-        Tiles at one time.
-    bands : int
-    cache_bytes : int
-        For images held.
-    memory_bytes : int
-        Estimate of all that the compositor holds at one time.
-    output_bytes : int
-        Of the samples, not compressed.
-    seconds : float
-        Rough estimate.
-    """
-
-    canvas_size: tuple[int, int]
+    canvas_size: tuple[int, int]  # pixels, before cropping
     images: int
-    tile_size: int
-    workers: int
+    tile_size: int  # pixels
+    workers: int  # tiles at one time
     bands: int
-    cache_bytes: int
-    memory_bytes: int
-    output_bytes: int
-    seconds: float
+    cache_bytes: int  # for images held
+    memory_bytes: int  # estimate of all that the compositor holds at one time
+    output_bytes: int  # of the samples, not compressed
+    seconds: float  # rough estimate
 
 
 def plan_composite(
