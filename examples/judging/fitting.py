@@ -2,11 +2,10 @@
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-
-_REFINEMENTS = 10
 
 
 def apply(transform: ArrayLike, points: ArrayLike) -> FloatArray:
@@ -41,39 +40,25 @@ def fit_homography(source: ArrayLike, target: ArrayLike) -> FloatArray:
     """Homography that minimises the sum of squared distances in ``target``.
 
     ``source``, ``target``: at least four points (N, 2), no three of four on a line. Returns the normalized direct
-    linear transform, refined by Gauss-Newton; from source to target, ``H[2, 2] = 1``. Raises :class:`ArgumentError`
+    linear transform, refined by least squares; from source to target, ``H[2, 2] = 1``. Raises :class:`ArgumentError`
     when the points determine no homography.
     """
     a, b = _checked(source, target, 4)
     to_a, to_b = _normalization(a), _normalization(b)
     p, q = apply(to_a, a), apply(to_b, b)
-    ones, zeros = np.ones((len(p), 1)), np.zeros((len(p), 3))
-    lifted = np.hstack([p, ones])
-    rows = np.concatenate(
-        [np.hstack([lifted, zeros, -q[:, :1] * lifted]), np.hstack([zeros, lifted, -q[:, 1:] * lifted])]
-    )
-    singular, basis = np.linalg.svd(rows, full_matrices=False)[1:]
+    lifted, zeros = np.column_stack([p, np.ones(len(p))]), np.zeros((len(p), 3))
+    rows = [np.hstack([lifted, zeros, -q[:, :1] * lifted]), np.hstack([zeros, lifted, -q[:, 1:] * lifted])]
+    singular, basis = np.linalg.svd(np.concatenate(rows), full_matrices=False)[1:]
     if len(singular) < 8 or singular[7] < 1e-10 * singular[0]:
         raise ArgumentError("the points determine no homography")
-    h = basis[-1].reshape(3, 3)
-    for _ in range(_REFINEMENTS):
-        mapped = lifted @ h.T
-        found = mapped[:, :2] / mapped[:, 2:]
-        by_third = lifted / mapped[:, 2:]
-        jacobian = np.concatenate(
-            [
-                np.hstack([by_third, zeros, -found[:, :1] * by_third]),
-                np.hstack([zeros, by_third, -found[:, 1:] * by_third]),
-            ]
-        )
-        # The scale of H is free: the least-norm step leaves it alone.
-        step = np.linalg.lstsq(jacobian, (q - found).T.ravel(), rcond=1e-9)[0]
-        h = h + step.reshape(3, 3)
-        if np.linalg.norm(step) < 1e-13 * np.linalg.norm(h):
-            break
-    h = np.linalg.inv(to_b) @ h @ to_a
-    normalized: FloatArray = h / h[2, 2]
-    return normalized
+
+    def off(h: FloatArray) -> FloatArray:
+        residual: FloatArray = apply(h.reshape(3, 3), p) - q
+        return residual.ravel()
+
+    found = least_squares(off, basis[-1], xtol=1e-13, ftol=1e-15, gtol=1e-15)
+    h = np.linalg.inv(to_b) @ found.x.reshape(3, 3) @ to_a
+    return np.asarray(h / h[2, 2])
 
 
 FITS = {"similarity": fit_similarity, "homography": fit_homography}

@@ -75,6 +75,7 @@ def check_size(sources: Sequence[Source]) -> None:
 
 def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
     """The tiles, which are read without the illumination that all have; and what there is to say of that."""
+    # Imported late: images that are no tiles have no use for it.
     from rdstitch.stage.flat_field import estimate_illumination
 
     if wanted == "off":
@@ -84,8 +85,6 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         field = read_flat_field(wanted, sources[0].camera.image_size, channels)
         return [replace(source, flat_field=field) for source in sources], []
-    # Imported late: images that are no tiles have no use for it.
-
     shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
     if shown.field is None:
         text = f"{len(sources)} tiles show no illumination that they have in common, and samples stay as they are"
