@@ -171,7 +171,7 @@ WRONG: list[Any] = [[np.zeros((4, 5), np.int64)], [np.zeros((0, 5), np.uint8)], 
 
 @pytest.mark.parametrize(
     ("wrong", "told"),
-    [*((wrong, "") for wrong in WRONG), ([None, "b.png"], r"image 0 is None, which cv2\.imread returns")],
+    [*((wrong, ".") for wrong in WRONG), ([None, "b.png"], r"image 0 is None, which cv2\.imread returns")],
 )
 def test_what_is_no_image_is_named(wrong: Any, told: str) -> None:
     with pytest.raises(ArgumentError, match=told):

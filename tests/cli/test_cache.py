@@ -14,7 +14,6 @@ import pytest
 from rdstitch_cli.main import run
 
 from rdstitch.matching import two_view
-from rdstitch.pipeline import aligner
 from rdstitch.verification import overlap_check
 from tests.cli.running import FAST, Run, finished, start
 from tests.sampled import sampled
@@ -52,7 +51,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     # The package has a function of the module's name.
     watch(import_module("rdstitch.features.detect"), "_detect")
     watch(two_view, "estimate_radial_homographies")
-    watch(aligner, "align")
+    watch(import_module("rdstitch.alignment.align"), "_chosen")
     watch(overlap_check, "overlap_agreement")
     return called
 
@@ -62,15 +61,15 @@ def test_only_what_depends_on_a_changed_option_is_done_again(
 ) -> None:
     output = tmp_path / "out.png"
     arguments = ("mosaic", *frames, "-o", output, "--overwrite", "--cache", tmp_path / "new" / "cache", *FAST)
-    for expected in ({"_detect", "estimate_radial_homographies", "align", "overlap_agreement"}, set()):
+    for expected in ({"_detect", "estimate_radial_homographies", "_chosen", "overlap_agreement"}, set()):
         work.clear()
         first = rdstitch(*arguments)
         assert (first.status, set(work)) == (0, expected)
         assert _result(output) == plain
     for options, expected in (
         (("--blend", "feather", "--scale", "0.5"), set()),
-        (("--seed", "1"), {"estimate_radial_homographies", "align", "overlap_agreement"}),
-        (("--features", "orb"), {"_detect", "estimate_radial_homographies", "align", "overlap_agreement"}),
+        (("--seed", "1"), {"estimate_radial_homographies", "_chosen", "overlap_agreement"}),
+        (("--features", "orb"), {"_detect", "estimate_radial_homographies", "_chosen", "overlap_agreement"}),
     ):
         work.clear()
         rdstitch(*arguments, *options)
@@ -79,7 +78,7 @@ def test_only_what_depends_on_a_changed_option_is_done_again(
     moved = [Path(shutil.copy(frame, tmp_path / f"moved_{frame.name}")) for frame in frames]
     work.clear()
     rdstitch("calibrate", *moved, "-o", tmp_path / "camera.json", *arguments[-2 - len(FAST) :])
-    assert work == ["align"]  # whose layout does not matter to a lens
+    assert work == ["_chosen"]  # whose layout does not matter to a lens
 
 
 def test_an_image_more_needs_only_its_own(
