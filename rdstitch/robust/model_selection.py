@@ -10,7 +10,6 @@ from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import OBSERVABLE_STD
 from rdstitch.robust.covariance import covariances
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
-from rdstitch.robust.linearization import PairLenses, differentiate
 from rdstitch.robust.loss import PAIR_WIDTH, RAYLEIGH_MEDIAN
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
@@ -19,7 +18,7 @@ from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
 # Halved or doubled, these change the median error of λ by a sixth at most.
 _MIN_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
 _MAX_RESIDUAL = 3.0  # errors, in thresholds, beyond which a match is left out of the choice
-_STEPS = 15
+_FREE_STEPS, _STEPS = 8, 15
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class _Fitted(NamedTuple):
 
     model: PairModel
     fits: Fits
-    found: BatchedNormalEquations
+    equations: BatchedNormalEquations
 
 
 @dataclass(frozen=True)
@@ -68,17 +67,11 @@ class PairSelection:
             noise=self.noise[rows],
         )
 
-    @np.errstate(all="ignore")
-    def errors(self) -> FloatArray:
-        """Errors of the matches (B, N) where the pairs stand, pixels; inf where there is none."""
-        moved = differentiate(self.homography, PairLenses(self.distortion), self.data)
-        return np.sqrt(np.where(moved.lost | ~self.data.present, np.inf, moved.squared))
-
-    def fit(self, model: PairModel, width: FloatArray, steps: int) -> _Fitted:
+    def fit(self, model: PairModel, width: FloatArray, steps: int, *, rough: bool = False) -> _Fitted:
         """A model fitted to every pair from where it stands, with a loss of the given widths (B,), pixels."""
         start = Fits(model.initialize(self.homography, self.tilts), self.homography, self.distortion)
         problems = PairProblems(model, self.data, width, self.noise, self.fixed_distortion)
-        return _Fitted(model, *refine_pairs(problems, start, steps))
+        return _Fitted(model, *refine_pairs(problems, start, steps, rough=rough))
 
     def at(self, fits: Fits) -> Self:
         """Standing at fits."""
@@ -99,15 +92,17 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
         ``noise`` is estimated anew.
     """
     threshold, homography = pairs.threshold, HomographyPairModel()
-    errors = pairs.errors()
+    # The search ends near one plane of several; without its own fit a pair with depth keeps a sixth fewer inliers.
+    free = pairs.fit(homography, np.full(len(pairs.data), threshold), _FREE_STEPS, rough=True)
+    errors = free.equations.errors
     noise = noise_of(errors, threshold)
-    near = replace(pairs, noise=noise, data=pairs.data.only(errors < _MAX_RESIDUAL * threshold))
+    near = replace(pairs.at(free.fits), noise=noise, data=pairs.data.only(errors < _MAX_RESIDUAL * threshold))
     inliers = np.maximum((errors < threshold).sum(axis=1), 1)
     width, price = loss_width(noise, threshold), noise**2 * np.log(2 * inliers)
     freest = near.fit(homography, width, _STEPS)
     fitted = [*(near.fit(model, width, _STEPS) for model in planar), freest]
-    chosen = np.argmin([each.found.cost + each.found.information.shape[1] * price for each in fitted], axis=0)
-    rms = np.stack([rms_of(each.found.errors, threshold) for each in fitted], axis=1)
+    chosen = np.argmin([each.equations.cost + each.equations.information.shape[1] * price for each in fitted], axis=0)
+    rms = np.stack([rms_of(each.equations.errors, threshold) for each in fitted], axis=1)
     result: dict[int, PairFit] = {}
 
     def finished(index: int, rows: IntArray) -> dict[int, PairFit]:

@@ -4,6 +4,7 @@ Both images are drawn on the plane, and correlated at every shift at once (maske
 Padfield 2012). Where the plane is metric a shift by a period of the pattern is as good as the right one.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -15,12 +16,13 @@ from rdstitch.radial_homography import to_plane
 from rdstitch.verification.limits import limit
 from rdstitch.verification.photometric_agreement import ComparedImage, Grey
 
-MAX_SIDE = 128  # pixels of the images that are compared; twice as many say the same, and take four times as long
+MAX_SIDE = 256  # pixels of the images that are compared
+_COARSE_SIDE = 128  # pixels of those that are compared first, in a quarter of the time
+_DECIDED = 0.75  # of the correlation here: where they reach less elsewhere, larger ones do not reach the limit either
 _MAX_PX = 4  # times the sides of an image that its outline on the plane may have
-_COARSEST = 4.0  # pixels, standard deviation of the blur that brightness is measured by
-_MIN_SHIFT = 7  # pixels: shifts that are none
-SLACK = 1.5  # pixels by which the registration may be off
-_PEAK_SIDE = 5  # pixels, in which a peak is the largest value
+COARSEST = 8.0  # pixels, standard deviation of the blur that brightness is measured by
+_MIN_SHIFT = 14  # pixels: shifts that are none
+SLACK = 3  # pixels by which the registration may be off
 _MIN_NORM = 1e-4  # of the largest: where fewer pixels overlap, rounding decides
 
 
@@ -58,7 +60,7 @@ def drawing_scale(camera: Camera, homography: FloatArray, longest_side: int = MA
     return float(min(1.0, longest_side / max(height, width)) / np.sqrt(area))
 
 
-def draw(image: ComparedImage, scale: float, longest_side: int = MAX_SIDE, coarsest: float = _COARSEST) -> Drawing:
+def draw(image: ComparedImage, scale: float, longest_side: int = MAX_SIDE, coarsest: float = COARSEST) -> Drawing:
     """Draw an image on the plane with so many pixels a unit; ``longest_side`` is that of :func:`drawing_scale`.
 
     What is coarser than a blur by ``coarsest`` pixels counts as brightness.
@@ -82,30 +84,36 @@ def draw(image: ComparedImage, scale: float, longest_side: int = MAX_SIDE, coars
     return Drawing(_without_brightness(drawn, coarsest), origin)
 
 
-def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
+def placement_ambiguity(first: Drawing, second: Drawing, longest_side: int = MAX_SIDE) -> Ambiguity:
     """Compare two images, drawn at the same scale, at all shifts on the plane."""
+    share = longest_side / MAX_SIDE
     overlaps = Overlaps.of(first.pixels, second.pixels)
     # Position of the first image within the second: rows and columns count from -(size - 1) of the first.
     rows, columns = (np.arange(n) - (m - 1) for n, m in zip(overlaps.area.shape, first.pixels.shape, strict=True))
     right, down = np.rint(first.origin - second.origin)
     distance = np.hypot((rows - down).astype(np.float32)[:, None], (columns - right).astype(np.float32))
-    near = distance <= SLACK
+    near = distance <= share * SLACK
     most = float(overlaps.area[near].max(initial=0.0))
     if not most > 0:
         return Ambiguity(0.0, 0.0, 0.0)
     score = overlaps.correlation()
     # A peak of its own, not the flank of the one here.
-    peak = score >= cv2.dilate(score, np.ones((_PEAK_SIDE, _PEAK_SIDE), dtype=np.uint8))
+    peak = score >= cv2.dilate(score, np.ones((2 * math.ceil(share * SLACK) + 1,) * 2, dtype=np.uint8))
     enough = overlaps.area >= limit("kept overlap") * most
-    other = np.where(peak & (distance > _MIN_SHIFT) & enough, score, np.float32(0.0))
+    other = np.where(peak & (distance > share * _MIN_SHIFT) & enough, score, np.float32(0.0))
     best = int(other.argmax())
-    return Ambiguity(float(score[near].max()), float(other.flat[best]), float(distance.flat[best]) / MAX_SIDE)
+    return Ambiguity(float(score[near].max()), float(other.flat[best]), float(distance.flat[best]) / longest_side)
 
 
 def find_ambiguity(first: ComparedImage, second: ComparedImage) -> Ambiguity:
     """Draw two images on the plane at the scale of the second one, and compare them at all shifts."""
-    scale = drawing_scale(second.camera, second.homography)
-    return placement_ambiguity(draw(first, scale), draw(second, scale))
+    for side in (_COARSE_SIDE, MAX_SIDE):
+        scale, coarsest = drawing_scale(second.camera, second.homography, side), COARSEST * side / MAX_SIDE
+        drawn = [draw(image, scale, side, coarsest) for image in (first, second)]
+        ambiguity = placement_ambiguity(drawn[0], drawn[1], side)
+        if ambiguity.elsewhere < _DECIDED * ambiguity.here:
+            break
+    return ambiguity
 
 
 def _without_brightness(image: Grey, coarsest: float) -> Grey:

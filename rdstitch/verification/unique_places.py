@@ -18,7 +18,6 @@ from rdstitch.verification.limits import limit
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE, ComparedImage, Grey
 from rdstitch.verification.self_similarity import Drawing, Overlaps, draw, drawing_scale
 
-COARSEST = 8.0  # pixels, standard deviation of the blur that brightness is measured by
 _MIN_SHIFT = 10  # pixels: a shorter shift is no period that could be told from the peak itself
 _OWN_OVERLAP, _OVERLAP = 0.15, 0.05  # of an image, that a shift must keep; of two, of the most that one keeps
 _MAX_PERIODS = 16  # shifts that an image is compared with itself at
@@ -69,7 +68,7 @@ def unique_shifts(
     scale = float(np.median([drawing_scale(placed[k].camera, placed[k].homography, COMPARED_SIDE) for k in images]))
 
     def prepare(k: int) -> tuple[Drawing, Grey | None]:
-        drawing = draw(placed[k], scale, COMPARED_SIDE, COARSEST)
+        drawing = draw(placed[k], scale, COMPARED_SIDE)
         return drawing, departures(drawing.pixels)
 
     def compare(pair: tuple[int, int]) -> UniqueShift | None:

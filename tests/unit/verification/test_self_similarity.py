@@ -9,7 +9,7 @@ from rdstitch.camera import Camera
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification.photometric_agreement import ComparedImage
 from rdstitch.verification.self_similarity import Ambiguity, draw, drawing_scale, placement_ambiguity
-from rdstitch.verification.unique_places import COARSEST, departures, unique_shifts
+from rdstitch.verification.unique_places import departures, unique_shifts
 
 SIZE = (256, 192)
 LENS = Camera(SIZE)
@@ -102,7 +102,7 @@ def _image(stains: np.ndarray, left: int, top: int, put: tuple[int, int] = (0, 0
 
 
 def _pixels(image: ComparedImage) -> np.ndarray:
-    return draw(image, drawing_scale(image.camera, image.homography, SIZE[0]), SIZE[0], COARSEST).pixels
+    return draw(image, drawing_scale(image.camera, image.homography, SIZE[0]), SIZE[0]).pixels
 
 
 def test_only_what_is_unique_departs_from_the_pattern() -> None:
