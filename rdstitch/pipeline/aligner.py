@@ -8,6 +8,7 @@ from typing import Literal, Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
+from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.frames import stored, turned_alignment, turned_link, turned_tilts, turns
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
@@ -23,7 +24,6 @@ from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import names_of
 from rdstitch.options import StitchOptions
 from rdstitch.orientation import quarter_turn
-from rdstitch.pipeline.inlier_selection import reselect_inliers
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.process_memory import return_freed_memory
 from rdstitch.verification.limits import limit
@@ -43,6 +43,13 @@ _SETTLED = 0.05
 _EXPLAINED = 0.5
 """Share of the matches off the planes of their pairs that are where the alignment expects them: more than half, and it
 was the lens that moved them, not the ground."""
+
+
+_WIDTH_PER_SIGMA, _MIN_THRESHOLD = 4.0, 0.5
+"""Up to how many standard deviations a match is an inlier, but at least up to so many pixels."""
+
+_MIN_KEPT = 0.5
+"""Share of its inliers that a pair must keep; otherwise the alignment does not fit it, and it stays as it is."""
 
 
 @contextmanager
@@ -206,6 +213,35 @@ def select_by_whole_lens(aligned: AlignedPairs, threshold: float) -> list[PairRe
     if changed <= _SETTLED * sum(int(pair.relation.inliers.sum()) for pair in selected.values()):
         return None
     return [selected.get(k, pair) for k, pair in enumerate(pairs)]
+
+
+def reselect_inliers(
+    pairs: Sequence[PairRegistration], alignment: Alignment, threshold: float
+) -> dict[int, PairRegistration]:
+    """Select the inliers of the pairs again, by what an alignment expects of their putative matches.
+
+    Parameters
+    ----------
+    alignment : Alignment
+        Of these pairs.
+    threshold : float
+        Distance up to which a match can be an inlier, pixels; it is less where the inliers scatter less.
+
+    Returns
+    -------
+    dict of int to PairRegistration
+        The pairs that the alignment uses and fits, with their inliers, by their position in ``pairs``.
+    """
+    errors = {k: pair.errors(alignment.transfer) for k, pair in enumerate(pairs) if pair.images in alignment.support}
+    known = [errors[k][pairs[k].relation.inliers] for k in errors]
+    sigma = sigma_of(np.concatenate([np.zeros(0), *known]) ** 2)
+    farthest = min(max(_WIDTH_PER_SIGMA * sigma, _MIN_THRESHOLD), threshold)
+    result = {}
+    for k, distances in errors.items():
+        relation, inliers = pairs[k].relation, distances < farthest
+        if inliers.sum() >= _MIN_KEPT * relation.inliers.sum():
+            result[k] = replace(pairs[k], relation=replace(relation, inliers=inliers))
+    return result
 
 
 def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:

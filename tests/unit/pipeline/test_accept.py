@@ -22,8 +22,7 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import Message, left_out
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import _without, accept
-from rdstitch.pipeline.aligner import AlignedPairs, Aligner, select_by_whole_lens
-from rdstitch.pipeline.inlier_selection import reselect_inliers
+from rdstitch.pipeline.aligner import AlignedPairs, Aligner, reselect_inliers, select_by_whole_lens
 from rdstitch.pipeline.register import register
 from rdstitch.verification.verdict import RefusedError
 from tests.alignment_scenes import grid, scene
