@@ -116,7 +116,7 @@ def test_of_a_turn_a_second_motion_is_parallax() -> None:
         (9, 0.2, None),
         (11, 0.9, "warning"),
         (11, np.nan, "warning"),
-        (11, 0.39, "failure"),
+        (11, 0.37, "failure"),
         (44, 0.41, "warning"),
         (51, 0.49, "failure"),
         (51, np.nan, "failure"),
