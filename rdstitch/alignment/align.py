@@ -170,6 +170,9 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         every, _ = _observations(links, chosen.cameras, _MATCHES_OF_A_TURN // len(links))
         whole = replace(whole, observations=every)
     problem, _ = whole.part(chosen.right, chosen.images)
+    # What errors share weighs the more, the more of them there are.
+    noise = noise_of_links(problem.observations, problem.homographies, problem.lens)
+    problem = replace(problem, overdispersion=max(noise.overdispersion, choice.overdispersion))
     problem, fit = adjust_over_relief(problem, choice)
     if len(options.lenses) > 1:
         problem, fit = with_third_coefficient(problem, fit)

@@ -17,7 +17,7 @@ from rdstitch.alignment.normal_equations import PoseBlocks, SparseNormalEquation
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors, costs, curvatures, slopes
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.robust.levenberg_marquardt import FIRST_DAMPING, MAX_DAMPING, MIN_GAIN, damping_by_gain
+from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, MIN_GAIN, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
 
 _MIN_SIGMA = 1e-3
@@ -93,6 +93,10 @@ class _State:
     cost: float
 
 
+_FIRST_DAMPING = 1e-6
+"""Of the diagonal of the normal matrix. Focal length and tilts of many images are so weak together that a hundred times
+as much held them: of 300 frames the focal length stayed 13 % off, with a standard deviation of 2 %."""
+
 Revision = Callable[["BundleAdjuster", Parameters, float, FloatArray], "BundleAdjuster"]
 """See :meth:`BundleAdjuster.run`."""
 
@@ -166,7 +170,7 @@ class BundleAdjuster:
     def _descend(self, parameters: Parameters, sigma: float, width: float, most: int) -> tuple[_State, int, bool]:
         """Levenberg-Marquardt at one width of the loss; the state reached, linearizations, whether converged."""
         state = self._evaluate(parameters, sigma, width)
-        damping, failures, used = FIRST_DAMPING, 0, 1
+        damping, failures, used = _FIRST_DAMPING, 0, 1
         while used < most:
             normal = self._normal_equations(state, sigma)
             try:
