@@ -141,6 +141,26 @@ def test_outliers_do_not_move_the_result() -> None:
     assert abs(value - truth.distortion) < 5 * std < 0.005
 
 
+def test_the_focal_length_of_a_long_strip_is_the_same_from_wherever_it_starts() -> None:
+    """It is hardly seen beside the tilts of all images: damping would leave it near its start."""
+    rng = np.random.default_rng(5)
+    poses = jittered(grid(25, 2, (0.3, 0.5), 0.1, rng), 0.05, 0.02, rng)
+    truth = scene(poses, tilt=(0.02, -0.03), noise=0.2, rng=rng, per_link=120)
+    count, true = len(poses), np.log(520.0 / truth.cameras[0].scale)
+    freedom = FreeParameters.fixing(TILTING, count, [0], ONE_LENS)
+    seen = Observations.from_links(truth.links, truth.cameras)
+    adjuster = BundleAdjuster(TILTING, seen, freedom, Priors.none(TILTING, count))
+    values = []
+    for factor in (0.8, 1.0, 1.3):
+        shared = TILTING.shared_from_physical(np.array([0.02, -0.03, true + np.log(factor)]))
+        start = TILTING.nearest_poses(truth.truth, shared, np.zeros((count, 2)))
+        result = adjuster.run(Parameters(start, shared, np.array([-0.25, 0.0, 0.0, 0.0, 0.0])))
+        values.append(float(result.parameters.shared[-1]))
+    std = float(np.sqrt(adjuster.covariance(result)[2, 2]))
+    assert np.ptp(values) < 0.05 * std
+    assert abs(values[0] - true) < 4 * std
+
+
 def test_errors_of_a_given_scatter_give_their_sigma() -> None:
     errors = np.random.default_rng(0).normal(0, 0.7, (20_000, 2))
     assert sigma_of((errors**2).sum(axis=1)) == pytest.approx(0.7, rel=0.03)
