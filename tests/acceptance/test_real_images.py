@@ -114,6 +114,14 @@ def test_sequences(name: str, least: int, distortion: float, tolerance: float, s
 
 
 @pytest.mark.slow
+def test_trees_and_houses_leave_the_focal_length(shared_data: Locate) -> None:
+    """That of EXIF is right; with priors that all matches outweigh, relief made it half as long again."""
+    registration = rdstitch.calibrate([shared_data("beach")])
+    written = registration.sources[0].metadata.focal_px
+    assert abs(np.log(registration.camera.focal / written)) < 0.2
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(BOARDS))
 def test_chessboards_are_straight(name: str, shared_data: Locate) -> None:
     """Rows and columns of corners, undistorted, against a lens of eight coefficients fitted to these corners."""
