@@ -128,7 +128,7 @@ def spoiled(tmp_path: Path) -> list[Path]:
     true = read_image(frames[4]).pixels
     image = flight(29, 5).frame(4).copy()
     height, width = image.shape[:2]
-    patch = np.s_[height // 3 : height // 3 + 80, width // 8 : width // 8 + 80]
+    patch = np.s_[height // 3 : height // 3 + 72, width // 8 : width // 8 + 72]
     image[patch] = true[patch]
     write_image(frames[4], image)
     return frames

@@ -55,10 +55,11 @@ def test_exif_tells_the_time(rdstitch: Run, frames: list[Path], tmp_path: Path) 
     folder.mkdir()
     for number, frame in enumerate(frames):
         exif = Image.Exif()
-        photo = exif.get_ifd(ExifTags.IFD.Exif)
-        photo[ExifTags.Base.DateTimeOriginal] = f"2024:05:01 12:00:0{number}"
-        photo[ExifTags.Base.SubsecTimeOriginal] = "25"
-        photo[ExifTags.Base.OffsetTimeOriginal] = "+02:00"
+        exif[ExifTags.IFD.Exif] = {
+            ExifTags.Base.DateTimeOriginal: f"2024:05:01 12:00:0{number}",
+            ExifTags.Base.SubsecTimeOriginal: "25",
+            ExifTags.Base.OffsetTimeOriginal: "+02:00",
+        }
         with Image.open(frame) as image:
             image.save(folder / f"{number}.jpg", exif=exif, quality=97)
     output = tmp_path / "path.tum"
