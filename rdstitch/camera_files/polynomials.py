@@ -139,10 +139,11 @@ class Polynomial:
         r = s u, where s (1 - Σ k) = 1, and k are those found over s^p.
         """
         # Imported late: no other command should wait for SciPy's optimizers.
-        from scipy.optimize import brentq
+        from scipy.optimize import newton
 
         terms = list(zip(self.coefficients, self.powers, strict=True))
-        scale: float = brentq(lambda s: s - 1.0 - sum(k / s ** (p - 1) for k, p in terms), 0.2, 5.0)
+        # Near 1: far from it the powers have roots of their own.
+        scale = float(newton(lambda s: s - 1.0 - sum(k / s ** (p - 1) for k, p in terms), 1.0))
         return scale, tuple(k / scale**p for k, p in terms)
 
 

@@ -19,6 +19,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.camera_files import export_note, load_camera, read_camera_file, save_camera
 from rdstitch.camera_files.lens_models import LensModel
+from rdstitch.camera_files.polynomials import fitted_polynomial
 from rdstitch.errors import InputError, OutputError
 from rdstitch.records import parse_yaml
 
@@ -582,3 +583,12 @@ def test_what_is_wrong_is_named(old: str, new: str, message: str, tmp_path: Path
     with pytest.raises(InputError, match=r"a\.xml: ") as caught:
         load_camera(tmp_path / "a.xml", (640, 480))
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("powers", [(4, 3, 2), (3,), (3, 5)])
+@pytest.mark.parametrize("distortion", [0.0123, -0.0123, -0.3])
+def test_a_lens_of_any_sign_keeps_its_scale_at_the_unit_radius(distortion: float, powers: tuple[int, ...]) -> None:
+    camera = Camera((3264, 2448), distortion=distortion, focal=3117.3)
+    scale, moved = fitted_polynomial(camera, 1224.0, powers).moved()
+    assert scale * (1.0 - sum(moved)) == pytest.approx(1.0)
+    assert 0.5 < scale < 2.0
