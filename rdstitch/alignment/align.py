@@ -144,8 +144,7 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
     problem, _ = whole.part(~wrong, images)
     choice = choose_over_relief(problem, choice, options.models)
     free_lens = choice.fit.free_lens
-    whole = replace(whole, observations=everything, free_lens=free_lens, overdispersion=choice.overdispersion)
-    whole = replace(whole, min_gain=MIN_GAIN)
+    whole = replace(whole, observations=everything, free_lens=free_lens, min_gain=MIN_GAIN)
     return AdjustedImages(
         cameras,
         links,

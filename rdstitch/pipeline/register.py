@@ -88,11 +88,12 @@ def register(
     aligned = aligner.draft([pair for pair in pairs if not {*pair.images} & other_lens.keys()])
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
     aligned = close_loops(aligner, pairing, aligned, candidates)
-    aligned = aligner.completed(aligner.metric(aligned) if purpose == "trajectory" else aligned)
+    if purpose == "trajectory":
+        aligner = replace(aligner, needs_poses=True)
+        aligned = aligner.metric(aligned)
+    aligned = aligner.completed(aligned)
     settle = match_crossings if purpose == "calibrate" else settle_repeated_pattern
     aligned, undecided = settle(aligner, pairing, aligned, sources, detected.stretch, options.threads)
-    if purpose == "trajectory":
-        aligned = aligner.completed(aligner.metric(aligned))
     unplaced = {**other_lens, **detected.damaged, **undecided}
     return Registration(
         tuple(sources),

@@ -68,6 +68,6 @@ def test_the_example_prints_odometry(drive: Sequence, tmp_path: Path, capsys: py
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert lines
     # The focal length is a guess, and the height goes with it.
-    assert lines[-1]["pose"]["pose"]["position"]["z"] == pytest.approx(0.8, rel=0.2)
+    assert lines[-1]["pose"]["pose"]["position"]["z"] == pytest.approx(0.8, rel=0.1)
     assert len(lines[-1]["pose"]["covariance"]) == 36
     assert lines[-1]["header"]["frame_id"] == "odom_0"
