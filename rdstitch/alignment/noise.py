@@ -17,7 +17,7 @@ from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.late_imports import spatial
+from rdstitch.nearest_points import nearest_points
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _CELLS = (2, 3, 4)
@@ -88,8 +88,7 @@ def neighbours(observations: Observations, inliers: BoolArray) -> tuple[IntArray
     apart = np.column_stack([observations.points1[chosen], observations.link[chosen] * 10.0])
     if len(apart) < 2:
         return chosen[:0], chosen[:0]
-    nearby = spatial.cKDTree(apart).query(apart, k=min(4, len(apart)))
-    distance, neighbour = np.asarray(nearby[0]), np.asarray(nearby[1])
+    distance, neighbour = nearest_points(apart, apart, 4)
     pairs = (distance[:, 1:] > _MIN_DISTANCE) & (distance[:, 1:] < _MAX_DISTANCE)
     has_neighbour = pairs.any(axis=1)
     nearest = neighbour[np.arange(len(apart)), np.argmax(pairs, axis=1) + 1]

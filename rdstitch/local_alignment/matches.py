@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.late_imports import spatial
+from rdstitch.nearest_points import nearest_points
 from rdstitch.radial_homography import from_directions, from_plane, to_directions, to_plane
 
 # Matches that the alignment expects farther away than this share of the image's diagonal are taken to be wrong; where
@@ -109,8 +109,7 @@ class PlacedMatches:
         nearest_other = np.empty(len(self), dtype=np.intp)
         for start, stop in pairwise(first.tolist()):
             points = self.points[start:stop, 0]
-            nearest = np.asarray(spatial.cKDTree(points).query(points, k=2)[1])[:, 1]
-            nearest_other[start:stop] = start + np.minimum(nearest, len(points) - 1)
+            nearest_other[start:stop] = start + nearest_points(points, points, 2)[1][:, -1]
         return nearest_other
 
     @cached_property

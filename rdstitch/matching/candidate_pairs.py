@@ -12,9 +12,10 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
-from rdstitch.late_imports import sparse, spatial
+from rdstitch.late_imports import sparse
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.retrieval import Similarity, similarity
+from rdstitch.nearest_points import nearest_points
 from rdstitch.radial_homography import from_plane, to_plane
 
 EXHAUSTIVE_UP_TO = 30
@@ -83,7 +84,7 @@ def _nearest_positions(positions: FloatArray) -> set[tuple[int, int]]:
 
 def _nearest_pairs(places: FloatArray, images: IntArray, most: int) -> set[tuple[int, int]]:
     """Pairs of images of which one is among the nearest of the other, by their places."""
-    nearest = spatial.KDTree(places).query(places, k=min(most + 1, len(images)))[1].reshape(len(images), -1)
+    nearest = nearest_points(places, places, most + 1)[1]
     pairs = np.sort(np.stack([np.repeat(images, nearest.shape[1]), images[nearest.ravel()]], axis=1), axis=1)
     return {(i, j) for i, j in pairs.tolist() if i != j}
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray
 from rdstitch.division_model import undistort
-from rdstitch.late_imports import spatial
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.nearest_points import nearest_points
 from rdstitch.solvers.homography import direct_linear
 
 _NEIGHBOURS = 6
@@ -59,8 +59,7 @@ def _continued(pair: PairRegistration, threshold: float) -> BoolArray:
     """The inliers of a pair together with the matches that continue them, shape (N,)."""
     matched, inliers = pair.correspondences, pair.relation.inliers
     parallax = matched.points2 - pair.relation.transfer(matched.points1)
-    tree = spatial.cKDTree(matched.points1)
-    distances, neighbours = tree.query(matched.points1, k=min(_NEIGHBOURS + 1, len(inliers)))
+    distances, neighbours = nearest_points(matched.points1, matched.points1, _NEIGHBOURS + 1)
     with np.errstate(invalid="ignore"):
         change = np.linalg.norm(parallax[:, None] - parallax[neighbours], axis=2)
         continuing = change <= threshold + _STEEPEST * distances

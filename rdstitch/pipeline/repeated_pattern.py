@@ -14,10 +14,10 @@ from rdstitch.features.crossings import find_crossings
 from rdstitch.features.options import CLOSER, WORK_MEGAPIXELS
 from rdstitch.features.prepared_image import Stretch, prepare
 from rdstitch.inputs.source import Source
-from rdstitch.late_imports import spatial
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.nearest_points import nearest_points
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.robust.verification import places
@@ -183,8 +183,8 @@ def _matched(
     seen = np.flatnonzero(np.isfinite(expected).all(axis=1))
     if min(len(seen), len(second)) < _MIN_MATCHES:
         return pair
-    distance, nearest = map(np.asarray, spatial.cKDTree(second).query(expected[seen], k=2))
-    back = np.asarray(spatial.cKDTree(expected[seen]).query(second)[1])
+    distance, nearest = nearest_points(second, expected[seen], 2)
+    back = nearest_points(expected[seen], second, 1)[1][:, 0]
     mutual = back[nearest[:, 0]] == np.arange(len(seen))
     chosen = (distance[:, 0] < threshold) & (distance[:, 1] > 2.0 * threshold) & mutual
     indices = np.column_stack([seen, nearest[:, 0]])[chosen]

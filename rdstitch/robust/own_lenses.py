@@ -12,7 +12,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import LENS_STD
-from rdstitch.late_imports import spatial
+from rdstitch.nearest_points import nearest_points
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.covariance import covariances
 from rdstitch.robust.levenberg_marquardt import descend
@@ -78,6 +78,6 @@ def _coherence(points: FloatArray, errors: FloatArray) -> float:
     """Correlation of the errors (N, 2) of points (N, 2) and their nearest neighbours."""
     if len(points) < 2:
         return 0.0
-    nearest = np.asarray(spatial.cKDTree(points).query(points, k=2)[1])[:, 1]
+    nearest = nearest_points(points, points, 2)[1][:, 1]
     power = float(np.einsum("ni,ni->", errors, errors))
     return float(np.einsum("ni,ni->", errors, errors[nearest])) / power if power > 0.0 else 0.0
