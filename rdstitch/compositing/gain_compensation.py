@@ -144,9 +144,9 @@ _ROUNDS = 6
 _MIN_RELATIVE_GAIN = 0.05
 # From here on, as a share of the full range, brightened samples are compressed instead of clipped.
 _KNEE = 0.75
-_MEDIAN_SAMPLES = 50_000  # of all images together
+_MEDIAN_SAMPLES = 10_000  # of all images together
 # Residual, as a share of the right side, and decimals that are kept: both far below a grey level.
-_TOLERANCE, _MAX_STEPS, _DECIMALS = 1e-5, 3000, 5
+_TOLERANCE, _MAX_STEPS, _DECIMALS = 1e-4, 3000, 5
 
 _Prior = tuple["sparse.csr_array", FloatArray, int]
 """Precision (K, K), its product with what is expected (K, C), and how many unknowns an image has."""
@@ -328,17 +328,17 @@ def _solve(
     blocks[row // block, row % block, column % block] = entries.data[own]
     inverse = np.linalg.inv(blocks)
     x, left = start, right - normal @ start
-    enough = _TOLERANCE * np.linalg.norm(right, axis=0)
-    direction, previous = np.zeros_like(x), np.ones(x.shape[1])
+    enough = _TOLERANCE**2 * (right**2).sum(axis=0)
+    direction, previous, ones = np.zeros_like(x), np.ones(x.shape[1]), np.ones(len(x))
     for _ in range(_MAX_STEPS):
-        going = np.linalg.norm(left, axis=0) > enough
+        going = ones @ left**2 > enough
         if not going.any():
             break
         better = (inverse @ left.reshape(-1, block, x.shape[1])).reshape(x.shape)
-        now = (left * better).sum(axis=0)
+        now = ones @ (left * better)
         direction = better + now / previous * direction
         along = normal @ direction
-        step = np.where(going, now, 0.0) / np.where(going, (direction * along).sum(axis=0), 1.0)
+        step = np.where(going, now, 0.0) / np.where(going, ones @ (direction * along), 1.0)
         x, left, previous = x + step * direction, left - step * along, np.where(going, now, 1.0)
     return x
 
@@ -349,8 +349,10 @@ def _medians(values: FloatArray, pair: IntArray, which: BoolArray) -> FloatArray
     pair, values = pair[which], values[which]
     start = np.flatnonzero(np.diff(pair, prepend=-1))
     middle = start + np.diff(start, append=len(pair)) // 2
-    for channel, column in enumerate(values.T):
-        medians[pair[start], channel] = column[np.lexsort((column, pair))][middle]
+    # Sorted as fractions of a number that is the pair's: many times faster than indirectly, by two keys.
+    low, span = values.min(), max(2.0 * float(np.ptp(values)), 1e-12)
+    ordered = np.sort((values - low).T / span + pair, axis=1)[:, middle]
+    medians[pair[start]] = ((ordered - pair[start]) * span + low).T
     return medians
 
 
