@@ -14,7 +14,7 @@ Box = tuple[int, int, int, int]
 
 Float32Array = NDArray[np.float32]
 # All of them in ordinary folders; a survey with 70 and 50 % of overlap has about 20.
-_MAX_NEIGHBOURS = 40
+_MAX_NEIGHBOURS = 20
 
 
 def intersection(first: Box, second: Box) -> Box | None:

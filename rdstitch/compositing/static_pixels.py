@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import BoolArray
+from rdstitch.compositing.boxes import Float32Array
 from rdstitch.io.reduction import mean_of_channels
 
 MIN_IMAGES = 4
@@ -51,28 +52,28 @@ def static_pixels(images: Sequence[NDArray[np.generic]]) -> BoolArray | None:
     return static if _MIN_AREA < share < _MAX_AREA else None
 
 
-def _agreement(grey: NDArray[np.float32], window: int) -> FloatArray:
+def _agreement(grey: Float32Array, window: int) -> Float32Array:
     """How far the corners of different images agree, over a window, shape (h, w): 1 for what stays, else about 0."""
-    within_images, total = np.zeros((3, *grey.shape[1:])), np.zeros((2, *grey.shape[1:]))
+    within_images, total = np.zeros((3, *grey.shape[1:]), np.float32), np.zeros((2, *grey.shape[1:]), np.float32)
     for image in grey:
-        slope = np.stack([cv2.Sobel(image, cv2.CV_64F, 1, 0), cv2.Sobel(image, cv2.CV_64F, 0, 1)])
+        slope = np.stack([cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1)])
         within_images += _tensor(slope)
         total += slope
     # Products of the slopes of one image with those of all others, against those with its own.
     others = (_tensor(total) - within_images) / (len(grey) - 1)
     corners, common = (_smaller_eigenvalue(tensor, window) for tensor in (within_images, others))
-    agreement: FloatArray = common / np.maximum(corners, _MIN_TEXTURE * float(np.median(corners)) + 1e-12)
+    agreement: Float32Array = common / np.maximum(corners, _MIN_TEXTURE * float(np.median(corners)) + 1e-12)
     return agreement
 
 
-def _tensor(slope: FloatArray) -> FloatArray:
+def _tensor(slope: Float32Array) -> Float32Array:
     return np.stack([slope[0] ** 2, slope[1] ** 2, slope[0] * slope[1]])
 
 
-def _smaller_eigenvalue(tensor: FloatArray, window: int) -> FloatArray:
+def _smaller_eigenvalue(tensor: Float32Array, window: int) -> Float32Array:
     """Of the structure tensor (3, h, w), over a window."""
     xx, yy, xy = (cv2.boxFilter(part, -1, (window, window)) for part in tensor)
-    smaller: FloatArray = (xx + yy) / 2.0 - np.sqrt(((xx - yy) / 2.0) ** 2 + xy**2)
+    smaller: Float32Array = (xx + yy) / 2.0 - np.sqrt(((xx - yy) / 2.0) ** 2 + xy**2)
     return smaller
 
 

@@ -243,12 +243,12 @@ def _lattice_step(warp: Warp, probes: FloatArray) -> int:
     truth = warp.source_points(probes[:, 0], probes[:, 1])
     known = np.isfinite(truth).all(axis=1)
     for step in LATTICE_STEPS[:-1]:
-        around = probes[:, None] + corners * step
-        reach = warp.source_points(around[..., 0], around[..., 1])
-        around = probes[:, None] + corners * (step / 2)
-        near = warp.source_points(around[..., 0], around[..., 1])
-        error = np.linalg.norm(near.mean(axis=1) - truth, axis=1)[known]
-        if np.isfinite(reach[known]).all() and (error < limit).all():
+        around = probes[known, None] + corners * (step / 2)
+        error = warp.source_points(around[..., 0], around[..., 1]).mean(axis=1) - truth[known]
+        if not ((error**2).sum(axis=1) < limit**2).all():
+            continue
+        around = probes[known, None] + corners * step
+        if np.isfinite(warp.source_points(around[..., 0], around[..., 1])).all():
             return step
     return 1
 
