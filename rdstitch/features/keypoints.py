@@ -64,8 +64,8 @@ class Features:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
-        """All keypoints of at least one part; parts are of one kind, and have no signs."""
-        names = ("points", "descriptors", *_OF_A_KEYPOINT[:3])
+        """All keypoints of at least one part; parts are of one kind, with signs of the Laplacian."""
+        names = ("points", "descriptors", *_OF_A_KEYPOINT)
         joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         return replace(parts[0], **joined)
 

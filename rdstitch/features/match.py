@@ -51,7 +51,7 @@ def match(
     limit = check_ratio(ratio)
     if features1.kind != features2.kind:
         raise ArgumentError(f"features of different kinds do not match: {features1.kind} and {features2.kind}")
-    pairs, ratios = _match_signs(features1, features2, block_bytes, limit)
+    pairs, ratios = mutual_nearest(features1, features2, block_bytes, limit)
     order = np.lexsort((pairs[:, 1], pairs[:, 0], ratios))
     return Correspondences.of(features1, features2, pairs[order], ratios[order])
 
@@ -62,22 +62,6 @@ def check_ratio(ratio: float | None) -> float:
     if not 0 < limit <= 1:
         raise ArgumentError(f"ratio must be in (0, 1], not {limit}")
     return limit
-
-
-def _match_signs(
-    features1: Features, features2: Features, block_bytes: int, limit: float
-) -> tuple[NDArray[np.intp], FloatArray]:
-    """Mutual nearest neighbours that pass the ratio test, within each sign of the Laplacian where there are signs."""
-    sign1, sign2 = features1.laplacian_sign, features2.laplacian_sign
-    if sign1 is None or sign2 is None:
-        return mutual_nearest(features1, features2, block_bytes, limit)
-    pairs, ratios = [], []
-    for sign in (-1, 1):
-        index1, index2 = np.flatnonzero(sign1 == sign), np.flatnonzero(sign2 == sign)
-        nearest, ratio = mutual_nearest(features1.take(index1), features2.take(index2), block_bytes, limit)
-        pairs.append(np.column_stack([index1[nearest[:, 0]], index2[nearest[:, 1]]]))
-        ratios.append(ratio)
-    return np.concatenate(pairs), np.concatenate(ratios)
 
 
 def match_near(

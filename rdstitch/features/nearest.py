@@ -77,20 +77,21 @@ class Locations:
     # layer k holds the index of the (k+1)-th keypoint of each location that has one; the locations with the most
     # keypoints come first, so that every layer is a beginning of the one before
     layers: tuple[NDArray[np.intp], ...]
+    count: NDArray[np.intp]  # (L,): number of keypoints of each location
 
     @classmethod
-    def group(cls, points: FloatArray) -> Self:
-        """Group points (N, 2) that are equal; keypoints of one location keep their order."""
-        by_location = np.lexsort((points[:, 1], points[:, 0]))
-        first = np.ones(len(points), dtype=np.bool_)
+    def group(cls, points: FloatArray, chosen: NDArray[np.intp]) -> Self:
+        """Group the chosen (C,), ascending, of the points (N, 2); keypoints of one location keep their order."""
+        by_location = chosen[np.lexsort(points[chosen].T)]
+        first = np.ones(len(chosen), dtype=np.bool_)
         first[1:] = (np.diff(points[by_location], axis=0) != 0.0).any(axis=1)
         starts = np.flatnonzero(first)
-        count = np.diff(np.append(starts, len(points)))
+        count = np.diff(np.append(starts, len(chosen)))
         # Among equally many keypoints the first keypoint decides: the order of the input, not that of coordinates.
-        order = np.lexsort((by_location[starts], -count)) if len(points) else np.zeros(0, np.intp)
+        order = np.lexsort((by_location[starts], -count))
         starts, count = starts[order], count[order]
         layers = [by_location[starts[count > k] + k] for k in range(int(count.max(initial=1)))]
-        return cls(tuple(layers))
+        return cls(tuple(layers), count)
 
     def __len__(self) -> int:
         return len(self.layers[0])
@@ -112,10 +113,7 @@ class Locations:
 
     def blocks(self, most: int) -> Iterator[slice]:
         """All locations in ranges with at most so many keypoints together, or with one location."""
-        counts = np.zeros(len(self), dtype=np.intp)
-        for layer in self.layers:
-            counts[: len(layer)] += 1
-        until = np.append(0, np.cumsum(counts))
+        until = np.append(0, np.cumsum(self.count))
         start = 0
         while start < len(self):
             stop = max(start + 1, int(np.searchsorted(until, until[start] + most, side="right")) - 1)
@@ -144,16 +142,27 @@ def mutual_nearest(
     ratio : ndarray of shape (M,)
         Distance to the nearest over distance to the second nearest location, the worse of both directions.
     """
-    if len(features1) == 0 or len(features2) == 0:
-        return np.zeros((0, 2), dtype=np.intp), np.zeros(0)
-    one, two = Locations.group(features1.points), Locations.group(features2.points)
-    similarity = Similarity(features1.descriptors[one.order], features2.descriptors[two.order])
+    pairs, ratios = [np.zeros((0, 2), dtype=np.intp)], [np.zeros(0)]
+    for chosen1, chosen2 in _comparable(features1, features2):
+        one, two = Locations.group(features1.points, chosen1), Locations.group(features2.points, chosen2)
+        similarity = Similarity(features1.descriptors[one.order], features2.descriptors[two.order])
+        nearest, best, second = _two_best(similarity, one, two, block_bytes)
+        distinct = np.flatnonzero(best > second)
+        ratio = np.divide(*(similarity.distance(each[distinct]) for each in (best, second)))
+        passed = ratio < limit
+        pairs.append(_nearest_keypoints(similarity, one, two, distinct[passed], nearest[distinct[passed]]))
+        ratios.append(ratio[passed])
+    return np.concatenate(pairs), np.concatenate(ratios)
 
-    nearest, best, second = _two_best(similarity, one, two, block_bytes)
-    distinct = np.flatnonzero(best > second)
-    ratio = np.divide(*(similarity.distance(each[distinct]) for each in (best, second)))
-    chosen, ratio = distinct[ratio < limit], ratio[ratio < limit]
-    return _nearest_keypoints(similarity, one, two, chosen, nearest[chosen]), ratio
+
+def _comparable(features1: Features, features2: Features) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Indices of features that may match each other: those of either sign of the Laplacian, where there are signs."""
+    signs = features1.laplacian_sign, features2.laplacian_sign
+    if signs[0] is None or signs[1] is None:
+        groups = [(np.arange(len(features1)), np.arange(len(features2)))]
+    else:
+        groups = [(np.flatnonzero(signs[0] == sign), np.flatnonzero(signs[1] == sign)) for sign in (-1, 1)]
+    return [group for group in groups if all(map(len, group))]
 
 
 def _two_best(
@@ -218,19 +227,13 @@ def _nearest_keypoints(
     location2: NDArray[np.intp],
 ) -> NDArray[np.intp]:
     """Select the most alike pair of keypoints of each pair of locations, as indices into the features, shape (M, 2)."""
-    pairs = np.column_stack([one.layers[0][location1], two.layers[0][location2]])
-    best = np.full(len(pairs), -np.inf, np.float32)
-    row = 0
-    for layer1 in one.layers:
-        column = 0
-        for layer2 in two.layers:
-            both = np.flatnonzero((location1 < len(layer1)) & (location2 < len(layer2)))
-            inside1, inside2 = location1[both], location2[both]
-            value = similarity.pairs(row + inside1, column + inside2)
-            better = value > best[both]
-            chosen = both[better]
-            best[chosen] = value[better]
-            pairs[chosen] = np.column_stack([layer1[inside1[better]], layer2[inside2[better]]])
-            column += len(layer2)
-        row += len(layer1)
-    return pairs
+    count2 = two.count[location2]
+    many = one.count[location1] * count2
+    pair, first = np.repeat(np.arange(len(many)), many), np.cumsum(many) - many
+    turn = np.arange(len(pair)) - first[pair]
+    places = [
+        np.cumsum([0, *map(len, side.layers)])[layer] + location[pair]
+        for side, layer, location in ((one, turn // count2[pair], location1), (two, turn % count2[pair], location2))
+    ]
+    best = np.lexsort((-similarity.pairs(places[0], places[1]), pair))[first]
+    return np.column_stack([side.order[place[best]] for side, place in zip((one, two), places, strict=True)])

@@ -158,6 +158,11 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     """
     if not len(votes):
         return None
+    one_lens = votes.fitted(np.zeros((len(votes), 2), dtype=np.intp), np.array([np.median(votes.distortion)]))
+    by_one = votes.mahalanobis_residuals(one_lens)
+    # Whatever the division: what is asked of the votes of pairs of both below, these votes must bring.
+    if np.maximum(by_one - _MIN_GAIN * _MAX_MEAN_RESIDUAL, 0.0).sum() < _GAIN_OF_FEW * _MAX_MEAN_RESIDUAL:
+        return None
     count, gap = len(cameras), max(_MIN_GAP, _MIN_GAP_PX / min(camera.scale for camera in cameras))
     divisions = [division for division in _divisions(count, votes) if abs(division[1][1] - division[1][0]) >= gap]
     if not divisions:
@@ -173,8 +178,7 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     between = which[:, 0] != which[:, 1]
     number, missed = int(between.sum()), votes.mahalanobis_residuals(lenses[which])
     least = max(float(missed[between].sum()), max(_MAX_MEAN_RESIDUAL, float(missed.mean())) * number)
-    by_one = votes.mahalanobis_residuals(votes.fitted(np.zeros_like(which), lenses[:1]))[between].sum()
-    if not number or by_one < (_MIN_GAIN + _GAIN_OF_FEW / number) * least:
+    if not number or by_one[between].sum() < (_MIN_GAIN + _GAIN_OF_FEW / number) * least:
         return None
     clear = _margins(count, votes, second, lenses)[seen].min() >= _MIN_MARGIN
     return TwoLenses(second, (float(lenses[0]), float(lenses[1])), bool(clear and not between.all()))

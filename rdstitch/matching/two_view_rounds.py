@@ -64,7 +64,8 @@ class Pairing:
 
         A pair that is passed over may overlap nevertheless, by little: its place then follows from the others.
         """
-        strongest = replace(self, features=self.features.strongest(_PRESCREEN_FEATURES))
+        # These matches are few, of most pairs hardly any: a file for each would take as long as the matching.
+        strongest = replace(self, features=self.features.strongest(_PRESCREEN_FEATURES), store=self.cache)
         shared = dict(zip(pairs, strongest._match(pairs, "comparing images"), strict=True))
         most = np.zeros(len(self.features), dtype=np.intp)
         for pair, matches in shared.items():

@@ -145,6 +145,19 @@ def test_grey_layouts_agree(image: NDArray[np.uint8]) -> None:
         assert same(reference, detect(layout))
 
 
+@pytest.mark.parametrize("enlarged", [1, 5])  # whole, and in tiles
+def test_sift_tells_dark_blobs_from_light_ones(enlarged: int) -> None:
+    row, column = np.indices((240, 320))
+    away2, sigma = (row % 80 - 40) ** 2 + (column % 80 - 40) ** 2, 3.0 + column // 80
+    grey = 128.0 + np.where(row // 80 == 1, -100.0, 100.0) * np.exp(-away2 / (2.0 * sigma**2))
+    large = cv2.resize(np.rint(grey).astype(np.uint8), None, fx=enlarged, fy=enlarged)
+    found = detect(large, FeatureOptions(work_megapixels=None))
+    points = (found.points + 0.5) / enlarged - 0.5
+    blobs = found.take(np.flatnonzero(np.linalg.norm(points % 80 - 40, axis=1) < 1.0))
+    assert len(np.unique(blobs.points, axis=0)) >= 12
+    np.testing.assert_array_equal(blobs.laplacian_sign, np.where(blobs.points[:, 1] // (80 * enlarged) == 1, 1, -1))
+
+
 @pytest.mark.parametrize("kind", ["rootsift", "surf", "orb", "akaze"])
 def test_threads_change_nothing(kind: str, image: NDArray[np.uint8]) -> None:
     options = FeatureOptions(kind=kind, max_features=700)
