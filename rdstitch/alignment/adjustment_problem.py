@@ -280,6 +280,15 @@ class Problem:
         adjuster, start = self._best_trial(model)
         return adjuster.run(start)
 
+    def apart(self, model: MotionModel, trial: BundleAdjustmentResult) -> BundleAdjustmentResult:
+        """All links on their own under one camera, which starts as a trial has it."""
+        known, shared = self.camera_priors, trial.parameters.shared
+        priors = known.priors(model, self.count, _TILT_SPREAD_START)
+        adjuster, start = independent_pairs(
+            model, self.observations, self.homographies, shared, self.lens, self.free_lens, priors, known.attitudes
+        )
+        return adjuster.run(start)
+
     def _best_trial(self, model: MotionModel) -> tuple[BundleAdjuster, Parameters]:
         """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
         known, links = self.camera_priors, len(self.observations)

@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.evidence import ErrorCost, Evidence
 from rdstitch.alignment.lens_selection import shows_center
 from rdstitch.alignment.link_equations import split_lens, whitened_errors
@@ -132,10 +133,14 @@ class Posterior:
         diagonal = 2.0 * float(np.median(self.problem.observations.scale2))
         return max(_POSSIBLE * self.evidence.noise, _PARALLAX * diagonal)
 
+    def cost(self, adjusted: BundleAdjustmentResult) -> ErrorCost:
+        """What the errors say that an adjustment leaves."""
+        errors = whitened_errors(self.problem.observations, adjusted.homographies, adjusted.parameters.lens)
+        return self.evidence.cost(errors)
+
     def of(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
-        errors = whitened_errors(self.problem.observations, fit.adjusted.homographies, fit.adjusted.parameters.lens)
-        errors_cost = self.evidence.cost(errors)
+        errors_cost = self.cost(fit.adjusted)
         wide = 0.0
         if fit.tilt_spread > 0.0:
             wide = 4.0 * self.problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
@@ -146,13 +151,11 @@ class Posterior:
         absurd = self.layout_matters and not stretch(fit) <= MAX_STRETCH
         return Hypothesis(fit, score if has_plausible_focal(fit) else math.inf, errors_cost.field, absurd)
 
-    def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
-        """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
-        if not model.one_camera and not _is_beyond_one_camera(self, best, self.least.field):
+    def suffices(self, best: Hypothesis, model: MotionModel, least: ErrorCost) -> bool:
+        """Whether another model could not be taken, even if it left errors that say as little as the ``least``."""
+        if not model.one_camera and not _is_beyond_one_camera(self, best, least.field):
             return True
-        return not best.absurd and best.score <= self.least.cost + self.price(
-            model, self.problem.free_lens, self.least.count
-        )
+        return not best.absurd and best.score <= least.cost + self.price(model, self.problem.free_lens, least.count)
 
     def price(self, model: MotionModel, free_lens: BoolArray, count: float) -> float:
         """What the parameters of a model cost, by so many independent observations (Schwarz's criterion)."""
@@ -169,30 +172,38 @@ def select_model(
 ) -> ModelChoice:
     """Adjust hypotheses from the least to the most free, and take the one with the best score.
 
-    Models are no longer tried that could not pay for their freedom even with the errors that links leave on their own.
+    Models are no longer tried that could not pay for their freedom even with the errors that links leave on their own;
+    so a turn that pairs do not look like is tried last, by the errors of links that are turns on their own.
     The best two and the least free one are then tried with more of the lens free: an off-centre lens acts like less
     regular motion. Free homographies are a model of another kind, taken only for what one camera cannot explain.
     """
     posterior = Posterior(problem, prefer_turn, layout_matters)
     tried: list[Hypothesis] = []
-    turns = [MODELS[name] for name in names if MODELS[name].on_sphere]
+    doubtful: list[tuple[MotionModel, BundleAdjustmentResult]] = []
     wide = replace(problem, free_lens=np.logical_or.reduce([problem.free_lens, *lenses]))
-    for turn in turns:
+    for turn in [MODELS[name] for name in names if MODELS[name].on_sphere]:
         if len(problem.observations) == 1:  # a trial is the whole
             tried.append(posterior.of(problem.fit(turn)))
             continue
         trial = wide.trial(turn)
-        if len(names) == 1 or trial.sigma <= posterior.largest_trial:
+        if len(names) == 1 or trial.sigma <= _POSSIBLE * posterior.evidence.noise:
             tried.append(posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
+        else:
+            doubtful.append((turn, trial))
     for model in [MODELS[name] for name in names if not MODELS[name].on_sphere]:
         if problem.count == 2 and model.free_tilts and not all(MODELS[name].one_camera for name in names):
             continue  # with two images, one camera that tilts is a homography
-        if tried and posterior.suffices(min(tried, key=_score), model):
+        if tried and posterior.suffices(min(tried, key=_score), model, posterior.least):
             break
         planes = [one.fit for one in tried if not one.fit.model.on_sphere]
         tried.append(posterior.of(problem.fit(model, planes[-1:])))
-    if min(tried, key=_score).absurd:
-        tried += [posterior.of(problem.fit(turn)) for turn in turns if all(one.fit.model is not turn for one in tried)]
+    for turn, trial in doubtful:
+        best = min(tried, key=_score)
+        if best.absurd or (
+            trial.sigma <= posterior.largest_trial
+            and not posterior.suffices(best, turn, posterior.cost(wide.apart(turn, trial)))
+        ):
+            tried.insert(0, posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
     tried = _with_wider_lenses(posterior, tried, lenses)
     return _choice(posterior, tried, _best(posterior, tried), requested=len(names) == 1)
 
