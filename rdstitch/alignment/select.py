@@ -133,6 +133,11 @@ class Posterior:
         diagonal = 2.0 * float(np.median(self.problem.observations.scale2))
         return max(_POSSIBLE * self.evidence.noise, _PARALLAX * diagonal)
 
+    @property
+    def tolerable(self) -> float:
+        """Shared errors up to which a turn is taken in place of a plane with an absurd layout, pixels."""
+        return math.hypot(_TOLERABLE * self.evidence.farthest, self.evidence.noise)
+
     def cost(self, adjusted: BundleAdjustmentResult) -> ErrorCost:
         """What the errors say that an adjustment leaves."""
         errors = whitened_errors(self.problem.observations, adjusted.homographies, adjusted.parameters.lens)
@@ -151,11 +156,15 @@ class Posterior:
         absurd = self.layout_matters and not stretch(fit) <= MAX_STRETCH
         return Hypothesis(fit, score if has_plausible_focal(fit) else math.inf, errors_cost.field, absurd)
 
-    def suffices(self, best: Hypothesis, model: MotionModel, least: ErrorCost) -> bool:
-        """Whether another model could not be taken, even if it left errors that say as little as the ``least``."""
-        if not model.one_camera and not _is_beyond_one_camera(self, best, least.field):
+    def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
+        """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
+        if not model.one_camera and not _is_beyond_one_camera(self, best, self.least.field):
             return True
-        return not best.absurd and best.score <= least.cost + self.price(model, self.problem.free_lens, least.count)
+        return not best.absurd and not self.could_win(best, model, self.least)
+
+    def could_win(self, best: Hypothesis, model: MotionModel, least: ErrorCost) -> bool:
+        """Whether a model could have the better score, if it left errors that say no more than the ``least``."""
+        return best.score > least.cost + self.price(model, self.problem.free_lens, least.count)
 
     def price(self, model: MotionModel, free_lens: BoolArray, count: float) -> float:
         """What the parameters of a model cost, by so many independent observations (Schwarz's criterion)."""
@@ -193,16 +202,16 @@ def select_model(
     for model in [MODELS[name] for name in names if not MODELS[name].on_sphere]:
         if problem.count == 2 and model.free_tilts and not all(MODELS[name].one_camera for name in names):
             continue  # with two images, one camera that tilts is a homography
-        if tried and posterior.suffices(min(tried, key=_score), model, posterior.least):
+        if tried and posterior.suffices(min(tried, key=_score), model):
             break
         planes = [one.fit for one in tried if not one.fit.model.on_sphere]
         tried.append(posterior.of(problem.fit(model, planes[-1:])))
     for turn, trial in doubtful:
         best = min(tried, key=_score)
-        if best.absurd or (
-            trial.sigma <= posterior.largest_trial
-            and not posterior.suffices(best, turn, posterior.cost(wide.apart(turn, trial)))
-        ):
+        if not best.absurd and trial.sigma > posterior.largest_trial:
+            continue
+        least = posterior.cost(wide.apart(turn, trial))
+        if posterior.could_win(best, turn, least) or (best.absurd and least.field < posterior.tolerable):
             tried.insert(0, posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
     tried = _with_wider_lenses(posterior, tried, lenses)
     return _choice(posterior, tried, _best(posterior, tried), requested=len(names) == 1)
@@ -237,8 +246,7 @@ def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
     cameras = [one for one in tried if one.fit.model.one_camera]
     free = [one for one in tried if not one.fit.model.one_camera]
     best = min(cameras or free, key=_score)
-    largest = math.hypot(_TOLERABLE * posterior.evidence.farthest, posterior.evidence.noise)
-    turns = [one for one in tried if one.fit.model.on_sphere and one.field < largest]
+    turns = [one for one in tried if one.fit.model.on_sphere and one.field < posterior.tolerable]
     if best.absurd and turns:
         return turns[0]
     return min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
