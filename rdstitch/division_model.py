@@ -90,12 +90,16 @@ def distort(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = 
     centre; otherwise by Newton's method on the radius, with bisection where a step leaves the domain.
     """
     x = np.asarray(points, dtype=np.float64)
-    radius2 = np.einsum("...i,...i->...", x, x)
-    if any(higher):
-        radius = np.sqrt(radius2)
-        measured = _distorted_radius(radius, float(np.asarray(distortion).item()), tuple(higher))
-        return x * np.where(radius > 0.0, measured / np.maximum(radius, 1e-300), 1.0)[..., None]
-    return x * distorted_ratio(radius2, np.asarray(distortion))[..., None]
+    return x * measured_ratio(np.einsum("...i,...i->...", x, x), distortion, higher)[..., None]
+
+
+def measured_ratio(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
+    """Measured over undistorted radius, from the squared undistorted one, as :func:`distort` has it."""
+    if not any(higher):
+        return distorted_ratio(radius2, np.asarray(distortion))
+    radius = np.sqrt(radius2)
+    measured = _distorted_radius(radius, float(np.asarray(distortion).item()), tuple(higher))
+    return np.where(radius > 0.0, measured / np.maximum(radius, 1e-300), 1.0)
 
 
 def distorted_ratio(radius2: FloatArray, distortion: FloatArray, distortion2: FloatArray | None = None) -> FloatArray:

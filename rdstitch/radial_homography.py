@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
-from rdstitch.division_model import distort, divisor, divisor_slope
+from rdstitch.division_model import distort, divisor, divisor_slope, measured_ratio
 from rdstitch.planar_motion import PlanarMotion
 
 
@@ -131,6 +131,23 @@ class TransferJacobian:
         return np.stack(columns, axis=1) if columns else np.empty((2, 0, len(self.points)))
 
 
+def transfer_points(
+    homography: FloatArray, distortion: float, points: FloatArray, higher: Sequence[float] = ()
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """:func:`transfer` of points (2, N) by one homography (3, 3), or one a point (N, 3, 3).
+
+    Their lifted points (3, N), the third coordinates (N,) that H gives these, and where they are measured (2, N).
+    """
+    lifted = np.empty((3, points.shape[1]))
+    lifted[:2] = points
+    lifted[2] = divisor(lifted[0] ** 2 + lifted[1] ** 2, distortion, higher)
+    z = np.einsum("nij,jn->in", homography.reshape(-1, 3, 3), lifted)
+    third = np.where(z[2] > 0.0, z[2], np.nan)
+    flat = z[:2] / third
+    flat *= measured_ratio(flat[0] ** 2 + flat[1] ** 2, distortion, higher)
+    return lifted, third, flat
+
+
 def transfer_jacobian(
     homography: FloatArray, distortion: float, points: FloatArray, higher: Sequence[float] = ()
 ) -> TransferJacobian:
@@ -152,15 +169,8 @@ def transfer_jacobian(
         μ and ν in the frame of the points.
     """
     # Coordinates first, points last: so every operation runs along the points, which are many.
-    lifted = np.ascontiguousarray(lift(points, distortion, higher).T)
-    r2 = (lifted[:2] ** 2).sum(axis=0)
-    each = "" if homography.ndim == 2 else "n"
-    h = np.ascontiguousarray(homography.transpose(1, 2, 0)) if each else homography
-    z = np.einsum(f"ij{each},jn->in", h, lifted)
-    w = np.where(z[2] > 0.0, z[2], np.nan)
-    d = np.ascontiguousarray(distort((z[:2] / w).T, distortion, higher).T)
-
-    rho2 = (d**2).sum(axis=0)
+    lifted, w, d = transfer_points(homography, distortion, points.T, higher)
+    r2, rho2 = (x**2 + y**2 for x, y in (lifted[:2], d))
     g = divisor(rho2, distortion, higher)
     alpha = 2.0 * divisor_slope(rho2, distortion, higher) / g
     stretch = 1.0 - alpha * rho2
@@ -172,7 +182,7 @@ def transfer_jacobian(
     d_by_z[1, 1] += scale
     np.multiply(d, -1.0 / (stretch * w), out=d_by_z[:, 2])
 
-    by_lifted = np.einsum(f"ikn,kj{each}->ijn", d_by_z, h)
+    by_lifted = np.einsum("ikn,nkj->ijn", d_by_z, homography.reshape(-1, 3, 3))
     along_third = by_lifted[:, 2]
     slope = lifted[:2] * (2.0 * divisor_slope(r2, distortion, higher))
     by_point = (by_lifted[:, :2] + along_third[:, None] * slope).transpose(2, 0, 1)
@@ -194,16 +204,15 @@ def measurement_whitening(by_point: FloatArray, common: FloatArray | None = None
         A random displacement of the transferred point besides, of one standard deviation, over that of the noise: its
         square is added to the covariance.
     """
-    a, b = by_point[:, 0, :], by_point[:, 1, :]
-    xx = (1.0 + np.einsum("ni,ni->n", a, a)) / 2.0
-    yy = (1.0 + np.einsum("ni,ni->n", b, b)) / 2.0
-    xy = np.einsum("ni,ni->n", a, b) / 2.0
+    (ax, ay), (bx, by) = by_point.transpose(1, 2, 0)
+    xx, yy, xy = (1.0 + ax * ax + ay * ay) / 2.0, (1.0 + bx * bx + by * by) / 2.0, (ax * bx + ay * by) / 2.0
     if common is not None:
         xx, yy, xy = xx + common[:, 0] ** 2, yy + common[:, 1] ** 2, xy + common[:, 0] * common[:, 1]
     whitening = np.zeros_like(by_point)
-    conditional = xx - xy**2 / yy
-    whitening[:, 0, 0] = 1.0 / np.sqrt(conditional)
-    whitening[:, 0, 1] = -xy / yy / np.sqrt(conditional)
+    slope = xy / yy
+    conditional = 1.0 / np.sqrt(xx - xy * slope)
+    whitening[:, 0, 0] = conditional
+    whitening[:, 0, 1] = -slope * conditional
     whitening[:, 1, 1] = 1.0 / np.sqrt(yy)
     return whitening
 

@@ -25,7 +25,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.division_model import undistort
 from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.radial_homography import RadialHomography, transfer
-from rdstitch.robust.levenberg_marquardt import MIN_GAIN
+from rdstitch.robust.levenberg_marquardt import MIN_GAIN, ROUGH_GAIN
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 from rdstitch.solvers.homography import direct_linear
 
@@ -280,6 +280,15 @@ class Problem:
         adjuster, start = self._best_trial(model)
         return adjuster.run(start)
 
+    def apart(self, model: MotionModel, trial: BundleAdjustmentResult) -> BundleAdjustmentResult:
+        """All links on their own under one camera, which starts as a trial has it."""
+        known, shared = self.camera_priors, trial.parameters.shared
+        priors = known.priors(model, self.count, _TILT_SPREAD_START)
+        adjuster, start = independent_pairs(
+            model, self.observations, self.homographies, shared, self.lens, self.free_lens, priors, known.attitudes
+        )
+        return replace(adjuster, min_gain=self.min_gain).run(start)
+
     def _best_trial(self, model: MotionModel) -> tuple[BundleAdjuster, Parameters]:
         """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
         known, links = self.camera_priors, len(self.observations)
@@ -292,7 +301,8 @@ class Problem:
         ]
         squared = [adjuster.squared(start) for adjuster, start in trials]
         width = ALIGNMENT_WIDTH * min(map(sigma_of, squared))
-        return trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
+        adjuster, start = trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
+        return replace(adjuster, min_gain=ROUGH_GAIN), start
 
     def taken_over(self, model: MotionModel, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""

@@ -11,7 +11,14 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.link_equations import LinkEquations, folds, link_equations, squared_lengths, whitened_errors
+from rdstitch.alignment.link_equations import (
+    LinkEquations,
+    folds,
+    link_equations,
+    squared_lengths,
+    trial_errors,
+    whitened_errors,
+)
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel, inverses
 from rdstitch.alignment.normal_equations import PoseBlocks, SparseNormalEquations, chain
 from rdstitch.alignment.observations import Observations
@@ -70,27 +77,57 @@ class FreeParameters:
 class BundleAdjustmentResult:
     """Result of an adjustment."""
 
+    adjuster: "BundleAdjuster"
     parameters: Parameters
-    matrices: ModelMatrices
-    homographies: FloatArray  # (L, 3, 3): of each link
     sigma: float  # standard deviation of an error's coordinate, pixels, from the median
-    squared: FloatArray  # (M,): ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred
-    equations: LinkEquations  # at the solution
-    # (S', S'): of the model's named parameters and the free parameters of the lens, priors included
-    covariance: FloatArray
     converged: bool
     iterations: int
+
+    @cached_property
+    def matrices(self) -> ModelMatrices:
+        """Of the images."""
+        return self.adjuster.model.matrices(self.parameters.poses, self.parameters.shared)
+
+    @cached_property
+    def homographies(self) -> FloatArray:
+        """Of each link, (L, 3, 3)."""
+        return self.adjuster.of_links(self.matrices)
+
+    @cached_property
+    def squared(self) -> FloatArray:
+        """``|r|²`` of each correspondence (M,), px², whitened; inf where it cannot be transferred."""
+        return self.adjuster.squared(self.parameters)
+
+    @cached_property
+    def equations(self) -> LinkEquations:
+        """At the solution."""
+        return self.adjuster.linearized(self.parameters, ALIGNMENT_WIDTH * self.sigma).equations
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Of the model's named parameters and the free ones of the lens (S', S'), priors included."""
+        return self.adjuster.covariance(self)
 
 
 @dataclass(frozen=True)
 class _State:
-    """Parameters with all that is computed from them."""
+    """Parameters with the linearization at them."""
 
     parameters: Parameters
     matrices: ModelMatrices
     homographies: FloatArray
     equations: LinkEquations
-    cost: float
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """Where a descent has led."""
+
+    parameters: Parameters
+    errors: FloatArray  # (M, 2): whitened as the last linearization has it, pixels; NaN where there is no transfer
+    damping: float
+    iterations: int
+    converged: bool
 
 
 _FIRST_DAMPING = 1e-6
@@ -130,34 +167,29 @@ class BundleAdjuster:
             return max(self._rough_width(squared) if revise else 0.0, ALIGNMENT_WIDTH * sigma)
 
         squared = self.squared(start)
-        sigma = self._sigma(squared)
+        sigma, damping = self._sigma(squared), _FIRST_DAMPING
         adjuster, wide, parameters, total, used = self, widest(squared, sigma), start, 0, 0
         while True:
             last = wide <= ALIGNMENT_WIDTH * sigma * 1.05
-            state, iterations, converged = adjuster._descend(parameters, sigma, wide, 12 if last else 4)
-            parameters, squared, total, used = (
-                state.parameters,
-                state.equations.squared,
-                total + iterations,
-                used + iterations,
-            )
+            descent = adjuster._descend(parameters, sigma, wide, damping, 12 if last else 4)
+            parameters, errors, damping = descent.parameters, descent.errors, descent.damping
+            squared, total, used = squared_lengths(errors), total + descent.iterations, used + descent.iterations
             sigma, previous = self._sigma(squared), sigma
             wide = max(wide / 3.0, ALIGNMENT_WIDTH * sigma)
-            converged = last and converged and abs(sigma - previous) <= 0.02 * previous
+            converged = last and descent.converged and abs(sigma - previous) <= 0.02 * previous
             if converged or used >= self.max_iterations:
-                revised = revise(adjuster, parameters, sigma, state.equations.errors) if revise else adjuster
+                revised = revise(adjuster, parameters, sigma, errors) if revise else adjuster
                 if revised is adjuster:
-                    return adjuster._finished(parameters, sigma, total, converged)
+                    return BundleAdjustmentResult(adjuster, parameters, sigma, converged, total)
                 adjuster, wide, used = revised, widest(squared, sigma), 0
 
     def squared(self, parameters: Parameters) -> FloatArray:
         """``|r|²`` of each correspondence (M,), px², whitened; inf where it cannot be transferred."""
-        homographies = self._of_links(self.model.matrices(parameters.poses, parameters.shared))
-        return squared_lengths(whitened_errors(self.observations, homographies, parameters.lens))
+        return squared_lengths(whitened_errors(self.observations, self._homographies(parameters), parameters.lens))
 
     def normal_equations(self, adjusted: BundleAdjustmentResult, width: float | None = None) -> SparseNormalEquations:
         """At a solution, priors included; the ``width`` of the loss, pixels, follows the errors if not given."""
-        state = self._evaluate(adjusted.parameters, adjusted.sigma, width or ALIGNMENT_WIDTH * adjusted.sigma)
+        state = self.linearized(adjusted.parameters, width or ALIGNMENT_WIDTH * adjusted.sigma)
         return self._normal_equations(state, adjusted.sigma)
 
     def covariance(self, adjusted: BundleAdjustmentResult) -> FloatArray:
@@ -167,51 +199,56 @@ class BundleAdjuster:
         named: FloatArray = derivative @ covariance @ derivative.T
         return named
 
-    def _descend(self, parameters: Parameters, sigma: float, width: float, most: int) -> tuple[_State, int, bool]:
-        """Levenberg-Marquardt at one width of the loss; the state reached, linearizations, whether converged."""
-        state = self._evaluate(parameters, sigma, width)
-        damping, failures, used = _FIRST_DAMPING, 0, 1
+    def _descend(self, parameters: Parameters, sigma: float, width: float, damping: float, most: int) -> _Descent:
+        """Levenberg-Marquardt at one width of the loss, in at most so many linearizations and steps that fail."""
+        used, failures, moved = 1, 0, True
         while used < most:
-            normal = self._normal_equations(state, sigma)
+            if moved:
+                state, moved = self.linearized(parameters, width), False
+                normal, errors = self._normal_equations(state, sigma), state.equations.errors
+                cost = self._cost(parameters, errors, sigma, width)
             try:
                 flat, step_shared = normal.solve(damping)
             except RuntimeError:  # singular: no correspondence of some images can be transferred
-                return state, used, False
+                return _Descent(parameters, errors, damping, used, False)
             step_poses = np.zeros(self.free.poses.shape)
             step_poses[self.free.poses] = flat
             # The decrease of the quadratic model, less what the damping adds to it.
             predicted = -(normal.gradient_poses @ flat + normal.gradient_shared @ step_shared)
-            if not np.isfinite(predicted) or predicted <= self.min_gain * max(state.cost, 1e-12):
-                return state, used, True
-            parameters_moved = state.parameters.retract(self.model, step_poses, step_shared, self.free.lens)
+            if not np.isfinite(predicted) or predicted <= self.min_gain * max(cost, 1e-12):
+                if failures or damping <= _FIRST_DAMPING:
+                    return _Descent(parameters, errors, damping, used, True)
+                damping = _FIRST_DAMPING  # steps that an earlier damping makes short show no minimum
+                continue
+            trial, after = parameters.retract(self.model, step_poses, step_shared, self.free.lens), np.inf
+            if not folds(trial.lens, self.observations.reach):
+                there = self._homographies(trial)
+                tried = trial_errors(self.observations, there, trial.lens, state.equations.whitening)
+                after = self._cost(trial, tried, sigma, width)
             used += 1
-            moved_state = (
-                None
-                if folds(parameters_moved.lens, self.observations.reach)
-                else self._evaluate(parameters_moved, sigma, width)
-            )
-            after = np.inf if moved_state is None else self._cost(moved_state, state.equations.whitening, sigma, width)
-            damping, failures = damping_by_gain(damping, failures, float((state.cost - after) / predicted))
-            if moved_state is not None and after < state.cost:
-                state = moved_state
+            damping, failures = damping_by_gain(damping, failures, float((cost - after) / predicted))
+            if after < cost:
+                parameters, errors, moved = trial, tried, True
             elif damping > MAX_DAMPING:
-                return state, used, True
-        return state, used, False
+                return _Descent(parameters, errors, damping, used, True)
+        return _Descent(parameters, errors, damping, used, False)
 
-    def _evaluate(self, parameters: Parameters, sigma: float, width: float) -> _State:
-        """Errors, cost and linearization at some parameters."""
+    def linearized(self, parameters: Parameters, width: float) -> _State:
+        """The errors at some parameters, linearized and weighted by a loss of this width, pixels."""
         matrices = self.model.matrices(parameters.poses, parameters.shared)
-        homographies = self._of_links(matrices)
+        homographies = self.of_links(matrices)
         equations = link_equations(self.observations, homographies, parameters.lens, width, self.free.lens)
-        cost = float(robust_cost(equations.squared, width).sum()) * self.weight(sigma)
-        return _State(parameters, matrices, homographies, equations, cost + self._prior_cost(parameters))
+        return _State(parameters, matrices, homographies, equations)
 
-    def _cost(self, state: _State, whitening: FloatArray, sigma: float, width: float) -> float:
-        """The cost of a state with a given whitening."""
-        squared = state.equations.squared_with(whitening)
-        return float(robust_cost(squared, width).sum()) * self.weight(sigma) + self._prior_cost(state.parameters)
+    def _cost(self, parameters: Parameters, errors: FloatArray, sigma: float, width: float) -> float:
+        """Of errors (M, 2) at some parameters, with the priors."""
+        lost = float(robust_cost(squared_lengths(errors), width).sum())
+        return lost * self.weight(sigma) + self._prior_cost(parameters)
 
-    def _of_links(self, matrices: ModelMatrices) -> FloatArray:
+    def _homographies(self, parameters: Parameters) -> FloatArray:
+        return self.of_links(self.model.matrices(parameters.poses, parameters.shared))
+
+    def of_links(self, matrices: ModelMatrices) -> FloatArray:
         """``H_ij = P_j P_i⁻¹`` of each link, shape (L, 3, 3)."""
         i, j = self.observations.image1, self.observations.image2
         with np.errstate(all="ignore"):
@@ -279,23 +316,6 @@ class BundleAdjuster:
         whole = np.eye(size + lens)
         whole[:size, :size] = derivative
         return physical, whole
-
-    def _finished(self, parameters: Parameters, sigma: float, used: int, converged: bool) -> BundleAdjustmentResult:
-        """The result with its covariance."""
-        state = self._evaluate(parameters, sigma, ALIGNMENT_WIDTH * sigma)
-        derivative = self.named_parameters(parameters.shared)[1]
-        covariance = inverse_information(self._normal_equations(state, sigma).shared_information())
-        return BundleAdjustmentResult(
-            parameters,
-            state.matrices,
-            state.homographies,
-            sigma,
-            state.equations.squared,
-            state.equations,
-            derivative @ covariance @ derivative.T,
-            converged,
-            used,
-        )
 
 
 def sigma_of(squared: FloatArray) -> float:

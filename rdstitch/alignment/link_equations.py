@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.division_model import is_one_to_one
-from rdstitch.radial_homography import TransferJacobian, measurement_whitening, transfer_jacobian, whiten
+from rdstitch.radial_homography import (
+    TransferJacobian,
+    measurement_whitening,
+    transfer_jacobian,
+    transfer_points,
+    whiten,
+)
 from rdstitch.robust.loss import robust_weight
 
 
@@ -30,21 +36,7 @@ class LinkEquations:
     gradient: FloatArray  # (L, 9 + K): ``Σ w J'r``
     squared: FloatArray  # (M,): ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred
     whitening: FloatArray  # (M, 2, 2): what makes r of an error in normalized coordinates
-    error: FloatArray  # (M, 2): that error; not finite where it cannot be transferred
-
-    @property
-    def errors(self) -> FloatArray:
-        """Whitened errors (M, 2), pixels; NaN where there is no transfer."""
-        return whiten(self.whitening, self.error.T).T
-
-    @np.errstate(all="ignore")
-    def squared_with(self, whitening: FloatArray) -> FloatArray:
-        """``|r|²`` (M,) with a whitening that was computed elsewhere, px²; inf where there is no transfer.
-
-        Between one linearization and the next the whitening must stay what it is: otherwise the errors could be made
-        smaller by a larger derivative, against the gradient, which takes the whitening for constant.
-        """
-        return squared_lengths(whiten(whitening, self.error.T).T)
+    errors: FloatArray  # (M, 2): whitened, pixels; NaN where there is no transfer
 
 
 def split_lens(lens: FloatArray) -> tuple[float, tuple[float, ...], FloatArray]:
@@ -69,15 +61,15 @@ def link_equations(
     """
     count, total = len(observations.points1), 10 + int(free_lens.sum())
     sums = np.zeros((len(observations), total, total))
-    squared, error, whitening = np.empty(count), np.empty((2, count)), np.empty((2, 2, count))
+    squared, errors, whitening = np.empty(count), np.empty((2, count)), np.empty((2, 2, count))
     for first, last in observations.chunks:
         rows = slice(observations.start[first], observations.start[last])
         transferred = _transferred(observations, homographies, lens, first, last)
-        squared[rows], error[:, rows] = squared_lengths(transferred.whitened.T), transferred.error
+        squared[rows], errors[:, rows] = squared_lengths(transferred.whitened.T), transferred.whitened
         whitening[:, :, rows] = transferred.whitening.transpose(1, 2, 0)
         edges = observations.start[first : last + 1] - observations.start[first]
         sums[first:last] = _link_sums(transferred, np.sqrt(robust_weight(squared[rows], width)), free_lens, edges)
-    return LinkEquations(sums[:, :-1, :-1], sums[:, :-1, -1], squared, whitening.transpose(2, 0, 1), error.T)
+    return LinkEquations(sums[:, :-1, :-1], sums[:, :-1, -1], squared, whitening.transpose(2, 0, 1), errors.T)
 
 
 def whitened_errors(observations: Observations, homographies: FloatArray, lens: FloatArray) -> FloatArray:
@@ -85,6 +77,25 @@ def whitened_errors(observations: Observations, homographies: FloatArray, lens: 
     chunks = observations.chunks
     errors = [_transferred(observations, homographies, lens, *chunk).whitened for chunk in chunks]
     return np.concatenate([np.empty((2, 0)), *errors], axis=1).T
+
+
+@np.errstate(all="ignore")
+def trial_errors(
+    observations: Observations, homographies: FloatArray, lens: FloatArray, whitening: FloatArray
+) -> FloatArray:
+    """Transfer errors (M, 2) as a linearization elsewhere has whitened them, pixels; NaN where there is none.
+
+    Between one linearization and the next the whitening must stay what it is: otherwise the errors could be made
+    smaller by a larger derivative, against the gradient, which takes the whitening for constant.
+    """
+    distortion, higher, center = split_lens(lens)
+    errors = np.empty_like(observations.points1.T)
+    for first, last in observations.chunks:
+        rows = slice(observations.start[first], observations.start[last])
+        each = _repeated(homographies[first:last], np.diff(observations.start[first : last + 1]))
+        points = transfer_points(each, distortion, (observations.points1[rows] - center).T, higher)[2]
+        errors[:, rows] = whiten(whitening[rows], points - (observations.points2[rows] - center).T)
+    return errors.T
 
 
 @dataclass(frozen=True)
@@ -151,15 +162,20 @@ def _transferred(
     """The correspondences of links ``first`` to ``last``, transferred."""
     rows = slice(observations.start[first], observations.start[last])
     counts = np.diff(observations.start[first : last + 1])
-    scale1 = np.repeat(observations.scale1[first:last], counts)[:, None, None]
     scale2 = np.repeat(observations.scale2[first:last], counts)[:, None, None]
-    homography = np.repeat(homographies[first:last], counts, axis=0)
+    ratio = np.repeat(observations.scale2[first:last] / observations.scale1[first:last], counts)[:, None, None]
+    homography = _repeated(homographies[first:last], counts)
     distortion, higher, center = split_lens(lens)
     derivatives = transfer_jacobian(homography, distortion, observations.points1[rows] - center, higher)
     relief = None if observations.relief is None else observations.relief[rows]
-    whitening = measurement_whitening(derivatives.by_point * (scale2 / scale1), relief) * scale2
+    whitening = measurement_whitening(derivatives.by_point * ratio, relief) * scale2
     error = (derivatives.points - (observations.points2[rows] - center)).T
     return _Transferred(derivatives, whitening, error, whiten(whitening, error))
+
+
+def _repeated(homographies: FloatArray, counts: IntArray) -> FloatArray:
+    """Homographies (L, 3, 3), each for so many correspondences, (M, 3, 3), the correspondences last in memory."""
+    return np.repeat(homographies.reshape(-1, 9).T, counts, axis=1).reshape(3, 3, -1).transpose(2, 0, 1)
 
 
 def _link_sums(

@@ -35,8 +35,6 @@ medians and times the root of N."""
 _SIGNIFICANT = 3.0
 """Standard deviations of the logarithm of their ratio by which errors along the parallax must exceed those across."""
 
-_BISECTIONS = 40
-
 
 def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[str]) -> ModelChoice:
     """The model of one camera chosen again, with heights that account for errors, where such heights show.
@@ -130,9 +128,6 @@ def _scatter(errors: FloatArray, parallax: FloatArray, effective: float) -> floa
     least = math.exp(_SIGNIFICANT * _MEDIAN_STD * math.sqrt(2.0 / (effective / 2.0)))
     if noise <= 0.0 or float(np.median(along)) <= least * noise * _NORMAL_MEDIAN:
         return 0.0
-    low, high = 0.0, float((np.sqrt(along) / length).max())
-    for _ in range(_BISECTIONS):
-        middle = (low + high) / 2.0
-        higher = np.median(along / (noise + (middle * length) ** 2)) > _NORMAL_MEDIAN
-        low, high = (middle, high) if higher else (low, middle)
-    return high / math.sqrt(noise)
+    # Of this scatter the median of ``along / (noise + (scatter length)²)`` is what it is for normal variables.
+    variance = float(np.median((along / _NORMAL_MEDIAN - noise) / length**2))
+    return math.sqrt(max(variance, 0.0) / noise)

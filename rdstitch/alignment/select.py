@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.evidence import ErrorCost, Evidence
 from rdstitch.alignment.lens_selection import shows_center
 from rdstitch.alignment.link_equations import split_lens, whitened_errors
@@ -132,10 +133,19 @@ class Posterior:
         diagonal = 2.0 * float(np.median(self.problem.observations.scale2))
         return max(_POSSIBLE * self.evidence.noise, _PARALLAX * diagonal)
 
+    @property
+    def tolerable(self) -> float:
+        """Shared errors up to which a turn is taken in place of a plane with an absurd layout, pixels."""
+        return math.hypot(_TOLERABLE * self.evidence.farthest, self.evidence.noise)
+
+    def cost(self, adjusted: BundleAdjustmentResult) -> ErrorCost:
+        """What the errors say that an adjustment leaves."""
+        errors = whitened_errors(self.problem.observations, adjusted.homographies, adjusted.parameters.lens)
+        return self.evidence.cost(errors)
+
     def of(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
-        errors = whitened_errors(self.problem.observations, fit.adjusted.homographies, fit.adjusted.parameters.lens)
-        errors_cost = self.evidence.cost(errors)
+        errors_cost = self.cost(fit.adjusted)
         wide = 0.0
         if fit.tilt_spread > 0.0:
             wide = 4.0 * self.problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
@@ -150,9 +160,11 @@ class Posterior:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
         if not model.one_camera and not _is_beyond_one_camera(self, best, self.least.field):
             return True
-        return not best.absurd and best.score <= self.least.cost + self.price(
-            model, self.problem.free_lens, self.least.count
-        )
+        return not best.absurd and not self.could_win(best, model, self.least)
+
+    def could_win(self, best: Hypothesis, model: MotionModel, least: ErrorCost) -> bool:
+        """Whether a model could have the better score, if it left errors that say no more than the ``least``."""
+        return best.score > least.cost + self.price(model, self.problem.free_lens, least.count)
 
     def price(self, model: MotionModel, free_lens: BoolArray, count: float) -> float:
         """What the parameters of a model cost, by so many independent observations (Schwarz's criterion)."""
@@ -169,21 +181,24 @@ def select_model(
 ) -> ModelChoice:
     """Adjust hypotheses from the least to the most free, and take the one with the best score.
 
-    Models are no longer tried that could not pay for their freedom even with the errors that links leave on their own.
+    Models are no longer tried that could not pay for their freedom even with the errors that links leave on their own;
+    so a turn that pairs do not look like is tried last, by the errors of links that are turns on their own.
     The best two and the least free one are then tried with more of the lens free: an off-centre lens acts like less
     regular motion. Free homographies are a model of another kind, taken only for what one camera cannot explain.
     """
     posterior = Posterior(problem, prefer_turn, layout_matters)
     tried: list[Hypothesis] = []
-    turns = [MODELS[name] for name in names if MODELS[name].on_sphere]
+    doubtful: list[tuple[MotionModel, BundleAdjustmentResult]] = []
     wide = replace(problem, free_lens=np.logical_or.reduce([problem.free_lens, *lenses]))
-    for turn in turns:
+    for turn in [MODELS[name] for name in names if MODELS[name].on_sphere]:
         if len(problem.observations) == 1:  # a trial is the whole
             tried.append(posterior.of(problem.fit(turn)))
             continue
         trial = wide.trial(turn)
-        if len(names) == 1 or trial.sigma <= posterior.largest_trial:
+        if len(names) == 1 or trial.sigma <= _POSSIBLE * posterior.evidence.noise:
             tried.append(posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
+        else:
+            doubtful.append((turn, trial))
     for model in [MODELS[name] for name in names if not MODELS[name].on_sphere]:
         if problem.count == 2 and model.free_tilts and not all(MODELS[name].one_camera for name in names):
             continue  # with two images, one camera that tilts is a homography
@@ -191,8 +206,13 @@ def select_model(
             break
         planes = [one.fit for one in tried if not one.fit.model.on_sphere]
         tried.append(posterior.of(problem.fit(model, planes[-1:])))
-    if min(tried, key=_score).absurd:
-        tried += [posterior.of(problem.fit(turn)) for turn in turns if all(one.fit.model is not turn for one in tried)]
+    for turn, trial in doubtful:
+        best = min(tried, key=_score)
+        if not best.absurd and trial.sigma > posterior.largest_trial:
+            continue
+        least = posterior.cost(wide.apart(turn, trial))
+        if posterior.could_win(best, turn, least) or (best.absurd and least.field < posterior.tolerable):
+            tried.insert(0, posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
     tried = _with_wider_lenses(posterior, tried, lenses)
     return _choice(posterior, tried, _best(posterior, tried), requested=len(names) == 1)
 
@@ -226,8 +246,7 @@ def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
     cameras = [one for one in tried if one.fit.model.one_camera]
     free = [one for one in tried if not one.fit.model.one_camera]
     best = min(cameras or free, key=_score)
-    largest = math.hypot(_TOLERABLE * posterior.evidence.farthest, posterior.evidence.noise)
-    turns = [one for one in tried if one.fit.model.on_sphere and one.field < largest]
+    turns = [one for one in tried if one.fit.model.on_sphere and one.field < posterior.tolerable]
     if best.absurd and turns:
         return turns[0]
     return min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)

@@ -83,7 +83,7 @@ def _by_relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> Fl
     share = len(few.points1) / max(len(observations.points1), 1)
     if share < 1.0:  # each counts for several beside the priors
         adjuster = replace(adjuster, observations=few, overdispersion=adjuster.overdispersion * share)
-        adjusted = replace(adjusted, squared=adjuster.squared(adjusted.parameters))
+        adjusted = replace(adjusted, adjuster=adjuster)
     return ReliefField(LinearResponse.of(adjuster, adjusted)).covariance()
 
 

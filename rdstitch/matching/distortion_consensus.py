@@ -86,11 +86,5 @@ def _scatter(residual: FloatArray, errors: FloatArray) -> float:
     """The additional standard deviation that makes the median of the normalized residuals what it should be."""
     if len(residual) < 3:
         return 0.0
-    low, high = 0.0, float(np.abs(residual).max()) * 2.0
-    for _ in range(50):
-        middle = (low + high) / 2
-        if np.median(np.abs(residual) / np.hypot(errors, middle)) > 0.6745:
-            low = middle
-        else:
-            high = middle
-    return low
+    # Where the median of some ratios of squares is a number, that of the differences times it is zero.
+    return float(np.sqrt(max(np.median((residual / 0.6745) ** 2 - errors**2), 0.0)))

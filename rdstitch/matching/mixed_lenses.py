@@ -82,15 +82,18 @@ class Votes:
         lenses : ndarray of shape (K,)
             λ to start from; that of a lens without votes stays.
         """
-        rows, count = 2 * len(self), len(lenses)
-        places = np.repeat(np.arange(rows), 2), np.repeat(which, 2, axis=0).ravel()
-        design = sparse.coo_array((self._whitening.ravel(), places), shape=(rows, count)).tocsc()
-        seen = np.bincount(which.ravel(), minlength=len(lenses)) > 0
+        count, every = len(lenses), np.arange(len(lenses))
+        both = np.broadcast_arrays(which[:, :, None], which[:, None, :])
+        places = tuple(np.concatenate([lens.ravel(), every]) for lens in both)
+        information = np.swapaxes(self._whitening, 1, 2) @ self._whitening
+        votes = np.einsum("lij,lj->li", information, self.distortion)
+        unseen = np.bincount(which.ravel(), minlength=count) == 0
         for _ in range(_REWEIGHTINGS):
-            weight = np.repeat(1.0 / np.maximum(self.mahalanobis_residuals(lenses[which]), 0.1), 2)
-            normal = (design.T * weight) @ design + sparse.diags_array(1.0 - seen)
-            right = design.T @ (weight * self._whitened(self.distortion).ravel())
-            lenses = np.where(seen, np.asarray(sparse_linalg.spsolve(normal.tocsc(), right)), lenses)
+            weight = 1.0 / np.maximum(self.mahalanobis_residuals(lenses[which]), 0.1)
+            entries = np.concatenate([(information * weight[:, None, None]).ravel(), unseen])
+            normal = sparse.coo_array((entries, places), shape=(count, count)).tocsc()
+            right = np.bincount(which.ravel(), (votes * weight[:, None]).ravel(), count)
+            lenses = np.where(unseen, lenses, sparse_linalg.splu(normal).solve(right))
         return lenses
 
     @cached_property

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, sigma_of
-from rdstitch.alignment.link_equations import link_equations
+from rdstitch.alignment.link_equations import link_equations, squared_lengths, trial_errors
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, MotionModel
 from rdstitch.alignment.normal_equations import PoseBlocks, chain
 from rdstitch.alignment.observations import Observations
@@ -51,9 +51,8 @@ def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: flo
         step = np.zeros((count, model.pose_size))
         step[free] = poses_step
         moved = start.retract(model, step, shared_step, FREE_LENS)
-        there = link_equations(observations, homographies(moved), moved.lens, width, FREE_LENS)
-        squared = there.squared_with(equations.whitening)
-        return 2.0 * float(robust_cost(squared, width).sum())
+        errors = trial_errors(observations, homographies(moved), moved.lens, equations.whitening)
+        return 2.0 * float(robust_cost(squared_lengths(errors), width).sum())
 
     rng = np.random.default_rng(0)
     for _ in range(4):
@@ -81,7 +80,7 @@ def test_sums_of_a_link_are_those_of_its_jacobian(free: np.ndarray) -> None:
     jacobian = np.concatenate([by.by_homography, by.by_lens(free).transpose(2, 0, 1)], axis=2)
     there = np.isfinite(found.squared)
     assert 0 < there.sum() < len(there)
-    jacobian, error = (found.whitening @ jacobian)[there], (found.whitening @ found.error[:, :, None])[there, :, 0]
+    jacobian, error = (found.whitening @ jacobian)[there], found.errors[there]
     weight = robust_weight(found.squared[there], width)
     expected = np.einsum("m,mik,mil->kl", weight, jacobian, jacobian)
     np.testing.assert_allclose(found.gram[0], expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
