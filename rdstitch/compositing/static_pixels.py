@@ -54,16 +54,16 @@ def static_pixels(images: Sequence[NDArray[np.generic]]) -> BoolArray | None:
 
 def _agreement(grey: Float32Array, window: int) -> Float32Array:
     """How far the corners of different images agree, over a window, shape (h, w): 1 for what stays, else about 0."""
-    within_images, total = np.zeros((3, *grey.shape[1:]), np.float32), np.zeros((2, *grey.shape[1:]), np.float32)
+    within_images: Float32Array = np.zeros((3, *grey.shape[1:]), np.float32)
+    total: Float32Array = np.zeros((2, *grey.shape[1:]), np.float32)
     for image in grey:
         slope = np.stack([cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1)])
         within_images += _tensor(slope)
         total += slope
     # Products of the slopes of one image with those of all others, against those with its own.
-    others = (_tensor(total) - within_images) / (len(grey) - 1)
+    others = (_tensor(total) - within_images) / np.float32(len(grey) - 1)
     corners, common = (_smaller_eigenvalue(tensor, window) for tensor in (within_images, others))
-    agreement: Float32Array = common / np.maximum(corners, _MIN_TEXTURE * float(np.median(corners)) + 1e-12)
-    return agreement
+    return np.asarray(common / np.maximum(corners, _MIN_TEXTURE * np.median(corners) + 1e-12), np.float32)
 
 
 def _tensor(slope: Float32Array) -> Float32Array:
