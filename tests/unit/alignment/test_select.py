@@ -125,8 +125,10 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
 
 @pytest.mark.parametrize(("field", "chosen"), [(1.1, "rotation"), (1.5, "rigid")])
 def test_instead_of_an_absurd_plane_a_turn_may_leave_what_seams_hide_and_the_noise(field: float, chosen: str) -> None:
-    evidence = SimpleNamespace(farthest=4.0, noise=0.6)  # a quarter of 4 px, and the noise: 1.17 px
-    posterior: Any = SimpleNamespace(evidence=evidence, problem=SimpleNamespace(count=2))
+    problem: Any = SimpleNamespace(count=2)
+    posterior = Posterior(problem)
+    # A quarter of 4 px, and the noise: 1.17 px.
+    vars(posterior)["evidence"] = SimpleNamespace(farthest=4.0, noise=0.6)
 
     def hypothesis(model: MotionModel, score: float, field: float, *, absurd: bool) -> Hypothesis:
         fit: Any = SimpleNamespace(model=model)
