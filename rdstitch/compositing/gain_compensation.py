@@ -72,9 +72,9 @@ def compare_overlaps(survey: Survey) -> Cells | None:
         shares[index] = np.count_nonzero(seen) / min(areas[i], areas[j])
         side = max(2, round(max(*a.inside.shape, *b.inside.shape) / _CELLS))
         lit = [cut(light[k], tile.box, box) for k, tile in ((i, a), (j, b))]
-        values = [*(cut(tile.pixels, tile.box, box) for tile in (a, b)), *((each > 1)[..., None] for each in lit)]
+        shown = [*(cut(tile.pixels, tile.box, box) for tile in (a, b)), *((each > 1)[..., None] for each in lit)]
         for which in filter(np.any, (lit[0] * lit[1] == 1, lit[0] * lit[1] > 1)):
-            means = _cell_means(which, values, side)
+            means = _cell_means(which, shown, side)
             means[:, :2] += box[:2]
             means_of_pairs.append((np.full(len(means), index), means))
     pair = np.concatenate([which for which, _ in means_of_pairs]) if means_of_pairs else np.zeros(0, dtype=np.intp)

@@ -60,10 +60,10 @@ def _agreement(grey: Float32Array, window: int) -> Float32Array:
         within_images += _tensor(slope)
         total += slope
     # Products of the slopes of one image with those of all others, against those with its own.
-    others = (_tensor(total) - within_images) / (len(grey) - 1)
+    others = (_tensor(total) - within_images) / np.float32(len(grey) - 1)
     corners, common = (_smaller_eigenvalue(tensor, window) for tensor in (within_images, others))
-    agreement: Float32Array = common / np.maximum(corners, _MIN_TEXTURE * float(np.median(corners)) + 1e-12)
-    return agreement
+    least = np.float32(_MIN_TEXTURE * float(np.median(corners)) + 1e-12)
+    return np.asarray(common / np.maximum(corners, least), dtype=np.float32)
 
 
 def _tensor(slope: Float32Array) -> Float32Array:
