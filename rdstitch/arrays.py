@@ -11,7 +11,7 @@ IntArray = NDArray[np.intp]
 
 
 class Rows:
-    """Base of dataclasses of arrays that have the first axis in common."""
+    """Base of dataclasses of arrays, or of other such dataclasses, that have the first axis in common."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
@@ -23,3 +23,5 @@ class Rows:
         """Replace some rows."""
         for name in self.__dataclass_fields__:
             getattr(self, name)[rows] = getattr(others, name)
+
+    __getitem__, __setitem__ = take, put

@@ -10,7 +10,9 @@ _CELLS_PER_HALF_DIAGONAL = 5.0
 _CELLS_PER_SIDE = 64  # more than an image has, wherever its distortion centre is
 
 
-def covariances(information: FloatArray, influence: FloatArray, noise: FloatArray, data: Measurements) -> FloatArray:
+def covariances(
+    information: FloatArray, influence: FloatArray, chain: FloatArray, noise: FloatArray, data: Measurements
+) -> FloatArray:
     """Covariance (B, P, P) that holds also where neighbouring errors are alike, as parallax and lens misfit make them.
 
     ``A⁻¹ (Σ_c g_c g_c') A⁻¹`` over the cells c of a grid, ``A`` the normal matrix and ``g_c`` the gradient of the
@@ -20,8 +22,10 @@ def covariances(information: FloatArray, influence: FloatArray, noise: FloatArra
     Parameters
     ----------
     information : ndarray of shape (B, P, P)
-    influence : ndarray of shape (B, N, P)
-        Each match's share of the gradient.
+    influence : ndarray of shape (B, N, E)
+        Each match's share of the gradient by other parameters.
+    chain : ndarray of shape (B, E, P)
+        Derivatives of these.
     noise : ndarray of shape (B,)
         Standard deviation of the errors per axis, pixels.
     data : Measurements
@@ -37,10 +41,11 @@ def covariances(information: FloatArray, influence: FloatArray, noise: FloatArra
         return result
     # In the basis where noise² A⁻¹ is the identity, the larger of the two is a matter of eigenvalues.
     root = (vectors / np.sqrt(values)[:, None]) / scale[:, :, None]
-    of_cells, pair = _summed_over_cells(influence[usable] @ root, data.x1[usable])
-    outer = of_cells[:, :, None] * of_cells[:, None]
+    of_cells, pair = _summed_over_cells(influence[usable], data.x1[usable])
     starts = np.searchsorted(pair, np.arange(len(usable)))
-    clustered = np.add.reduceat(outer, starts, axis=0) / (noise[usable] ** 2)[:, None, None]
+    outer = np.add.reduceat(of_cells[:, :, None] * of_cells[:, None], starts, axis=0)
+    turn = chain[usable] @ root
+    clustered = np.swapaxes(turn, 1, 2) @ (outer / (noise[usable] ** 2)[:, None, None]) @ turn
     spread, directions = np.linalg.eigh(clustered)
     root = root @ (directions * np.sqrt(np.maximum(spread, 1.0))[:, None])
     result[usable] = (noise[usable] ** 2)[:, None, None] * (root @ np.swapaxes(root, 1, 2))

@@ -186,7 +186,7 @@ def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> lis
             search.best.distortion[members],
             data.take(members),
             None if tilts is None else tilts[members],
-            np.ones(len(members)),
+            None,
             threshold,
             options.distortion is not None,
         )

@@ -1,7 +1,7 @@
 """Levenberg-Marquardt for many small problems in lockstep."""
 
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -10,8 +10,12 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 MIN_GAIN = 1e-5
 """Expected relative fall of the loss of all images that is worth another step: a hundredth of the noise."""
 
-PAIR_GAIN, ROUGH_GAIN = 1e-4, 1e-3
-"""The same of a pair, or of a few matches of each; and where another descent goes on from there."""
+PAIR_GAIN = 1e-4
+"""The same of a few matches of each pair."""
+
+SHORT_STEP, ROUGH_STEP = 0.3, 1.0
+"""Standard deviations of the parameters, all together, of a step that is not worth taking; and where another descent
+goes on from there."""
 
 FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e4
 """Of the diagonal of the normal matrix: where a descent begins, and beyond which it has got stuck."""
@@ -29,11 +33,16 @@ class BatchedNormalEquations(Rows):
     squared: FloatArray  # (B, N): squared errors of the measurements; inf where there is none
 
     @property
+    def unit(self) -> FloatArray:
+        """What a step of one standard deviation gains, (B,)."""
+        return self.cost
+
+    @property
     def errors(self) -> FloatArray:
         """Errors of the measurements, (B, N); inf where there is none."""
         return np.sqrt(self.squared)
 
-    def where(self, better: BoolArray, others: "BatchedNormalEquations") -> "BatchedNormalEquations":
+    def where(self, better: BoolArray, others: Self) -> Self:
         """The others where they are better."""
         if better.all():
             return others
@@ -42,15 +51,22 @@ class BatchedNormalEquations(Rows):
         return result
 
 
-class Problems(Protocol):
+Equations = TypeVar("Equations", bound=BatchedNormalEquations)
+
+
+class Problems(Protocol[Equations]):
     """B problems of least squares, as the descent sees them."""
 
     def take(self, rows: BoolArray | IntArray) -> Self:
         """Some of them."""
         ...
 
-    def normal_equations(self, parameters: FloatArray) -> BatchedNormalEquations:
+    def normal_equations(self, parameters: FloatArray) -> Equations:
         """At parameters (B, K)."""
+        ...
+
+    def cost(self, before: Equations, after: Equations) -> FloatArray:
+        """Losses (B,) of ``before``, as the errors are weighed in ``after``."""
         ...
 
     def retract(self, parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -59,38 +75,42 @@ class Problems(Protocol):
 
 
 def descend(
-    problems: Problems,
+    problems: Problems[Equations],
     start: FloatArray,
     iterations: int,
     *,
     rough: bool = False,
-) -> tuple[FloatArray, BatchedNormalEquations]:
+) -> tuple[FloatArray, Equations]:
     """Where at most so many steps lead to, parameters of shape (B, K), and the equations there.
 
     A problem that has converged takes no further part, so that each is solved as if it were alone. ``rough``: another
     descent goes on from there.
     """
-    least_gain = ROUGH_GAIN if rough else PAIR_GAIN
+    least_gain = (ROUGH_STEP if rough else SHORT_STEP) ** 2
     result, parameters = start.copy(), start
     current = equations = problems.normal_equations(start)
     damping, rows = np.full(len(start), FIRST_DAMPING), np.arange(len(start))
     for _ in range(iterations):
         step = _damped_step(current, damping)
         gain = -np.einsum("bp,bp->b", step, current.gradient)
-        going = (gain > least_gain * current.cost) & (damping <= MAX_DAMPING)
+        going = (gain > least_gain * current.unit) & (damping <= MAX_DAMPING)
         if not going.any():
             break
         if not going.all():
+            result[rows[~going]] = parameters[~going]
+            equations.put(rows[~going], current.take(~going))
             rows, step, parameters, damping = rows[going], step[going], parameters[going], damping[going]
             problems, current = problems.take(going), current.take(going)
         moved, possible = problems.retract(parameters, step)
         trial = problems.normal_equations(moved)
-        better = possible & (trial.cost < current.cost)
+        better = possible & (trial.cost < problems.cost(current, trial))
         damping = next_damping(damping, better)
         if better.any():
             parameters, current = np.where(better[:, None], moved, parameters), current.where(better, trial)
-            result[rows] = parameters
-            equations.put(rows, current)
+    if len(rows) == len(start):
+        return parameters, current
+    result[rows] = parameters
+    equations.put(rows, current)
     return result, equations
 
 

@@ -2,7 +2,7 @@
 
 The loss is that of :mod:`rdstitch.robust.loss`, of the whitened transfer error in measured pixels.
 
-With ``z = H p(λ)`` the derivative of the transferred point by H is ``(∂d/∂z) ⊗ p``. So a match enters ``J'J`` by a
+With ``z = H p(λ)`` the derivative of the transferred point by H is ``(∂u/∂z) ⊗ p``. So a match enters ``J'J`` by a
 matrix of 3 x 3 times ``p p'``, and nothing of the size of a Jacobian is ever formed.
 """
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, Rows
 from rdstitch.division_model import distorted_ratio
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
 from rdstitch.robust.loss import loss_ratio, robust_weight
@@ -35,35 +35,35 @@ class PairLenses:
 
 
 @dataclass(frozen=True)
-class TransferDerivatives:
-    """Errors of transfer and their derivatives; pixels of image 2, pairs first and matches last."""
+class TransferDerivatives(Rows):
+    """Errors of transfer and their derivatives, pairs first and matches last.
 
-    error: FloatArray  # (B, 2, N): transferred less measured point
-    # (B, 2, 3, N): by ``z = H p``, so that the derivative by ``H[i, j]`` is ``by_image[:, :, i] * lifted[:, j]``
-    by_image: FloatArray
+    All in the undistorted image 2, where H acts without the lens: an error in measured pixels is taken there by the
+    derivative of undistortion, and so is its covariance, so that whitened errors are those of measured pixels.
+    """
+
+    image: FloatArray  # (B, 2, N): transferred point ``u``, undistorted half diagonals
+    inverse_depth: FloatArray  # (B, N): ``1 / z_w``, so that the derivative of ``u`` by ``z`` is ``[I | -u] / z_w``
     lifted: FloatArray  # (B, 3, N): ``p``
-    # (B, 2, E, N): by λ; or by λ of image 1, λ of image 2, μ and the distortion centre where the lens has all of these
-    by_lens: FloatArray
-    # (B, 3, N): entries xx, xy, yy of the inverse covariance of the error for unit noise in both images, halved: ``((I
-    # + J J') / 2)⁻¹``, J the derivative by the point of image 1 (Sampson's weighting)
+    # (B, E + 1, 2, N): derivative of the error by λ, or by λ of image 1, λ of image 2, μ and the distortion centre
+    # where the lens has all of these; last the error itself, transferred less measured point
+    columns: FloatArray
+    # (B, 3, N): entries xx, xy, yy of the inverse covariance of the error, halved, for noise of a pixel in both images
+    # (Sampson's weighting)
     precision: FloatArray
+    squared: FloatArray  # (B, N): squared whitened errors, pixels²
     # (B, N), bool: no transfer: behind the camera, or beyond the lens model. Errors and derivatives are then finite but
     # mean nothing
     lost: BoolArray
-
-    @property
-    def squared(self) -> FloatArray:
-        """Squared whitened errors, (B, N)."""
-        dx, dy = self.error[:, 0], self.error[:, 1]
-        xx, xy, yy = self.precision[:, 0], self.precision[:, 1], self.precision[:, 2]
-        return dx * (xx * dx + 2.0 * xy * dy) + yy * dy * dy
 
 
 def differentiate(homography: FloatArray, lens: PairLenses, data: Measurements) -> TransferDerivatives:
     """Transfer the matches of each pair from image 1 to image 2, with all derivatives.
 
-    With ``u = z_xy / z_w`` and d the distorted point, ``g = 1 + λ ρ² + μ ρ⁴``, ``ρ = |d|``, ``k = g - (2λ + 4μρ²) ρ²``:
-    ``dd/du = g (I + (2λ + 4μρ²) d d' / k)``, and at fixed u ``dd/dλ = d ρ² / k``.
+    With ``u = z_xy / z_w`` and d the distorted point, ``g = 1 + λ ρ² + μ ρ⁴``, ``ρ = |d|``, ``s = 2λ + 4μρ²``,
+    ``k = g - s ρ²``: the derivative of undistortion is ``A = (I - (s/g) d d') / g``; d is one to one where ``k > 0``,
+    and that of u by λ at fixed d is ``-d ρ² / g²``. With M the derivative of u by the measured point of image 1, unit
+    noise in both images gives the error the covariance ``A A' + M M'``.
 
     Parameters
     ----------
@@ -83,106 +83,124 @@ def differentiate(homography: FloatArray, lens: PairLenses, data: Measurements) 
     lifted[:, 2] = 1.0 + (first if mu is None else first + mu * r2) * r2
     z = homography @ lifted
     lost = ~(z[:, 2] > 0.0)
-    w = np.where(lost, 1.0, z[:, 2])
-    d = z[:, :2] / w[:, None]
-    ratio = distorted_ratio(d[:, 0] ** 2 + d[:, 1] ** 2, second, mu)
-    lost |= np.isnan(ratio)
-    d *= np.where(lost, 0.0, ratio)[:, None]
-
+    inverse_depth = 1.0 / np.where(lost, 1.0, z[:, 2])
+    u = z[:, :2] * inverse_depth[:, None]
+    g = distorted_ratio(u[:, 0] ** 2 + u[:, 1] ** 2, second, mu)
+    lost |= np.isnan(g)
+    g[lost] = 1.0
+    d = u * g[:, None]
     rho2 = d[:, 0] ** 2 + d[:, 1] ** 2
-    g = 1.0 + (second if mu is None else second + mu * rho2) * rho2
     slope = 2.0 * second if mu is None else 2.0 * second + 4.0 * mu * rho2
-    k = g - slope * rho2
-    lost |= ~(k > 0.0)
-    k[lost] = 1.0
-    px = data.px[:, None]
-    by_image = np.empty((*d.shape[:2], 3, d.shape[2]))
-    scale = g * px / w
-    np.multiply((d * (scale * slope / k)[:, None])[:, :, None], d[:, None], out=by_image[:, :, :2])
-    by_image[:, 0, 0] += scale
-    by_image[:, 1, 1] += scale
-    np.multiply(d, (-scale / k)[:, None], out=by_image[:, :, 2])
+    back = 1.0 / g
+    bend = slope * back
+    lost |= ~(bend * rho2 < 1.0)
 
-    by_lifted = np.swapaxes(homography, 1, 2)[:, None] @ by_image
-    along_third = by_lifted[:, :, 2]
+    # Derivatives of u by the lifted coordinate of image 1, and M.
+    third = (homography[:, :2, 2:] - u * homography[:, 2:, 2:]) * inverse_depth[:, None]
     slope1 = 2.0 * first if mu is None else 2.0 * first + 4.0 * mu * r2
-    by_point = by_lifted[:, :, :2] + along_third[:, :, None] * (x1 * slope1[:, None])[:, None]
-    in_image2 = d * (rho2 * px / k)[:, None]
+    by_point = (homography[:, :2, :2, None] - u[:, :, None] * homography[:, 2:, :2, None]) * inverse_depth[
+        :, None, None
+    ]
+    by_point += third[:, :, None] * (x1 * slope1[:, None])[:, None]
+    in_image2 = u * (rho2 * back)[:, None]
+    columns = np.empty((len(d), 2 if lens.own_distortion is None else 6, 2, d.shape[2]))
     if lens.own_distortion is None:
-        by_lens = (along_third * r2[:, None] + in_image2)[:, :, None]
+        columns[:, 0] = third * r2[:, None] + in_image2
     else:
-        by_lens = np.empty((*d.shape[:2], 5, d.shape[2]))
-        by_lens[:, :, 0] = along_third * r2[:, None]
-        by_lens[:, :, 1] = in_image2
-        by_lens[:, :, 2] = along_third * (r2**2)[:, None] + in_image2 * rho2[:, None]
-        by_lens[:, :, 3:] = -by_point
-        by_lens[:, 0, 3] += px
-        by_lens[:, 1, 4] += px
-    precision = _precision(by_point * (data.px_ratio / data.px)[:, None, None, None])
-    return TransferDerivatives((d - x2) * px[:, None], by_image, lifted, by_lens, precision, lost)
+        columns[:, 0] = third * r2[:, None]
+        columns[:, 1] = in_image2
+        columns[:, 2] = third * (r2**2)[:, None] + in_image2 * rho2[:, None]
+        columns[:, 3:5] = -(d * (bend * back)[:, None])[:, None] * d[:, :, None] - by_point.swapaxes(1, 2)
+        columns[:, 3, 0] += back
+        columns[:, 4, 1] += back
+    difference = d - x2
+    along = (d[:, 0] * difference[:, 0] + d[:, 1] * difference[:, 1]) * bend
+    error = (difference - d * along[:, None]) * back[:, None]
+    columns[:, -1] = error
 
-
-def _precision(by_point: FloatArray) -> FloatArray:
-    """``((I + J J') / 2)⁻¹`` of J (B, 2, 2, N), as entries xx, xy, yy (B, 3, N)."""
-    a, b = by_point[:, 0], by_point[:, 1]
-    xx = 1.0 + (a[:, 0] ** 2 + a[:, 1] ** 2)
-    yy = 1.0 + (b[:, 0] ** 2 + b[:, 1] ** 2)
-    xy = a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]
-    scale = 2.0 / (xx * yy - xy * xy)
-    return np.stack([yy * scale, -xy * scale, xx * scale], axis=1)
+    by_point *= data.px_ratio[:, None, None, None]
+    back2 = back * back
+    turned = back2 * bend * (bend * rho2 - 2.0)
+    spread = by_point[:, :, 0] ** 2 + by_point[:, :, 1] ** 2 + d * d * turned[:, None] + back2[:, None]
+    across = by_point[:, 0] * by_point[:, 1]
+    xy = across[:, 0] + across[:, 1] + d[:, 0] * d[:, 1] * turned
+    xx, yy = spread[:, 0], spread[:, 1]
+    scale = (2.0 * data.px**2)[:, None] / (xx * yy - xy * xy)
+    precision = np.empty((len(d), 3, d.shape[2]))
+    precision[:, 0], precision[:, 1], precision[:, 2] = yy * scale, xy * -scale, xx * scale
+    left = precision[:, :2] * error[:, :1] + precision[:, 1:] * error[:, 1:]
+    left *= error
+    squared = left[:, 0] + left[:, 1]
+    return TransferDerivatives(u, inverse_depth, lifted, columns, precision, squared, lost)
 
 
 def entry_equations(
     transferred: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool
 ) -> BatchedNormalEquations:
     """The loss with its scale ``c`` (B,), pixels, and its normal equations by the entries of H, then by the lens."""
-    squared = transferred.squared
-    relative, factor = (loss(squared, scale[:, None]) for loss in (loss_ratio, robust_weight))
-    lost, useless = transferred.lost & present, transferred.lost | ~present
-    relative[useless] = factor[useless] = 0.0
-    cost = (squared * relative).sum(axis=1) + scale**2 * lost.sum(axis=1)
-    squared[useless] = np.inf
+    useless = transferred.lost | ~present
+    relative = loss_ratio(transferred.squared, scale[:, None])
+    relative[useless] = 0.0
+    cost = (transferred.squared * relative).sum(axis=1) + scale**2 * (transferred.lost & present).sum(axis=1)
+    columns, by_z, left = _weighted(transferred, relative * relative, free_lens)
+    batch, size, _, count = columns.shape
+    extra = size - 1
 
-    lens = transferred.by_lens if free_lens else transferred.by_lens[:, :, :0]
-    extra = lens.shape[2]
-    columns = np.concatenate([transferred.by_image, lens, transferred.error[:, :, None]], axis=2)
-    weight = transferred.precision * factor[:, None]
-    xx, xy, yy = weight[:, :1], weight[:, 1:2], weight[:, 2:]
-    across, down = columns[:, 0], columns[:, 1]
-    left_across, left_down = xx * across + xy * down, xy * across + yy * down
-    by_h = across[:, :3, None] * left_across[:, None] + down[:, :3, None] * left_down[:, None]
-
-    lifted = np.swapaxes(transferred.lifted, 1, 2)
-    monomials = (transferred.lifted[:, _PAIRS[0]] * transferred.lifted[:, _PAIRS[1]]).swapaxes(1, 2)
-    batch, count = relative.shape
-    quadratic = (by_h[:, :, :3].reshape(batch, 9, count) @ monomials)[:, :, _ENTRY]
-    linear = by_h[:, :, 3:].reshape(batch, 3 * (extra + 1), count) @ lifted
-    linear = linear.reshape(batch, 3, extra + 1, 3)
-
+    lifted = transferred.lifted
+    monomials = (lifted[:, _PAIRS[0]] * lifted[:, _PAIRS[1]]).swapaxes(1, 2)
+    quadratic = (by_z[:, :3].reshape(batch, 9, count) @ monomials)[:, :, _ENTRY].reshape(batch, 3, 3, 3, 3)
+    linear = (by_z[:, 3:].reshape(batch, 3 * size, count) @ lifted.swapaxes(1, 2)).reshape(batch, size, 9)
     information = np.empty((batch, 9 + extra, 9 + extra))
     gradient = np.empty((batch, 9 + extra))
-    information[:, :9, :9] = quadratic.reshape(batch, 3, 3, 3, 3).transpose(0, 1, 3, 2, 4).reshape(batch, 9, 9)
-    gradient[:, :9] = linear[:, :, extra].reshape(batch, 9)
+    information[:, :9, :9] = quadratic.transpose(0, 1, 3, 2, 4).reshape(batch, 9, 9)
+    gradient[:, :9] = linear[:, extra]
     if extra:
-        mixed = linear[:, :, :extra].transpose(0, 1, 3, 2).reshape(batch, 9, extra)
-        information[:, :9, 9:] = mixed
-        information[:, 9:, :9] = mixed.swapaxes(1, 2)
-        of_lens = across[:, 3:-1] @ left_across[:, 3:].swapaxes(1, 2) + down[:, 3:-1] @ left_down[:, 3:].swapaxes(1, 2)
+        information[:, 9:, :9] = linear[:, :extra]
+        information[:, :9, 9:] = linear[:, :extra].swapaxes(1, 2)
+        flat = columns.reshape(batch, size, 2 * count)
+        of_lens = left.reshape(batch, size, 2 * count)[:, :extra] @ flat.swapaxes(1, 2)
         information[:, 9:, 9:] = of_lens[:, :, :extra]
         gradient[:, 9:] = of_lens[:, :, extra]
-    return BatchedNormalEquations(cost, information, gradient, squared)
+    return BatchedNormalEquations(cost, information, gradient, np.where(useless, np.inf, transferred.squared))
 
 
 def influence(transferred: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool) -> FloatArray:
     """Each match's share of the gradient by the entries of H and the lens, (B, N, 9 + E)."""
     factor = robust_weight(transferred.squared, scale[:, None])
     factor[~present | transferred.lost] = 0.0
+    columns, by_z, left = _weighted(transferred, factor, free_lens)
+    batch, size, _, count = columns.shape
+    by_h = (by_z[:, -1, :, None] * transferred.lifted[:, None]).reshape(batch, 9, count)
+    by_lens = (columns[:, : size - 1] * left[:, None, -1]).sum(axis=2)
+    return np.ascontiguousarray(np.concatenate([by_h, by_lens], axis=1).swapaxes(1, 2))
+
+
+def _weighted(
+    transferred: TransferDerivatives, factor: FloatArray, free_lens: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The columns that are free, (B, C, 2, N), and their products with the weights and the derivatives of u.
+
+    Returns
+    -------
+    columns : ndarray of shape (B, C, 2, N)
+    by_z : ndarray of shape (B, 3 + C, 3, N)
+        Of ``z`` and the columns with ``z``.
+    left : ndarray of shape (B, C, 2, N)
+        The columns times their weights.
+    """
+    columns = transferred.columns if free_lens else transferred.columns[:, -1:]
     weight = transferred.precision * factor[:, None]
-    xx, xy, yy = weight[:, 0], weight[:, 1], weight[:, 2]
-    dx, dy = transferred.error[:, 0], transferred.error[:, 1]
-    left = np.stack([xx * dx + xy * dy, xy * dx + yy * dy], axis=1)[:, :, None]
-    by_image, by_lens = ((part * left).sum(axis=1) for part in (transferred.by_image, transferred.by_lens))
-    batch, _, count = by_image.shape
-    by_h = (by_image[:, :, None] * transferred.lifted[:, None]).reshape(batch, 9, count)
-    parts = [by_h, by_lens] if free_lens else [by_h]
-    return np.ascontiguousarray(np.concatenate(parts, axis=1).swapaxes(1, 2))
+    batch, size, _, count = columns.shape
+    u, inverse_depth = transferred.image, transferred.inverse_depth[:, None]
+    left = np.empty((batch, size, 2, count))
+    np.multiply(weight[:, None, :2], columns[:, :, :1], out=left)
+    left += weight[:, None, 1:] * columns[:, :, 1:]
+    by_z = np.empty((batch, 3 + size, 3, count))
+    np.multiply(left, inverse_depth[:, None], out=by_z[:, 3:, :2])
+    weight *= inverse_depth**2
+    by_z[:, 0, :2], by_z[:, 1, :2] = weight[:, :2], weight[:, 1:]
+    by_z[:, 2, :2] = weight[:, :2] * -u[:, :1] - weight[:, 1:] * u[:, 1:]
+    last = by_z[:, :, 2]
+    np.multiply(by_z[:, :, 0], -u[:, :1], out=last)
+    last -= by_z[:, :, 1] * u[:, 1:]
+    return columns, by_z, left

@@ -8,17 +8,14 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import OBSERVABLE_STD
-from rdstitch.robust.covariance import covariances
-from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
-from rdstitch.robust.loss import PAIR_WIDTH, RAYLEIGH_MEDIAN
+from rdstitch.robust.loss import loss_width, robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
-from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
+from rdstitch.robust.refinement import Fits, PairEquations, PairProblems, refine_pairs
 
 # Halved or doubled, these change the median error of λ by a sixth at most.
-_MIN_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
 _MAX_RESIDUAL = 3.0  # errors, in thresholds, beyond which a match is left out of the choice
-_FREE_STEPS, _STEPS = 8, 15
+_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -40,7 +37,7 @@ class _Fitted(NamedTuple):
 
     model: PairModel
     fits: Fits
-    equations: BatchedNormalEquations
+    equations: PairEquations
 
 
 @dataclass(frozen=True)
@@ -51,7 +48,7 @@ class PairSelection:
     distortion: FloatArray  # (B,): where to start, or what λ is known to be
     data: Measurements
     tilts: FloatArray | None  # (B, 2, 2): known tilts (ψ, θ) of both images, radians
-    noise: FloatArray  # (B,): standard deviation of the errors per axis, pixels
+    noise: FloatArray | None  # (B,): standard deviation of the errors per axis, pixels; None: as each fit finds it
     threshold: float  # largest transfer error of an inlier, pixels
     fixed_distortion: bool  # whether λ is known
 
@@ -64,14 +61,19 @@ class PairSelection:
             distortion=self.distortion[rows],
             data=self.data.take(rows),
             tilts=tilts,
-            noise=self.noise[rows],
+            noise=None if self.noise is None else self.noise[rows],
         )
 
-    def fit(self, model: PairModel, width: FloatArray, steps: int, *, rough: bool = False) -> _Fitted:
-        """A model fitted to every pair from where it stands, with a loss of the given widths (B,), pixels."""
+    def problems(self, model: PairModel) -> PairProblems:
+        """To fit a model to every pair."""
+        limit = np.full(len(self.data), self.threshold)
+        width = limit if self.noise is None else loss_width(self.noise, limit)
+        return PairProblems(model, self.data, width, self.noise, self.fixed_distortion)
+
+    def fit(self, model: PairModel) -> _Fitted:
+        """A model fitted to every pair from where it stands."""
         start = Fits(model.initialize(self.homography, self.tilts), self.homography, self.distortion)
-        problems = PairProblems(model, self.data, width, self.noise, self.fixed_distortion)
-        return _Fitted(model, *refine_pairs(problems, start, steps, rough=rough))
+        return _Fitted(model, *refine_pairs(self.problems(model), start, _STEPS))
 
     def at(self, fits: Fits) -> Self:
         """Standing at fits."""
@@ -91,26 +93,28 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
     pairs : PairSelection
         ``noise`` is estimated anew.
     """
-    threshold, homography = pairs.threshold, HomographyPairModel()
-    # The search ends near one plane of several; without its own fit a pair with depth keeps a sixth fewer inliers.
-    free = pairs.fit(homography, np.full(len(pairs.data), threshold), _FREE_STEPS, rough=True)
-    errors = free.equations.errors
-    noise = noise_of(errors, threshold)
-    near = replace(pairs.at(free.fits), noise=noise, data=pairs.data.only(errors < _MAX_RESIDUAL * threshold))
-    inliers = np.maximum((errors < threshold).sum(axis=1), 1)
-    width, price = loss_width(noise, threshold), noise**2 * np.log(2 * inliers)
-    freest = near.fit(homography, width, _STEPS)
-    fitted = [*(near.fit(model, width, _STEPS) for model in planar), freest]
-    chosen = np.argmin([each.equations.cost + each.equations.information.shape[1] * price for each in fitted], axis=0)
-    rms = np.stack([rms_of(each.equations.errors, threshold) for each in fitted], axis=1)
+    freest = pairs.fit(HomographyPairModel())
+    errors, noise = freest.equations.errors, freest.equations.noise
+    far = pairs.data.present & ~(errors < _MAX_RESIDUAL * pairs.threshold)
+    near = replace(pairs.at(freest.fits), noise=noise, data=pairs.data.only(~far))
+    fitted = [*(near.fit(model) for model in planar), freest]
+    inliers = np.maximum((errors < pairs.threshold).sum(axis=1), 1)
+    price = noise**2 * np.log(2 * inliers)
+    costs = np.array([each.equations.cost + each.equations.information.shape[1] * price for each in fitted])
+    costs[-1] -= (robust_cost(freest.equations.squared, freest.equations.scale[:, None]) * far).sum(axis=1)
+    chosen = np.argmin(costs, axis=0)
+    rms = np.stack([rms_of(each.equations.errors, pairs.threshold) for each in fitted], axis=1)
     result: dict[int, PairFit] = {}
 
     def finished(index: int, rows: IntArray) -> dict[int, PairFit]:
         model, fits, equations = fitted[index]
-        standing = replace(near.at(fits), noise=noise_of(equations.errors, threshold)).take(rows)
+        fits, standing = fits.take(rows), pairs.at(fits).take(rows)
+        if index < len(planar):  # on all matches, with the noise that it leaves itself
+            equations = standing.problems(model).normal_equations(fits.parameters)
+        else:
+            equations = equations.take(rows)
         reasons = [_explained(fitted, index, rms[row]) for row in rows]
-        chosen_fits = _finished(model, fits.take(rows), standing, pairs.data.take(rows), reasons)
-        return dict(zip(rows.tolist(), chosen_fits, strict=True))
+        return dict(zip(rows.tolist(), _finished(_Fitted(model, fits, equations), standing, reasons), strict=True))
 
     for index in range(len(fitted)):
         rows = np.flatnonzero(chosen == index)
@@ -125,60 +129,38 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
     return [result[row] for row in range(len(pairs.data))]
 
 
-def _finished(
-    model: PairModel, fits: Fits, near: PairSelection, data: Measurements, reasons: list[str]
-) -> Iterator[PairFit]:
+def _finished(fitted: _Fitted, pairs: PairSelection, reasons: list[str]) -> Iterator[PairFit]:
     """The chosen model with its covariance, and without λ where that is not observable.
 
     Parameters
     ----------
-    model : PairModel
-    fits : Fits
-    near : PairSelection
-        Standing at the fits; with the matches that the choice was made by.
-    data : Measurements
-        All matches.
+    fitted : _Fitted
+        To all matches.
+    pairs : PairSelection
+        Standing at the fits.
     reasons : list of str
         Why this model was chosen, for each pair.
     """
-    errors, covariance = _inspected(model, fits, near, data)
-    std = np.zeros(len(data)) if near.fixed_distortion else np.sqrt(covariance[:, 0, 0])
-    known = [(fits, row, errors[row], covariance[row], std[row], reason) for row, reason in enumerate(reasons)]
+    found = [_described(fitted, pairs)]
+    std = np.zeros(len(reasons)) if pairs.fixed_distortion else np.sqrt(found[0][2][:, 0, 0])
+    known = [(0, row, deviation, reason) for row, (deviation, reason) in enumerate(zip(std, reasons, strict=True))]
     unseen = np.flatnonzero(~(std < OBSERVABLE_STD))
     if len(unseen):
-        level = replace(near.take(unseen), distortion=np.zeros(len(unseen)), fixed_distortion=True)
-        straight = level.fit(model, loss_width(level.noise, near.threshold), _STEPS).fits
-        errors, covariance = _inspected(model, straight, level, data.take(unseen))
+        level = replace(pairs.take(unseen), distortion=np.zeros(len(unseen)), fixed_distortion=True)
+        found.append(_described(level.fit(fitted.model), level))
         for index, row in enumerate(unseen.tolist()):
             why = f"{reasons[row]}; λ is not observable (standard deviation {std[row]:.2g}) and was set to 0"
-            known[row] = straight, index, errors[index], covariance[index], np.inf, why
-    for fit, k, error, spread, deviation, why in known:
-        distortion = float(fit.distortion[k])
-        yield PairFit(model, fit.state[k], fit.homography[k], distortion, error, spread, float(deviation), why)
+            known[row] = 1, index, np.inf, why
+    for which, row, deviation, why in known:
+        fits, errors, covariance = found[which]
+        distortion, state, homography = float(fits.distortion[row]), fits.state[row], fits.homography[row]
+        yield PairFit(fitted.model, state, homography, distortion, errors[row], covariance[row], float(deviation), why)
 
 
-def _inspected(model: PairModel, fits: Fits, pairs: PairSelection, data: Measurements) -> tuple[FloatArray, FloatArray]:
-    """Errors and covariances of fits as they stand, on all matches."""
-    width = loss_width(pairs.noise, pairs.threshold)
-    problems = PairProblems(model, data, width, pairs.noise, pairs.fixed_distortion)
-    equations, shares = problems.inspect(fits.parameters)
-    return equations.errors, covariances(equations.information, shares, pairs.noise, data)
-
-
-def noise_of(errors: FloatArray, threshold: float) -> FloatArray:
-    """Standard deviations per axis, pixels, (B,), from the median of the errors (B, N) below the threshold."""
-    inside = errors < threshold
-    count = inside.sum(axis=1)
-    ordered = np.sort(np.where(inside, errors, np.inf), axis=1)
-    middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
-    middle = np.minimum(middle, errors.shape[1] - 1)
-    median = np.take_along_axis(ordered, middle, axis=1).mean(axis=1)
-    return np.where(count > 0, np.maximum(median / RAYLEIGH_MEDIAN, _MIN_NOISE), _MIN_NOISE)
-
-
-def loss_width(noise: FloatArray, threshold: float) -> FloatArray:
-    """Scales of the loss, pixels, for errors of these standard deviations per axis."""
-    return np.minimum(threshold, PAIR_WIDTH * noise)
+def _described(fitted: _Fitted, pairs: PairSelection) -> tuple[Fits, FloatArray, FloatArray]:
+    """Fits with their errors and covariances."""
+    model, fits, equations = fitted
+    return fits, equations.errors, pairs.problems(model).covariances(fits.parameters, equations)
 
 
 def rms_of(errors: FloatArray, threshold: float) -> FloatArray:

@@ -6,7 +6,7 @@ and the distortion centre, which both images share, are free too.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,17 +14,14 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import LENS_STD
 from rdstitch.nearest_points import nearest_points
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.robust.covariance import covariances
 from rdstitch.robust.levenberg_marquardt import descend
 from rdstitch.robust.measurements import Measurements
-from rdstitch.robust.model_selection import loss_width, noise_of
 from rdstitch.robust.pair_models import HomographyPairModel
 from rdstitch.robust.refinement import PairProblems
 
 _HOMOGRAPHY = HomographyPairModel()
 _OWN_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of image 1, λ of image 2, μ, and the distortion centre
-_ITERATIONS = 10
-_ROUNDS = 2  # what one λ leaves is no measure of the noise
+_ITERATIONS = 20
 
 
 @dataclass(frozen=True)
@@ -54,19 +51,13 @@ def own_lenses(relations: Sequence[RadialHomography], data: Measurements, thresh
     parameters[:, :2] = [[relation.distortion] * 2 for relation in relations]
     parameters[:, lens:] = _HOMOGRAPHY.initialize(np.stack([relation.homography for relation in relations]))
     with np.errstate(all="ignore"):  # a step may leave the domain of the lens model
-        problems = PairProblems(_HOMOGRAPHY, data, np.full(count, threshold), np.ones(count), lens_std=_OWN_STD)
-        equations = problems.normal_equations(parameters)
-        for _ in range(_ROUNDS):
-            noise = noise_of(equations.errors, threshold)
-            problems = replace(problems, scale=loss_width(noise, threshold), noise=noise)
-            parameters, equations = descend(problems, parameters, _ITERATIONS)
-        noise = noise_of(equations.errors, threshold)
-        covariance = covariances(equations.information, problems.inspect(parameters)[1], noise, data)
-        left = problems.transfer(parameters)
-        inliers = data.present & ~left.lost & (left.squared < loss_width(noise, threshold)[:, None] ** 2)
+        problems = PairProblems(_HOMOGRAPHY, data, np.full(count, threshold), lens_std=_OWN_STD)
+        parameters, equations = descend(problems, parameters, _ITERATIONS)
+        covariance = problems.covariances(parameters, equations)
+        inliers = equations.squared < equations.scale[:, None] ** 2
     coherence = [
         _coherence(points[:, row].T, errors[:, row].T)
-        for points, errors, row in zip(data.x1, left.error, inliers, strict=True)
+        for points, errors, row in zip(data.x1, equations.transferred.columns[:, -1], inliers, strict=True)
     ]
     return [
         OwnLenses(row[:2], known[:2, :2], shared)

@@ -20,8 +20,8 @@ from rdstitch.robust.verification import MIN_PLACES
 from rdstitch.solvers.solutions import Solutions
 
 # Halved or doubled, none of these changes what is found, only the time.
-_FIRST_BATCH, _SECOND_BATCH = 64, 160  # samples of five points; then of each solver: three of 60 % outliers need 140
-_MAX_BATCH = 512
+_FIRST_BATCH, _MAX_BATCH = 48, 512  # samples a turn; every turn has twice as many as the one before
+_ALONE = 512  # samples up to which the solver that assumes least goes on alone if it needs no more
 _SAMPLES_AT_ONCE = 4096
 _MIN_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before
 _QUICK_SCORE = 128  # matches on which hypotheses are compared before the best are scored on all
@@ -29,6 +29,7 @@ _SOLVER_SUCCESS = 0.8  # share of all-inlier samples that lead to the model, in 
 _NOVELTY = 0.1  # share of a hypothesis's inliers that must be new for it to be worth optimising
 _FREE_REFINEMENT = 12  # inliers from which on refinement may leave the model that the minimal solver assumes
 _LOCAL_STEPS = 4
+_GOLDEN = 0.618034  # its multiples are spread evenly, whatever their number
 
 
 @dataclass
@@ -87,7 +88,7 @@ def ransac(
     """Search the model that explains most matches of each pair, with all solvers taking turns.
 
     The last solver, which assumes least, begins; most pairs need no other. Solvers with fewer points need fewer samples
-    but assume more of the motion: they join where that is not enough. All share the best model so far, so that as soon
+    but assume more of the motion: they join where it would need many. All share the best model so far, so that as soon
     as one of them is confident, and each has explored a little, the pair is done.
 
     Parameters
@@ -101,25 +102,25 @@ def ransac(
         Known tilts (ψ, θ) of both images, radians.
     options : EstimationOptions
     """
-    quick = _subset(data, options.seed)
+    quick = _subset(data)
     lanes = [_Lane(solver, data, quick, ordered, tilts, options, index) for index, solver in enumerate(solvers)]
     best = Hypotheses.none(data)
     confident = np.zeros(len(data), dtype=np.bool_)
     active = np.arange(len(data))
-    turns, batch = lanes[-1:], _FIRST_BATCH
+    batch, hard = _FIRST_BATCH, active[:0]
     while len(active):
-        for lane in turns:
+        for lane, rows in [*((lane, hard) for lane in lanes[:-1]), (lanes[-1], active)]:
             left = options.max_iterations - int(np.sum([lane.drawn[active] for lane in lanes], axis=0).max())
-            lane.advance(best, active[lane.drawn[active] < lane.needed(best, active, explore=True)], min(batch, left))
+            lane.advance(best, rows[lane.drawn[rows] < lane.needed(best, rows, explore=True)], min(batch, left))
         needed = np.stack([lane.needed(best, active) for lane in lanes])
         drawn = np.stack([lane.drawn[active] for lane in lanes])
         explored = (drawn >= np.minimum(_MIN_EXPLORATION, needed)).all(axis=0)
         # Where the solver that assumes least is confident, nothing is left to explore.
         sure = (drawn[-1] >= needed[-1]) | (explored & (drawn >= needed).any(axis=0))
         confident[active[sure]] = True
-        active = active[~sure & (drawn.sum(axis=0) < options.max_iterations)]
-        batch = _SECOND_BATCH if turns is not lanes else min(2 * batch, _MAX_BATCH)
-        turns = lanes
+        going = ~sure & (drawn.sum(axis=0) < options.max_iterations)
+        active, hard = active[going], active[going & (needed[-1] > _ALONE)]
+        batch = min(2 * batch, _MAX_BATCH)
     return Search(best, np.sum([lane.drawn for lane in lanes], axis=0), confident)
 
 
@@ -226,9 +227,7 @@ class _Lane:
         self, start: Hypotheses, data: Measurements, rows: IntArray, model: PairModel, scale: float
     ) -> Hypotheses:
         """The start or its refinement, whichever is better."""
-        problems = PairProblems(
-            model, data, np.full(len(data), scale), np.ones(len(data)), self.solver.fixed_distortion
-        )
+        problems = PairProblems(model, data, np.full(len(data), scale), None, self.solver.fixed_distortion)
         state = model.initialize(start.homography, None if self.tilts is None else self.tilts[rows])
         begin = Fits(state, start.homography, start.distortion)
         fits, _ = refine_pairs(problems, begin, _LOCAL_STEPS, rough=True)
@@ -239,12 +238,13 @@ class _Lane:
         return result
 
 
-def _subset(data: Measurements, seed: int) -> Measurements:
+def _subset(data: Measurements) -> Measurements:
     """At most ``_QUICK_SCORE`` matches of each pair, spread over its list, to compare many hypotheses by."""
     if data.present.shape[1] <= _QUICK_SCORE:
         return data
-    jitter = np.random.default_rng([seed, 1 << 20]).random(_QUICK_SCORE)
-    places = ((np.arange(_QUICK_SCORE) + jitter) * (data.count[:, None] / _QUICK_SCORE)).astype(np.intp)
+    number = np.arange(_QUICK_SCORE)
+    jitter = number * _GOLDEN % 1.0
+    places = ((number + jitter) * (data.count[:, None] / _QUICK_SCORE)).astype(np.intp)
     few = data.count <= _QUICK_SCORE
-    places[few] = np.arange(_QUICK_SCORE)
+    places[few] = number
     return data.at(places)

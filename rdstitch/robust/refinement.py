@@ -7,8 +7,10 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.division_model import MAX_ABS_DISTORTION
+from rdstitch.robust.covariance import covariances
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, descend
 from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
+from rdstitch.robust.loss import loss_width, noise_of, robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 
@@ -29,17 +31,33 @@ class Fits(Rows):
         return np.column_stack([self.distortion, self.state])
 
 
+@dataclass
+class PairEquations(BatchedNormalEquations):
+    """The equations of B pairs, and what they were made from."""
+
+    scale: FloatArray  # (B,): of the loss, pixels
+    noise: FloatArray  # (B,): standard deviation of the errors per axis, pixels
+    transferred: TransferDerivatives
+
+    @property
+    def unit(self) -> FloatArray:
+        """The variance of the errors."""
+        return self.noise**2
+
+
 @dataclass(frozen=True)
 class PairProblems:
     """Refinement of B pairs as problems of least squares.
 
     Parameters are ``(λ, state)``; where ``lens_std`` is given, ``(λ of image 1, λ of image 2, μ, centre, state)``.
+    Where no noise is given, it follows from the errors, and the width of the loss from it: the loss becomes narrow as
+    the fit becomes good.
     """
 
     model: PairModel
     data: Measurements
-    scale: FloatArray  # (B,): of the loss, pixels
-    noise: FloatArray  # (B,): standard deviation of the errors per axis, pixels
+    scale: FloatArray  # (B,): of the loss, pixels; without ``noise`` the largest
+    noise: FloatArray | None = None  # (B,): standard deviation of the errors per axis, pixels
     fixed_distortion: bool = False  # whether λ is known
     lens_std: FloatArray | None = None  # (5,): standard deviations of the priors of the lens
 
@@ -50,7 +68,8 @@ class PairProblems:
 
     def take(self, rows: BoolArray | IntArray) -> Self:
         """Some of them."""
-        return replace(self, data=self.data.take(rows), scale=self.scale[rows], noise=self.noise[rows])
+        noise = None if self.noise is None else self.noise[rows]
+        return replace(self, data=self.data.take(rows), scale=self.scale[rows], noise=noise)
 
     def transfer(self, parameters: FloatArray) -> TransferDerivatives:
         """The matches transferred, with derivatives by the entries of H and the lens."""
@@ -58,17 +77,18 @@ class PairProblems:
         lenses = PairLenses(lens[0]) if self.lens_std is None else PairLenses(lens[0], lens[1], lens[2], lens[3:].T)
         return differentiate(self.model.homography(parameters[:, -_STATE:]), lenses, self.data)
 
-    def normal_equations(self, parameters: FloatArray) -> BatchedNormalEquations:
+    def normal_equations(self, parameters: FloatArray) -> PairEquations:
         """Loss, normal matrix and gradient."""
-        return self._equations(self.transfer(parameters), parameters, self.chain(parameters))
-
-    def _equations(
-        self, transferred: TransferDerivatives, parameters: FloatArray, chain: FloatArray
-    ) -> BatchedNormalEquations:
-        entries = entry_equations(transferred, self.data.present, self.scale, self.free > 0)
+        transferred, chain = self.transfer(parameters), self.chain(parameters)
+        scale, noise = self.scale, self.noise
+        squared = np.where(transferred.lost | ~self.data.present, np.inf, transferred.squared)
+        if noise is None:
+            noise = noise_of(np.sqrt(squared), scale, chain.shape[2])
+            scale = loss_width(noise, scale)
+        entries = entry_equations(transferred, self.data.present, scale, self.free > 0)
         information = np.swapaxes(chain, 1, 2) @ entries.information @ chain
-        gradient = np.einsum("bkp,bk->bp", chain, entries.gradient)
-        cost, weight = entries.cost, self.noise**2
+        gradient = (entries.gradient[:, None] @ chain)[:, 0]
+        cost, weight = entries.cost, noise**2
         residual, by_state = self.model.prior(parameters[:, -_STATE:])
         if residual.shape[1]:
             information[:, self.free :, self.free :] += weight[:, None, None] * (by_state.T @ by_state)
@@ -79,7 +99,15 @@ class PairProblems:
             information[:, : self.free, : self.free] += weight[:, None, None] * np.diag(self.lens_std**-2.0)
             gradient[:, : self.free] += weight[:, None] * lens / self.lens_std
             cost = cost + weight * (lens**2).sum(axis=1)
-        return BatchedNormalEquations(cost, information, gradient, entries.squared)
+        return PairEquations(cost, information, gradient, entries.squared, scale, noise, transferred)
+
+    def cost(self, before: PairEquations, after: PairEquations) -> FloatArray:
+        """Loss of ``before`` with the width of ``after``."""
+        if self.noise is not None:
+            return before.cost
+        change, unchanged = (robust_cost(before.squared, each.scale[:, None]) for each in (after, before))
+        result: FloatArray = before.cost + ((change - unchanged) * self.data.present).sum(axis=1)
+        return result
 
     def chain(self, parameters: FloatArray) -> FloatArray:
         """Derivative of the entries of H and the lens by the lens and the model's parameters, (B, 9 + E, E + P)."""
@@ -97,11 +125,11 @@ class PairProblems:
         possible = within & np.isfinite(moved).all(axis=1)
         return np.where(possible[:, None], moved, parameters), possible
 
-    def inspect(self, parameters: FloatArray) -> tuple[BatchedNormalEquations, FloatArray]:
-        """The equations, and each match's share of the gradient, (B, N, P)."""
-        transferred, chain = self.transfer(parameters), self.chain(parameters)
-        shares = influence(transferred, self.data.present, self.scale, self.free > 0) @ chain
-        return self._equations(transferred, parameters, chain), shares
+    def covariances(self, parameters: FloatArray, equations: PairEquations) -> FloatArray:
+        """Of the parameters where they stand, (B, P, P)."""
+        shares = influence(equations.transferred, self.data.present, equations.scale, self.free > 0)
+        chain = self.chain(parameters)
+        return covariances(equations.information, shares, chain, equations.noise, self.data)
 
 
 @np.errstate(all="ignore")  # a step may leave the domain of the lens model
@@ -111,7 +139,7 @@ def refine_pairs(
     iterations: int,
     *,
     rough: bool = False,
-) -> tuple[Fits, BatchedNormalEquations]:
+) -> tuple[Fits, PairEquations]:
     """Fit the model and λ by at most so many steps; the fits, and the equations there.
 
     Parameters

@@ -7,8 +7,16 @@ import pytest
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, damping_by_gain, descend
-from rdstitch.robust.loss import PAIR_WIDTH, RAYLEIGH_MEDIAN, loss_ratio, robust_cost, robust_weight
-from rdstitch.robust.model_selection import loss_width, noise_of, rms_of
+from rdstitch.robust.loss import (
+    PAIR_WIDTH,
+    RAYLEIGH_MEDIAN,
+    loss_ratio,
+    loss_width,
+    noise_of,
+    robust_cost,
+    robust_weight,
+)
+from rdstitch.robust.model_selection import rms_of
 from rdstitch.robust.similarity_fit import fit_similarity
 
 SQUARED = np.array([0.0, 1.0, 4.0, 36.0, np.inf])
@@ -42,6 +50,8 @@ def test_the_noise_is_that_of_the_median_below_the_threshold() -> None:
     np.testing.assert_allclose(noise_of(known, 10.0), [2.0 / 1.1774, 2.5 / 1.1774, 0.02, 1.5 / 1.1774])
     np.testing.assert_allclose(noise_of(np.full((1, 9), 1e-3), 10.0), 0.02)
     np.testing.assert_allclose(noise_of(np.array([[1.0, 2.0, 4.0]]), 10.0), 2.0 / 1.1774)
+    # Six numbers to which two parameters were fitted have four degrees of freedom.
+    np.testing.assert_allclose(noise_of(np.array([[1.0, 2.0, 4.0]]), 10.0, 2), np.sqrt(6 / 4) * 2.0 / 1.1774)
 
 
 def test_the_loss_is_no_wider_than_the_threshold() -> None:
@@ -62,6 +72,14 @@ def test_an_error_at_the_threshold_is_outside(threshold: float) -> None:
     assert noise_of(errors, threshold) == pytest.approx(max(0.5 * threshold / 1.1774, 0.02))
 
 
+class _ValleyEquations(BatchedNormalEquations):
+    """Noise of a hundredth of the loss at the bottom."""
+
+    @property
+    def unit(self) -> FloatArray:
+        return np.full(len(self.cost), 1e-4)
+
+
 @dataclass(frozen=True)
 class _Valleys:
     """Losses ``floor + (x² - 1)²`` of one parameter, and how often each was evaluated."""
@@ -73,12 +91,15 @@ class _Valleys:
     def take(self, rows: BoolArray | IntArray) -> "_Valleys":
         return _Valleys(self.floor[rows], self.number[rows], self.evaluations)
 
-    def normal_equations(self, parameters: FloatArray) -> BatchedNormalEquations:
+    def normal_equations(self, parameters: FloatArray) -> _ValleyEquations:
         self.evaluations[self.number] += 1
         x = parameters[:, 0]
         residual, slope = x**2 - 1.0, 2.0 * x
         cost, information, gradient = self.floor + residual**2, (slope**2)[:, None, None], (slope * residual)[:, None]
-        return BatchedNormalEquations(cost, information, gradient, (residual**2)[:, None])
+        return _ValleyEquations(cost, information, gradient, (residual**2)[:, None])
+
+    def cost(self, before: _ValleyEquations, after: _ValleyEquations) -> FloatArray:
+        return before.cost
 
     def retract(self, parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
         return parameters + step, np.ones(len(step), dtype=np.bool_)
@@ -98,7 +119,7 @@ def test_descents_in_lockstep_do_not_notice_each_other() -> None:
 
 def test_what_is_only_a_start_takes_fewer_steps() -> None:
     valley = _Valleys(np.ones(1), np.arange(1), np.zeros(1, dtype=np.intp))
-    start = np.full((1, 1), 1.01)
+    start = np.full((1, 1), 1.003)
     assert descend(valley, start, 30, rough=True)[0] == start
     assert abs(descend(valley, start, 30)[0] - 1.0) < 1e-3
 
