@@ -8,6 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import (
+    MIN_GAIN,
+    ROUGH_GAIN,
     WIDEST_START,
     BundleAdjuster,
     BundleAdjustmentResult,
@@ -25,7 +27,6 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.division_model import undistort
 from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.radial_homography import RadialHomography, transfer
-from rdstitch.robust.levenberg_marquardt import MIN_GAIN, ROUGH_GAIN
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 from rdstitch.solvers.homography import direct_linear
 

@@ -14,7 +14,7 @@ from rdstitch.alignment.adjustment_problem import (
 )
 from rdstitch.alignment.attitude_check import check_attitudes
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
-from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
+from rdstitch.alignment.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, noise_of_links
@@ -33,7 +33,6 @@ from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.matching.links import Link, in_alternate_directions
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.robust.levenberg_marquardt import MIN_GAIN, PAIR_GAIN
 
 _UNCONFIRMED = 0.1
 """What the matches count in the spanning tree of a link without a consistent triangle, relative to one with."""
@@ -125,7 +124,7 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
     wrong, confirmed = cycle_consistency(apart, few, len(cameras))
     trust = _trust(few, confirmed)
     reference = -1 if options.reference is None else options.reference
-    whole = Problem(few, relations, trust, len(cameras), reference, lens, free_lens, known, min_gain=PAIR_GAIN)
+    whole = Problem(few, relations, trust, len(cameras), reference, lens, free_lens, known, min_gain=FEW_GAIN)
     problem, images = whole.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     problem = replace(

@@ -24,12 +24,17 @@ from rdstitch.alignment.normal_equations import PoseBlocks, SparseNormalEquation
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors, costs, curvatures, slopes
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, MIN_GAIN, damping_by_gain
+from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
+
+MIN_GAIN = 1e-5
+"""Expected relative fall of the loss that is worth another step: a hundredth of the noise."""
+
+FEW_GAIN, ROUGH_GAIN = 1e-4, 1e-3
+"""The same of a few matches of each pair; and where another descent goes on from there."""
 
 _MIN_SIGMA = 1e-3
 """Pixels; a smaller one is not measurable, and errors are divided by it."""
-
 
 WIDEST_START = 0.05
 """Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is down-weighted."""

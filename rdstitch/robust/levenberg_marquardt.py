@@ -7,12 +7,6 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 
-MIN_GAIN = 1e-5
-"""Expected relative fall of the loss of all images that is worth another step: a hundredth of the noise."""
-
-PAIR_GAIN = 1e-4
-"""The same of a few matches of each pair."""
-
 SHORT_STEP, ROUGH_STEP = 0.3, 1.0
 """Standard deviations of the parameters, all together, of a step that is not worth taking; and where another descent
 goes on from there."""
