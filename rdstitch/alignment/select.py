@@ -135,7 +135,7 @@ class Posterior:
 
     @property
     def tolerable(self) -> float:
-        """Shared errors up to which a turn is taken in place of a plane with an absurd layout, pixels."""
+        """Shared errors up to which another model is taken in place of one with an absurd layout, pixels."""
         return math.hypot(_TOLERABLE * self.evidence.farthest, self.evidence.noise)
 
     def cost(self, adjusted: BundleAdjustmentResult) -> ErrorCost:
@@ -242,13 +242,13 @@ def _with_wider_lenses(
 
 
 def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
-    """The one with the best score; where a plane has an absurd layout, a turn that joins the images."""
+    """The one with the best score; where its layout is absurd, a turn, or else another, that joins the images."""
     cameras = [one for one in tried if one.fit.model.one_camera]
     free = [one for one in tried if not one.fit.model.one_camera]
     best = min(cameras or free, key=_score)
-    turns = [one for one in tried if one.fit.model.on_sphere and one.field < posterior.tolerable]
-    if best.absurd and turns:
-        return turns[0]
+    kept = [one for one in tried if not one.absurd and one.field < posterior.tolerable]
+    if best.absurd and kept:
+        return min([one for one in kept if one.fit.model.on_sphere] or kept, key=_score)
     return min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Problem
-from rdstitch.alignment.motion_models import PSI, RIGID, ROTATION, MotionModel
+from rdstitch.alignment.motion_models import PSI, RIGID, ROTATION, SIMILARITY, MotionModel
 from rdstitch.alignment.select import Hypothesis, ModelChoice, Posterior, _best, select_model
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
@@ -123,8 +123,13 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
     assert [message.severity for message in lens.messages if "depth" in message.text] == ["failure"]
 
 
-@pytest.mark.parametrize(("field", "chosen"), [(1.1, "rotation"), (1.5, "rigid")])
-def test_instead_of_an_absurd_plane_a_turn_may_leave_what_seams_hide_and_the_noise(field: float, chosen: str) -> None:
+@pytest.mark.parametrize(
+    ("turn", "similarity", "chosen"),
+    [(1.1, 1.1, "rotation"), (1.5, 1.1, "similarity"), (1.5, 1.5, "rigid")],
+)
+def test_instead_of_an_absurd_plane_others_may_leave_what_seams_hide_and_the_noise(
+    turn: float, similarity: float, chosen: str
+) -> None:
     problem: Any = SimpleNamespace(count=2)
     posterior = Posterior(problem)
     # A quarter of 4 px, and the noise: 1.17 px.
@@ -134,8 +139,12 @@ def test_instead_of_an_absurd_plane_a_turn_may_leave_what_seams_hide_and_the_noi
         fit: Any = SimpleNamespace(model=model)
         return Hypothesis(fit, score, field, absurd)
 
-    plane, turn = hypothesis(RIGID, 0.0, 0.5, absurd=True), hypothesis(ROTATION, 60.0, field, absurd=False)
-    assert _best(posterior, [turn, plane]).fit.model.name == chosen
+    tried = [
+        hypothesis(ROTATION, 60.0, turn, absurd=False),
+        hypothesis(RIGID, 0.0, 0.5, absurd=True),
+        hypothesis(SIMILARITY, 30.0, similarity, absurd=False),
+    ]
+    assert _best(posterior, tried).fit.model.name == chosen
 
 
 def test_a_model_that_was_requested_is_taken() -> None:

@@ -20,9 +20,11 @@ LENS = Camera((640, 480), -0.2, focal=520.0)
 
 @pytest.mark.parametrize(("count", "votes"), [(20, 0), (29, 0), (30, 1), (120, 1)])
 def test_few_inliers_have_no_vote(count: int, votes: int) -> None:
-    points1 = np.random.default_rng(count).uniform((150.0, 100.0), (490.0, 380.0), (count, 2))
+    rng = np.random.default_rng(count)
+    points1 = rng.uniform((150.0, 100.0), (490.0, 380.0), (count, 2))
     flat = LENS.undistort(points1)
     points2 = LENS.distort(flat @ np.array([[0.96, 0.28], [-0.28, 0.96]]).T + (-130.0, 110.0))
+    points2 += rng.normal(scale=0.1, size=points2.shape)
     relation = estimate_radial_homography(points1, points2, LENS.image_size, focal=520.0)
     assert relation.inliers.all()
     indices = np.repeat(np.arange(count)[:, None], 2, axis=1)
