@@ -101,7 +101,12 @@ class Hypothesis:
     fit: Fit
     score: float  # -2 log of the posterior, up to a constant of the problem
     field: float  # size of what the errors of neighbours share, pixels of a coordinate
-    absurd: bool  # whether nobody would keep its layout
+    stretch: float  # of its layout: the ratio of areas, inf where images are folded; 1 where no layout is asked for
+
+    @property
+    def absurd(self) -> bool:
+        """Whether nobody would keep its layout."""
+        return not self.stretch <= MAX_STRETCH
 
 
 @dataclass(frozen=True)
@@ -153,8 +158,8 @@ class Posterior:
         score = errors_cost.cost + self.price(fit.model, fit.free_lens, errors_cost.count) + wide + priors
         if fit.model.on_sphere != self.prefer_turn:
             score += _PREFERENCE
-        absurd = self.layout_matters and not stretch(fit) <= MAX_STRETCH
-        return Hypothesis(fit, score if has_plausible_focal(fit) else math.inf, errors_cost.field, absurd)
+        layout = stretch(fit) if self.layout_matters else 1.0
+        return Hypothesis(fit, score if has_plausible_focal(fit) else math.inf, errors_cost.field, layout)
 
     def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
@@ -242,13 +247,14 @@ def _with_wider_lenses(
 
 
 def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
-    """The one with the best score; where its layout is absurd, a turn, or else another, that joins the images."""
+    """The one with the best score; where its layout is absurd, a turn that joins the images; if folded, any other."""
     cameras = [one for one in tried if one.fit.model.one_camera]
     free = [one for one in tried if not one.fit.model.one_camera]
     best = min(cameras or free, key=_score)
     kept = [one for one in tried if not one.absurd and one.field < posterior.tolerable]
-    if best.absurd and kept:
-        return min([one for one in kept if one.fit.model.on_sphere] or kept, key=_score)
+    turns = [one for one in kept if one.fit.model.on_sphere]
+    if best.absurd and (turns or (kept and math.isinf(best.stretch))):
+        return min(turns or kept, key=_score)
     return min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
 
 

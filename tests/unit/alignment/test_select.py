@@ -1,5 +1,6 @@
 """Turn, plane or neither: what is chosen, on matches of known motions."""
 
+import math
 from dataclasses import replace
 from importlib import import_module
 from types import SimpleNamespace
@@ -124,25 +125,30 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
 
 
 @pytest.mark.parametrize(
-    ("turn", "similarity", "chosen"),
-    [(1.1, 1.1, "rotation"), (1.5, 1.1, "similarity"), (1.5, 1.5, "rigid")],
+    ("stretch", "turn", "similarity", "chosen"),
+    [
+        (20.0, 1.1, 1.1, "rotation"),
+        (20.0, 1.5, 1.1, "rigid"),
+        (math.inf, 1.5, 1.1, "similarity"),
+        (math.inf, 1.5, 1.5, "rigid"),
+    ],
 )
 def test_instead_of_an_absurd_plane_others_may_leave_what_seams_hide_and_the_noise(
-    turn: float, similarity: float, chosen: str
+    stretch: float, turn: float, similarity: float, chosen: str
 ) -> None:
     problem: Any = SimpleNamespace(count=2)
     posterior = Posterior(problem)
     # A quarter of 4 px, and the noise: 1.17 px.
     vars(posterior)["evidence"] = SimpleNamespace(farthest=4.0, noise=0.6)
 
-    def hypothesis(model: MotionModel, score: float, field: float, *, absurd: bool) -> Hypothesis:
+    def hypothesis(model: MotionModel, score: float, field: float, ratio: float) -> Hypothesis:
         fit: Any = SimpleNamespace(model=model)
-        return Hypothesis(fit, score, field, absurd)
+        return Hypothesis(fit, score, field, ratio)
 
     tried = [
-        hypothesis(ROTATION, 60.0, turn, absurd=False),
-        hypothesis(RIGID, 0.0, 0.5, absurd=True),
-        hypothesis(SIMILARITY, 30.0, similarity, absurd=False),
+        hypothesis(ROTATION, 60.0, turn, 1.0),
+        hypothesis(RIGID, 0.0, 0.5, stretch),
+        hypothesis(SIMILARITY, 30.0, similarity, 2.0),
     ]
     assert _best(posterior, tried).fit.model.name == chosen
 
