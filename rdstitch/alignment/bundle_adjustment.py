@@ -227,13 +227,13 @@ class BundleAdjuster:
                 continue
             trial, after = parameters.retract(self.model, step_poses, step_shared, self.free.lens), np.inf
             if not folds(trial.lens, self.observations.reach):
-                there = self._homographies(trial)
-                tried = trial_errors(self.observations, there, trial.lens, state.equations.whitening)
-                after = self._cost(trial, tried, sigma, width)
+                homographies = self._homographies(trial)
+                trial_error = trial_errors(self.observations, homographies, trial.lens, state.equations.whitening)
+                after = self._cost(trial, trial_error, sigma, width)
             used += 1
             damping, failures = damping_by_gain(damping, failures, float((cost - after) / predicted))
             if after < cost:
-                parameters, errors, moved = trial, tried, True
+                parameters, errors, moved = trial, trial_error, True
             elif damping > MAX_DAMPING:
                 return _Descent(parameters, errors, damping, used, True)
         return _Descent(parameters, errors, damping, used, False)

@@ -34,7 +34,6 @@ class LinkEquations:
 
     gram: FloatArray  # (L, 9 + K, 9 + K): ``Σ w J'J`` by the entries of H and the K free parameters of the lens
     gradient: FloatArray  # (L, 9 + K): ``Σ w J'r``
-    squared: FloatArray  # (M,): ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred
     whitening: FloatArray  # (M, 2, 2): what makes r of an error in normalized coordinates
     errors: FloatArray  # (M, 2): whitened, pixels; NaN where there is no transfer
 
@@ -61,15 +60,15 @@ def link_equations(
     """
     count, total = len(observations.points1), 10 + int(free_lens.sum())
     sums = np.zeros((len(observations), total, total))
-    squared, errors, whitening = np.empty(count), np.empty((2, count)), np.empty((2, 2, count))
+    errors, whitening = np.empty((2, count)), np.empty((2, 2, count))
     for first, last in observations.chunks:
         rows = slice(observations.start[first], observations.start[last])
         transferred = _transferred(observations, homographies, lens, first, last)
-        squared[rows], errors[:, rows] = squared_lengths(transferred.whitened.T), transferred.whitened
-        whitening[:, :, rows] = transferred.whitening.transpose(1, 2, 0)
+        errors[:, rows], whitening[:, :, rows] = transferred.whitened, transferred.whitening.transpose(1, 2, 0)
+        root = np.sqrt(robust_weight(squared_lengths(transferred.whitened.T), width))
         edges = observations.start[first : last + 1] - observations.start[first]
-        sums[first:last] = _link_sums(transferred, np.sqrt(robust_weight(squared[rows], width)), free_lens, edges)
-    return LinkEquations(sums[:, :-1, :-1], sums[:, :-1, -1], squared, whitening.transpose(2, 0, 1), errors.T)
+        sums[first:last] = _link_sums(transferred, root, free_lens, edges)
+    return LinkEquations(sums[:, :-1, :-1], sums[:, :-1, -1], whitening.transpose(2, 0, 1), errors.T)
 
 
 def whitened_errors(observations: Observations, homographies: FloatArray, lens: FloatArray) -> FloatArray:

@@ -73,15 +73,16 @@ def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: flo
 @pytest.mark.parametrize("free", [ONE_LENS, FREE_LENS, np.zeros(5, dtype=np.bool_)], ids=["one", "all", "none"])
 def test_sums_of_a_link_are_those_of_its_jacobian(free: np.ndarray) -> None:
     truth = _scene()
-    seen, lens, width = Observations.from_links(truth.links[:1], truth.cameras), np.array([-0.2, 0.05, 0, 0.01, 0]), 9.0
+    observations = Observations.from_links(truth.links[:1], truth.cameras)
+    lens, width = np.array([-0.2, 0.05, 0, 0.01, 0]), 9.0
     behind = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.0], [-2.0, 0.0, 1.0]])  # some of the correspondences
-    found = link_equations(seen, behind[None], lens, width, free)
-    by = transfer_jacobian(behind, lens[0], seen.points1 - lens[3:], (0.05, 0.0))
+    found = link_equations(observations, behind[None], lens, width, free)
+    by = transfer_jacobian(behind, lens[0], observations.points1 - lens[3:], (0.05, 0.0))
     jacobian = np.concatenate([by.by_homography, by.by_lens(free).transpose(2, 0, 1)], axis=2)
-    there = np.isfinite(found.squared)
-    assert 0 < there.sum() < len(there)
-    jacobian, error = (found.whitening @ jacobian)[there], found.errors[there]
-    weight = robust_weight(found.squared[there], width)
+    seen = np.isfinite(found.errors[:, 0])
+    assert 0 < seen.sum() < len(seen)
+    jacobian, error = (found.whitening @ jacobian)[seen], found.errors[seen]
+    weight = robust_weight((error**2).sum(axis=1), width)
     expected = np.einsum("m,mik,mil->kl", weight, jacobian, jacobian)
     np.testing.assert_allclose(found.gram[0], expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
     expected = np.einsum("m,mik,mi->k", weight, jacobian, error)
