@@ -349,7 +349,7 @@ def test_a_full_disk(place: Path, command: str) -> None:
     before = state_of(place)
     # No file may grow beyond this: the system refuses the write, as a full disk does.
     limited = (
-        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (20, 20)); "
+        "import resource, sys; sys.dont_write_bytecode = True; resource.setrlimit(resource.RLIMIT_FSIZE, (20, 20)); "
         "from rdstitch_cli.main import run; sys.exit(run(sys.argv[1:]))"
     )
     arguments = (command, place / "a.png", place / "b.png", "-o", output, *lens)
