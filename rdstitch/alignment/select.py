@@ -36,6 +36,9 @@ MAX_STRETCH = 10.0
 """Ratio of areas from which on a turn about the centre that joins the images is what a person would rather see. A plane
 seen from above has up to 7, one seen under 35 degrees 6 to 15, by the focal length, and no turn joins such images."""
 
+_REFUSED = 100.0
+"""The same from which on the compositor draws no image, so that any other layout is better."""
+
 
 def stretch(fit: Fit) -> float:
     """Return the ratio of the areas that a pixel gets, 98 % over 2 % of all images; inf where they are folded.
@@ -247,13 +250,13 @@ def _with_wider_lenses(
 
 
 def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
-    """The one with the best score; where its layout is absurd, a turn that joins the images; if folded, any other."""
+    """The one with the best score; where its layout is absurd, a turn that joins the images; if refused, any other."""
     cameras = [one for one in tried if one.fit.model.one_camera]
     free = [one for one in tried if not one.fit.model.one_camera]
     best = min(cameras or free, key=_score)
     kept = [one for one in tried if not one.absurd and one.field < posterior.tolerable]
     turns = [one for one in kept if one.fit.model.on_sphere]
-    if best.absurd and (turns or (kept and math.isinf(best.stretch))):
+    if best.absurd and (turns or (kept and best.stretch > _REFUSED)):
         return min(turns or kept, key=_score)
     return min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
 

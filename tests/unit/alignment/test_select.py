@@ -129,7 +129,7 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
     [
         (20.0, 1.1, 1.1, "rotation"),
         (20.0, 1.5, 1.1, "rigid"),
-        (math.inf, 1.5, 1.1, "similarity"),
+        (110.0, 1.5, 1.1, "similarity"),
         (math.inf, 1.5, 1.5, "rigid"),
     ],
 )
