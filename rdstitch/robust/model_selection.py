@@ -141,18 +141,18 @@ def _finished(fitted: _Fitted, pairs: PairSelection, reasons: list[str]) -> Iter
     reasons : list of str
         Why this model was chosen, for each pair.
     """
-    found = [_described(fitted, pairs)]
-    std = np.zeros(len(reasons)) if pairs.fixed_distortion else np.sqrt(found[0][2][:, 0, 0])
+    described = [_described(fitted, pairs)]
+    std = np.zeros(len(reasons)) if pairs.fixed_distortion else np.sqrt(described[0][2][:, 0, 0])
     known = [(0, row, deviation, reason) for row, (deviation, reason) in enumerate(zip(std, reasons, strict=True))]
     unseen = np.flatnonzero(~(std < OBSERVABLE_STD))
     if len(unseen):
         level = replace(pairs.take(unseen), distortion=np.zeros(len(unseen)), fixed_distortion=True)
-        found.append(_described(level.fit(fitted.model), level))
+        described.append(_described(level.fit(fitted.model), level))
         for index, row in enumerate(unseen.tolist()):
             why = f"{reasons[row]}; λ is not observable (standard deviation {std[row]:.2g}) and was set to 0"
             known[row] = 1, index, np.inf, why
     for which, row, deviation, why in known:
-        fits, errors, covariance = found[which]
+        fits, errors, covariance = described[which]
         distortion, state, homography = float(fits.distortion[row]), fits.state[row], fits.homography[row]
         yield PairFit(fitted.model, state, homography, distortion, errors[row], covariance[row], float(deviation), why)
 
