@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import rdstitch
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import ImageTexture, Photometry, Texture, grid_poses, sequence_over
 
 _DISTORTION = -0.35

@@ -13,19 +13,18 @@ if TYPE_CHECKING:
     from rdstitch import synthetic as synthetic
     from rdstitch.alignment import Alignment as Alignment
     from rdstitch.alignment.trajectory import Trajectory as Trajectory
-    from rdstitch.camera import Camera as Camera
     from rdstitch.camera_files import load_camera as load_camera
     from rdstitch.camera_files import save_camera as save_camera
     from rdstitch.compositing import CompositeOptions as CompositeOptions
-    from rdstitch.doctor import Examination as Examination
-    from rdstitch.doctor import examine as examine
     from rdstitch.errors import RdstitchError as RdstitchError
     from rdstitch.features import FeatureOptions as FeatureOptions
-    from rdstitch.messages import Message as Message
-    from rdstitch.options import StitchOptions as StitchOptions
+    from rdstitch.geometry.camera import Camera as Camera
+    from rdstitch.geometry.radial_homography import RadialHomography as RadialHomography
     from rdstitch.pipeline.apply_sidecar import Recomposition as Recomposition
     from rdstitch.pipeline.apply_sidecar import apply as apply
     from rdstitch.pipeline.composer import Composer as Composer
+    from rdstitch.pipeline.doctor import Examination as Examination
+    from rdstitch.pipeline.doctor import examine as examine
     from rdstitch.pipeline.follow import FollowedPoses as FollowedPoses
     from rdstitch.pipeline.follow import Pose as Pose
     from rdstitch.pipeline.follow import Tracker as Tracker
@@ -38,12 +37,13 @@ if TYPE_CHECKING:
     from rdstitch.pipeline.stage_tiles import place_tiles as place_tiles
     from rdstitch.pipeline.stage_tiles import tiles as tiles
     from rdstitch.pipeline.undistort_images import undistort as undistort
-    from rdstitch.radial_homography import RadialHomography as RadialHomography
-    from rdstitch.registration import Registration as Registration
     from rdstitch.report import write_report as write_report
+    from rdstitch.results.messages import Message as Message
+    from rdstitch.results.registration import Registration as Registration
+    from rdstitch.results.stitch_options import StitchOptions as StitchOptions
+    from rdstitch.results.stitch_result import StitchResult as StitchResult
     from rdstitch.robust import estimate_radial_homography as estimate_radial_homography
     from rdstitch.stage import TileOptions as TileOptions
-    from rdstitch.stitch_result import StitchResult as StitchResult
 
     __version__: str
 
@@ -53,14 +53,14 @@ _HOMES = {
         "rdstitch": "errors solvers synthetic",
         "rdstitch.alignment": "Alignment",
         "rdstitch.alignment.trajectory": "Trajectory",
-        "rdstitch.camera": "Camera",
+        "rdstitch.geometry.camera": "Camera",
         "rdstitch.camera_files": "load_camera save_camera",
         "rdstitch.compositing": "CompositeOptions",
-        "rdstitch.doctor": "Examination examine",
+        "rdstitch.pipeline.doctor": "Examination examine",
         "rdstitch.errors": "RdstitchError",
         "rdstitch.features": "FeatureOptions",
-        "rdstitch.messages": "Message",
-        "rdstitch.options": "StitchOptions",
+        "rdstitch.results.messages": "Message",
+        "rdstitch.results.stitch_options": "StitchOptions",
         "rdstitch.pipeline.apply_sidecar": "Recomposition apply",
         "rdstitch.pipeline.composer": "Composer",
         "rdstitch.pipeline.follow": "FollowedPoses Pose Tracker",
@@ -68,12 +68,12 @@ _HOMES = {
         "rdstitch.pipeline.recipes": "calibrate mosaic mosaic_blocks pano trajectory",
         "rdstitch.pipeline.stage_tiles": "place_tiles tiles",
         "rdstitch.pipeline.undistort_images": "undistort",
-        "rdstitch.radial_homography": "RadialHomography",
-        "rdstitch.registration": "Registration",
+        "rdstitch.geometry.radial_homography": "RadialHomography",
+        "rdstitch.results.registration": "Registration",
         "rdstitch.report": "write_report",
         "rdstitch.robust": "estimate_radial_homography",
         "rdstitch.stage": "TileOptions",
-        "rdstitch.stitch_result": "StitchResult",
+        "rdstitch.results.stitch_result": "StitchResult",
     }.items()
     for name in names.split()
 }

@@ -12,7 +12,7 @@
     └── LimitError               7  refused: too large for memory, format or common sense
 
 A fit that fails is not an error but a value with a reason; see
-:class:`rdstitch.radial_homography.RadialHomography`.
+:class:`rdstitch.geometry.radial_homography.RadialHomography`.
 """
 
 from typing import ClassVar

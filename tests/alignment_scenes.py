@@ -7,9 +7,9 @@ from scipy.spatial import KDTree
 
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, TILTING, YAW, X, Y
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
-from rdstitch.radial_homography import RadialHomography
 
 
 @dataclass(frozen=True)

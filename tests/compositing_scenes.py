@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from examples.judging.comparison import plane_under
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, PlacedImage, plan_canvas
 from rdstitch.compositing.source_images import Displacement, ImageLoader
+from rdstitch.geometry.camera import Camera
 from rdstitch.io import DecodedImage, Metadata
 from rdstitch.synthetic.poses import grid_poses
 from rdstitch.synthetic.rendering import Photometry, sequence_over

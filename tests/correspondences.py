@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.radial_homography import RadialHomography
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
 from tests.instances import Instances, PlanarInstances, general_instances, planar_instances
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import Photometry, Sequence, drive_poses, ground, sequence_over
 
 DISTORTION = -0.25

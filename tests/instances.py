@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rdstitch.arrays import FloatArray
-from rdstitch.division_model import distort
-from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
-from rdstitch.radial_homography import lift, project
+from rdstitch.geometry.division_model import distort
+from rdstitch.geometry.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
+from rdstitch.geometry.radial_homography import lift, project
 from rdstitch.solvers.solutions import Solutions
 
 Range = tuple[float, float]

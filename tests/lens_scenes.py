@@ -3,7 +3,7 @@
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from tests.alignment_scenes import Scene, grid, scene
 
 SIZE = (640, 480)

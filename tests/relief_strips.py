@@ -6,13 +6,13 @@ import numpy as np
 
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.features import Correspondences
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.radial_homography import to_plane
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
 

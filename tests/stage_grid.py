@@ -11,7 +11,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 
 Specimen = Literal["fluorescence", "brightfield"]
 

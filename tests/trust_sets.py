@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 
 from examples import judging
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
 from rdstitch.features import FeatureOptions
-from rdstitch.options import StitchOptions
+from rdstitch.geometry.camera import Camera
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.registration import Registration
+from rdstitch.results.registration import Registration
+from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import (
     BrownLens,
     Lens,

@@ -36,7 +36,7 @@ def read_config(path: Path, commands: Mapping[str, click.Command], running: str)
 
 
 def _parse(path: Path) -> dict[str, Any]:
-    from rdstitch.file_access import read_text
+    from rdstitch.system.file_access import read_text
 
     try:
         return tomllib.loads(read_text(path))

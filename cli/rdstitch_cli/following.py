@@ -14,9 +14,9 @@ from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
-    from rdstitch.options import StitchOptions
     from rdstitch.pipeline.follow import FollowedPoses
-    from rdstitch.registration import Registration
+    from rdstitch.results.registration import Registration
+    from rdstitch.results.stitch_options import StitchOptions
 
 
 @contextmanager
@@ -38,10 +38,10 @@ def followed(
     printed: as the file that is written at the end has them.
     """
     from rdstitch.camera_files import CAMERA_SUFFIXES
-    from rdstitch.file_access import file_state
     from rdstitch.inputs.arrivals import Arrivals
-    from rdstitch.outputs import TemporaryFolder, check_output
     from rdstitch.pipeline.follow import follow as follow_frames
+    from rdstitch.system.file_access import file_state
+    from rdstitch.system.outputs import TemporaryFolder, check_output
 
     if len(inputs) != 1:
         raise click.UsageError("--follow takes one input: a folder, a video, the index of a camera, a stream or -")

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from rdstitch.messages import bytes_in_words, seconds_in_words
+from rdstitch.results.messages import bytes_in_words, seconds_in_words
 from rdstitch_cli.config import CONFIG_FILE
 from rdstitch_cli.options import is_given
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
-    from rdstitch.camera import Camera
     from rdstitch.choices import SolverName
     from rdstitch.compositing import CompositePlan
-    from rdstitch.options import StitchOptions
-    from rdstitch.outputs import Outputs
-    from rdstitch.registration import Registration
-    from rdstitch.stitch_result import StitchResult
+    from rdstitch.geometry.camera import Camera
+    from rdstitch.results.registration import Registration
+    from rdstitch.results.stitch_options import StitchOptions
+    from rdstitch.results.stitch_result import StitchResult
+    from rdstitch.system.outputs import Outputs
 
 
 def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
@@ -45,9 +45,9 @@ def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
 def _size_of_images(file: Path) -> tuple[int, int]:
     """Width and height of the first input image as it is stored, for a camera file that does not say them."""
     from rdstitch.errors import InputError
+    from rdstitch.geometry.exif_orientation import inverse, turned_size
     from rdstitch.inputs.find import find_images
     from rdstitch.io import read_metadata
-    from rdstitch.orientation import inverse, turned_size
 
     # The names on standard input are read later, and a video only once.
     named = [path for path in click.get_current_context().params["inputs"] if str(path) != "-"]
@@ -73,7 +73,7 @@ def stitch_options(
     """The library's options from a command's flags."""
     from rdstitch.compositing import CompositeOptions
     from rdstitch.features import FeatureOptions
-    from rdstitch.options import StitchOptions
+    from rdstitch.results.stitch_options import StitchOptions
 
     _check_written([camera])
     if preview:
@@ -106,7 +106,7 @@ def composite_fields(given: dict[str, Any]) -> dict[str, Any]:
 
 def _check_written(read: Iterable[Path | None]) -> None:
     """Refuse to write over a file that an option names to be read, or over the configuration."""
-    from rdstitch.outputs import check_not_read
+    from rdstitch.system.outputs import check_not_read
 
     context = click.get_current_context()
     files = [file for file in (*read, context.meta.get(CONFIG_FILE)) if file is not None]
@@ -122,8 +122,8 @@ class FilesBeside:
         self, reporter: Reporter, inputs: Sequence[Path], given: dict[str, Any], output: Path | None = None
     ) -> None:
         """Take their options out of a command's flags, and find out before long work whether they can be written."""
-        from rdstitch.outputs import check_distinct, check_output
-        from rdstitch.progress import StageTimer
+        from rdstitch.system.outputs import check_distinct, check_output
+        from rdstitch.system.progress import StageTimer
 
         self._reporter, self.progress = reporter, StageTimer(reporter)
         self._report, self._layers = given.pop("report", None), given.pop("layers", None)
@@ -154,7 +154,7 @@ class FilesBeside:
         try:
             yield
         except RefusedError as refused:
-            from rdstitch.outputs import Outputs
+            from rdstitch.system.outputs import Outputs
 
             with Outputs(overwrite=True) as outputs:
                 self.stage(outputs, refused.registration)
@@ -162,8 +162,8 @@ class FilesBeside:
 
     def stage(self, outputs: "Outputs", result: "StitchResult | Registration") -> None:
         """Stage the files that are wanted, to be published with what else the recipe writes."""
-        from rdstitch.outputs import text_bytes
-        from rdstitch.stitch_result import StitchResult
+        from rdstitch.results.stitch_result import StitchResult
+        from rdstitch.system.outputs import text_bytes
 
         def attempt(place: Path, write: Callable[[], object]) -> None:
             for message in outputs.attempt(place, write):
@@ -212,7 +212,7 @@ def report_registration(
     registration: "Registration", reporter: Reporter, content: Callable[[], Any] | None = None
 ) -> None:
     """λ, nan where it is not observable, or some content as JSON to standard output; warnings to standard error."""
-    from rdstitch.outputs import json_bytes
+    from rdstitch.system.outputs import json_bytes
 
     reporter.finish()
     warn_of(registration, reporter)
@@ -225,7 +225,7 @@ def report_registration(
 
 def warn_of(registration: "Registration", reporter: Reporter) -> None:
     """Give what the user must know of a registration."""
-    from rdstitch.messages import of_severity, told_once
+    from rdstitch.results.messages import of_severity, told_once
 
     alignment = registration.alignment
     for message in told_once((*registration.failures, *registration.warnings, *registration.left_out)):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Never, Self
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from rdstitch.messages import Message
+    from rdstitch.results.messages import Message
 
 _ASCII = {
     "λ": "lambda",

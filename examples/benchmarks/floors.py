@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 
 import rdstitch
 from examples.benchmarks.driver import images_of, run, timed
+from rdstitch.features.feature_options import FeatureOptions
 from rdstitch.features.opencv import SIFT_CONTRAST
-from rdstitch.features.options import FeatureOptions
+from rdstitch.geometry.radial_homography import transfer_jacobian
 
 # What is first imported while functions are timed would keep the timers of the first folder.
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.radial_homography import transfer_jacobian
 
 _FUNCTIONS = {
     "decode": ("rdstitch.io.read:read_image",),

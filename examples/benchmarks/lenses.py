@@ -18,13 +18,13 @@ import numpy as np
 
 from examples.benchmarks.driver import run
 from examples.judging import registration_error
-from rdstitch.camera import Camera
 from rdstitch.choices import LensName
 from rdstitch.errors import RdstitchError
 from rdstitch.executors import open_executor
+from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import read_sources
-from rdstitch.options import StitchOptions
 from rdstitch.pipeline.register import register
+from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import BrownLens, FisheyeLens, Sequence, grid_poses, ground, sequence_over
 from rdstitch.synthetic.lenses import Lens
 

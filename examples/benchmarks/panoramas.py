@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from examples.benchmarks.driver import run
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.options import StitchOptions
+from rdstitch.geometry.camera import Camera
 from rdstitch.pipeline.recipes import pano
+from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import Photometry, TurningSequence, panorama_rotations, turning_sequence
 
 Pixels = NDArray[np.uint8]

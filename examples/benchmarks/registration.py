@@ -19,7 +19,7 @@ from examples.paper.common.estimators import lomsac_estimators
 from examples.paper.common.stitchers import installed_stitchers, run_all
 from examples.paper.end_to_end import SETS
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import read_image
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.synthetic import Sequence

@@ -17,7 +17,7 @@ import numpy as np
 import rdstitch
 from examples.benchmarks.driver import StagePeaks, StageTimes, apart, costliest, processor_time, run
 from examples.judging import registration_error
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.io.write import write_image
 from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
 

@@ -11,10 +11,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from examples.benchmarks.driver import run
-from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
-from rdstitch.options import StitchOptions
+from rdstitch.geometry.camera import Camera
 from rdstitch.pipeline.recipes import mosaic
+from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import (
     Photometry,
     Sequence,

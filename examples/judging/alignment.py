@@ -12,7 +12,7 @@ from examples.judging.fitting import FITS, apply, quantile
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.radial_homography import to_plane
+from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.synthetic.rendering import Sequence
 
 Transfer = Callable[[FloatArray], FloatArray]

@@ -14,7 +14,7 @@ import numpy as np
 from examples.judging import compare_with_plane
 from examples.paper.common.report import Effort, Pixels, Report, Settings, Table
 from examples.paper.common.stitchers import Stitcher, installed_stitchers, run_all
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import read_image
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 

@@ -17,11 +17,11 @@ from examples.judging.fitting import apply
 from examples.paper.common.report import Effort, Report, Settings, Table
 from examples.paper.common.stitched import register_files
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions
-from rdstitch.options import StitchOptions
-from rdstitch.radial_homography import project
-from rdstitch.registration import Registration
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import project
+from rdstitch.results.registration import Registration
+from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
 
 _CENTRE = np.array([0.0, 0.0, 1.0])

@@ -4,10 +4,10 @@ from examples.judging import registration_error
 from examples.paper.common.matched import rendered_pair
 from examples.paper.common.report import Effort, Pixels, Report, Settings, Table
 from examples.paper.common.stitched import stitch_files, stitch_rendered
-from rdstitch.camera import Camera
 from rdstitch.camera_files.lens_models import fit_lens
 from rdstitch.errors import RegistrationError
-from rdstitch.options import StitchOptions
+from rdstitch.geometry.camera import Camera
+from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import FisheyeLens
 from rdstitch.synthetic.lenses import Lens
 

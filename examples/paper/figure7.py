@@ -11,7 +11,7 @@ from examples.paper.common.matched import MatchedPair, match_files, match_render
 from examples.paper.common.plain_ransac import THRESHOLD, all_solvers, draw_samples
 from examples.paper.common.report import Effort, Report, Settings, Table, curves
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 

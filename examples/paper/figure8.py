@@ -21,12 +21,12 @@ from examples.paper.common.plain_ransac import all_solvers, best_of
 from examples.paper.common.report import Pixels, Report, Settings, Table
 from rdstitch.alignment import Alignment, Link, align
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, CompositeOptions, PlacedImage, compose
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.planar_motion import rotation_from_tilt
+from rdstitch.geometry.radial_homography import project
 from rdstitch.io.read import read_image
 from rdstitch.matching.distortion_consensus import Consensus, vote
-from rdstitch.planar_motion import rotation_from_tilt
-from rdstitch.radial_homography import project
 from rdstitch.robust.measurements import Measurements
 from rdstitch.synthetic import ImageTexture, Poses, sequence_over
 from rdstitch.synthetic import Sequence as RenderedSequence

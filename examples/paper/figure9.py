@@ -21,10 +21,10 @@ from rdstitch.alignment.priors import Prior, Priors
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import LENS_PARAMETERS
+from rdstitch.geometry.camera import LENS_PARAMETERS
+from rdstitch.geometry.planar_motion import PlanarMotion, rotation_from_tilt
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
-from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt
-from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 

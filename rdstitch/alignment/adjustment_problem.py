@@ -24,9 +24,9 @@ from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors, Priors
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.division_model import undistort
+from rdstitch.geometry.division_model import undistort
+from rdstitch.geometry.radial_homography import RadialHomography, transfer
 from rdstitch.matching.match_graph import connected_components, spanning_tree
-from rdstitch.radial_homography import RadialHomography, transfer
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 from rdstitch.solvers.homography import direct_linear
 

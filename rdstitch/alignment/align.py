@@ -12,6 +12,7 @@ from rdstitch.alignment.adjustment_problem import (
     relations_at,
     thin_for_selection,
 )
+from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.attitude_check import check_attitudes
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjustmentResult
@@ -19,7 +20,6 @@ from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_l
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, noise_of_links
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.position_priors import hold_positions
 from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
@@ -27,12 +27,12 @@ from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
 from rdstitch.alignment.uncertainty import covariances, weigh_lens
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.camera import LENS_STD, Camera
-from rdstitch.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
 from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.geometry.camera import LENS_STD, Camera
+from rdstitch.geometry.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.matching.links import Link, in_alternate_directions
-from rdstitch.radial_homography import RadialHomography
 
 _UNCONFIRMED = 0.1
 """What the matches count in the spanning tree of a link without a consistent triangle, relative to one with."""

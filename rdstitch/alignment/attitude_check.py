@@ -12,11 +12,11 @@ from itertools import product
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA, PlanarModel
-from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.select import select_model
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.messages import Message
+from rdstitch.results.messages import Message
 
 _MAX_IMAGES = 60
 """That are compared: evenly chosen ones of more say as well which signs are right."""

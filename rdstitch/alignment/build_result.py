@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Problem
+from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.frames import levelled
@@ -15,18 +16,17 @@ from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise import EXACTNESS, coherence, judge_relief
-from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.alignment.uncertainty import considered_covariance, pose_covariances
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.errors import ImpossibleCameraError
+from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
+from rdstitch.geometry.planar_motion import rigid_in_plane
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
-from rdstitch.messages import Message, Severity
-from rdstitch.planar_motion import rigid_in_plane
+from rdstitch.results.messages import Message, Severity
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _STEP = 1e-5

@@ -11,9 +11,9 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.link_equations import split_lens
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.late_imports import sparse
+from rdstitch.geometry.radial_homography import transfer_jacobian
 from rdstitch.matching.links import spread_choice
-from rdstitch.radial_homography import transfer_jacobian
+from rdstitch.system.late_imports import sparse
 
 _PROBES = 6
 """Points of a link that are transferred round each triangle."""

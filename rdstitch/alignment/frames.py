@@ -14,10 +14,10 @@ import numpy as np
 from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.alignment.select import MAX_STRETCH
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.camera import LENS_PARAMETERS, Camera
+from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
+from rdstitch.geometry.exif_orientation import inverse, turning_matrix
+from rdstitch.geometry.planar_motion import rigid_in_plane, rotation_from_tilt, tilt_from_normal
 from rdstitch.matching.links import Link
-from rdstitch.orientation import inverse, turning_matrix
-from rdstitch.planar_motion import rigid_in_plane, rotation_from_tilt, tilt_from_normal
 
 
 def turns(orientations: Sequence[int]) -> FloatArray:

@@ -7,8 +7,8 @@ import numpy as np
 from rdstitch.alignment.lens_selection import CENTER
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import LENS_PARAMETERS, Camera
-from rdstitch.division_model import divisor, divisor_slope
+from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
+from rdstitch.geometry.division_model import divisor, divisor_slope
 
 _COEFFICIENT_NAMES = ("λ", "μ", "ν")
 _ORDINALS = ("first", "second", "third")

@@ -21,7 +21,7 @@ from rdstitch.alignment.noise import Coherence, NoiseModel, coherence, noise_of_
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.camera import LENS_PARAMETERS
+from rdstitch.geometry.camera import LENS_PARAMETERS
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 LENSES: dict[str, tuple[str, ...]] = {
@@ -33,7 +33,7 @@ LENSES: dict[str, tuple[str, ...]] = {
 """Parameters of each lens of the ladder, from the simplest."""
 
 CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
-"""Which of :data:`rdstitch.camera.LENS_PARAMETERS` are the distortion centre, shape (5,)."""
+"""Which of :data:`rdstitch.geometry.camera.LENS_PARAMETERS` are the distortion centre, shape (5,)."""
 
 _FARTHEST_CENTER, _FARTHEST_CENTER_OF_CROPS = 0.08, 0.25
 """Half diagonals: a distortion centre farther off than the first is no lens, but something else that it takes the blame
@@ -87,7 +87,7 @@ class LensChoice:
 
 
 def free_parameters(name: str) -> BoolArray:
-    """Which of :data:`rdstitch.camera.LENS_PARAMETERS` a lens of the ladder has, shape (5,)."""
+    """Which of :data:`rdstitch.geometry.camera.LENS_PARAMETERS` a lens of the ladder has, shape (5,)."""
     return np.array([parameter in LENSES[name] for parameter in LENS_PARAMETERS])
 
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.division_model import is_one_to_one
-from rdstitch.radial_homography import (
+from rdstitch.geometry.division_model import is_one_to_one
+from rdstitch.geometry.radial_homography import (
     TransferJacobian,
     measurement_whitening,
     transfer_jacobian,

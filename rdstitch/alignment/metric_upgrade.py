@@ -13,7 +13,7 @@ import numpy as np
 
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y, inverses
 from rdstitch.arrays import FloatArray
-from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
+from rdstitch.geometry.planar_motion import rotation_from_tilt, tilt_from_normal
 
 _MAX_TILT = math.radians(75.0)
 _TILT_STEPS = 31

@@ -17,7 +17,7 @@ from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.nearest_points import nearest_points
+from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _CELLS = (2, 3, 4)

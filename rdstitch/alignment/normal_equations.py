@@ -13,7 +13,7 @@ from rdstitch.alignment.link_equations import LinkEquations
 from rdstitch.alignment.motion_models import ModelMatrices, inverses
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.late_imports import sparse, sparse_linalg
+from rdstitch.system.late_imports import sparse, sparse_linalg
 
 
 @dataclass(frozen=True, eq=False)

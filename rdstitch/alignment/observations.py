@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import Link, spread_choice
 
 _CHUNK = 4096

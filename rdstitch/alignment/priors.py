@@ -30,7 +30,7 @@ import numpy as np
 
 from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.camera import LENS_PARAMETERS, LENS_STD, Camera
+from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD, Camera
 
 _EXACT_STD = 1e-6
 
@@ -111,7 +111,7 @@ LENS = (
     Prior(((0.9, 0.0, 0.04), (0.1, -0.35, 0.12))),
     *(Prior(((1.0, 0.0, std),)) for std in LENS_STD[1:].tolist()),
 )
-"""Priors on :data:`rdstitch.camera.LENS_PARAMETERS`."""
+"""Priors on :data:`rdstitch.geometry.camera.LENS_PARAMETERS`."""
 
 TILT = Prior(((0.8, 0.0, math.radians(20.0)), (0.2, 0.0, math.radians(45.0))))
 

@@ -21,8 +21,8 @@ from rdstitch.alignment.link_equations import LinearizedErrors, split_lens
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y, inverses
 from rdstitch.alignment.noise import apart, neighbours
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.division_model import distort, undistort
-from rdstitch.radial_homography import project
+from rdstitch.geometry.division_model import distort, undistort
+from rdstitch.geometry.radial_homography import project
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _STEP = 1e-4

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.messages import Message
-from rdstitch.radial_homography import from_plane, to_plane
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import from_plane, to_plane
+from rdstitch.results.messages import Message
 
 CONTRADICTS = "contradicts the other links"
 """Why a link was not used although it fits well on its own."""
@@ -174,8 +174,9 @@ class Alignment:
     focal_std : float or None
         Its standard deviation in the same unit.
     distortion, distortion_std : float
-        λ of the one-parameter lens nearest to the one found (:attr:`rdstitch.camera.Camera.nearest_distortion`), and
-        its standard deviation; inf where it is not observable, 0 where it was given.
+        λ of the one-parameter lens nearest to the estimate
+        (:attr:`rdstitch.geometry.camera.Camera.nearest_distortion`), and its standard deviation; inf where it is not
+        observable, 0 where it was given.
     lens : str
         The lens that was found, a key of :data:`rdstitch.alignment.lens_selection.LENSES`.
     lens_reason : str

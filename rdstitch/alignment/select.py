@@ -1,9 +1,9 @@
 """Which motion the images show: one posterior score for all hypotheses.
 
-``score = -2 log L(errors) + k log n + priors``: how likely the errors are (:mod:`rdstitch.alignment.evidence`),
-Schwarz's approximation of what ``k`` parameters cost, and what the camera is off from what cameras are
-(:mod:`rdstitch.alignment.priors`). No score makes up for errors that everybody sees, nor for a layout that nobody would
-keep (:mod:`rdstitch.alignment.select`).
+``score = -2 log L(errors) + k log n + priors``: how likely the errors are
+(:mod:`rdstitch.alignment.residual_likelihood`), Schwarz's approximation of what ``k`` parameters cost, and what the
+camera is off from what cameras are (:mod:`rdstitch.alignment.priors`). No score makes up for errors that everybody
+sees, nor for a layout that nobody would keep (:mod:`rdstitch.alignment.select`).
 
 A camera that stays where it is sees the same of a plane as of anything else: where a turn explains the images, models
 over a plane do so too, with more parameters, so that the turn is taken where it fits, and a plane where there is
@@ -19,12 +19,12 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
-from rdstitch.alignment.evidence import ErrorCost, Evidence
 from rdstitch.alignment.lens_selection import shows_center
 from rdstitch.alignment.link_equations import split_lens, whitened_errors
 from rdstitch.alignment.motion_models import MODELS, MotionModel, inverses
+from rdstitch.alignment.residual_likelihood import ErrorCost, Evidence
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.division_model import undistort
+from rdstitch.geometry.division_model import undistort
 
 _GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
 """Half diagonals: points of an image of usual proportions, out to the corners."""

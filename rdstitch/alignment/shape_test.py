@@ -35,9 +35,9 @@ from rdstitch.alignment.noise import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ShapeTest
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.camera import Camera
-from rdstitch.division_model import distort, undistort
-from rdstitch.radial_homography import project
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.division_model import distort, undistort
+from rdstitch.geometry.radial_homography import project
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 Correction = Callable[[FloatArray, IntArray, float], FloatArray]

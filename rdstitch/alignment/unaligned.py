@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rdstitch.alignment.result import CONTRADICTS, Alignment
-from rdstitch.messages import Message, left_out, names_of
+from rdstitch.results.messages import Message, left_out, names_of
 
 _FEW = 1.0 / 3.0
 """Of the features that most images have: a blur of several pixels leaves a quarter and less, even where all others

@@ -23,14 +23,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rdstitch.camera import Camera, CameraRecord
 from rdstitch.camera_files import formats
 from rdstitch.camera_files.lens_models import CameraFile, LensFit
 from rdstitch.camera_files.polynomials import hugin_project, is_hugin, lensfun_xml, read_hugin, read_lensfun
 from rdstitch.errors import ArgumentError, InputError, OutputError
-from rdstitch.file_access import read_text
-from rdstitch.outputs import json_bytes, text_bytes, write_bytes_atomic
-from rdstitch.records import convert, parse_json, parse_yaml
+from rdstitch.geometry.camera import Camera, CameraRecord
+from rdstitch.system.file_access import read_text
+from rdstitch.system.outputs import json_bytes, text_bytes, write_bytes_atomic
+from rdstitch.system.records import convert, parse_json, parse_yaml
 
 __all__ = ["CAMERA_SUFFIXES", "CameraFile", "LensFit", "export_note", "load_camera", "read_camera_file", "save_camera"]
 

@@ -12,10 +12,10 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from rdstitch.camera import Camera
 from rdstitch.camera_files.lens_models import CameraFile, LensFit, LensModel, fitted_lens, nearest_model
 from rdstitch.errors import ArgumentError
-from rdstitch.records import Count, Side, Size, convert
+from rdstitch.geometry.camera import Camera
+from rdstitch.system.records import Count, Side, Size, convert
 
 OWN, OWN_COMMENT = "rdstitch", "#rdstitch "
 """The field, and the comment, with the division model: by it λ comes back as it was."""

@@ -12,8 +12,8 @@ from typing import Self
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera, points_over
 from rdstitch.errors import ArgumentError
+from rdstitch.geometry.camera import Camera, points_over
 
 _GRID = 65  # points along each side of the image that models are fitted at
 _RATIONAL_STEPS = 12

@@ -19,11 +19,11 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.camera_files.formats import comments
 from rdstitch.camera_files.lens_models import CLOSE, CameraFile, LensFit, LensSamples, fitted_camera
 from rdstitch.errors import ArgumentError
-from rdstitch.records import Side, convert, parse_xml
+from rdstitch.geometry.camera import Camera
+from rdstitch.system.records import Side, convert, parse_xml
 
 _RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE = 0, 2, 3
 _FILM = math.hypot(36.0, 24.0)  # mm, at crop factor 1

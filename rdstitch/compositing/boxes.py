@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.late_imports import csgraph, sparse
+from rdstitch.system.late_imports import csgraph, sparse
 
 Box = tuple[int, int, int, int]
 """x0, y0, x1, y1, pixels, end exclusive."""

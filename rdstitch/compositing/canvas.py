@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera, points_over
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.errors import ArgumentError, LimitError
+from rdstitch.geometry.camera import Camera, points_over
+from rdstitch.geometry.radial_homography import to_directions, to_plane
 from rdstitch.io.read import DecodedImage
-from rdstitch.radial_homography import to_directions, to_plane
 
 _PROBES = 33  # points of a grid over the image, and along its outline, a side, at which the stretch is measured
 _POINTS_PER_SIDE = 64  # as the canvas samples outlines: undistorted, straight sides are curved

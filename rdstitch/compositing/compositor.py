@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.panorama_canvas import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.preparation import prepare_composite
@@ -21,9 +21,9 @@ from rdstitch.io.encoding import Layout
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, check_memory, write_strips
-from rdstitch.messages import Message
-from rdstitch.outputs import Fingerprint, Outputs
-from rdstitch.progress import ShareProgress, unheard
+from rdstitch.results.messages import Message
+from rdstitch.system.outputs import Fingerprint, Outputs
+from rdstitch.system.progress import ShareProgress, unheard
 
 
 @dataclass(frozen=True, repr=False)

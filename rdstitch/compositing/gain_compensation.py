@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import cut
-from rdstitch.compositing.options import ExposureMethod
+from rdstitch.compositing.composite_options import ExposureMethod
 from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale, no_exposure, squared_radius
 from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.survey import Survey, SurveyTile
-from rdstitch.late_imports import sparse
+from rdstitch.geometry.camera import Camera
+from rdstitch.system.late_imports import sparse
 
 # Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.
 _CELLS, _MAX_CELLS = 16, 150_000

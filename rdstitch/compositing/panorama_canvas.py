@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.camera import Camera, points_over
 from rdstitch.compositing.canvas import Canvas, canvas_between, plan_canvas, refuse_scale, turned_and_scaled
 from rdstitch.compositing.projection import PLANE, PROJECTIONS, TURN, Projection
 from rdstitch.errors import ArgumentError, LimitError
-from rdstitch.radial_homography import from_directions, to_directions
+from rdstitch.geometry.camera import Camera, points_over
+from rdstitch.geometry.radial_homography import from_directions, to_directions
 
 _POINTS_PER_SIDE = 64
 _GRID = 33  # points along each side of an image, over all of it

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Float32Array
 from rdstitch.compositing.warp import LATTICE_STEPS, Geometry, interpolated
+from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import nodes_around
 
 # The correction is smooth: it is computed at this spacing, canvas pixels, and interpolated.

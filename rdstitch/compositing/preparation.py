@@ -8,9 +8,9 @@ from functools import partial
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.image_cache import ImageCache
-from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import no_exposure
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
@@ -20,9 +20,9 @@ from rdstitch.compositing.survey import covered_pixels, crop_box, crop_rows, sur
 from rdstitch.compositing.tiles import BlockRunner, OutputStrip, TiledOutput, strips_of_blocks
 from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError
-from rdstitch.messages import Message
-from rdstitch.process_memory import return_freed_memory
-from rdstitch.progress import ShareProgress, unheard
+from rdstitch.results.messages import Message
+from rdstitch.system.process_memory import return_freed_memory
+from rdstitch.system.progress import ShareProgress, unheard
 
 _PREPARATION = 0.25
 # Images that the survey reads at one time: what the tiles need is not there yet.

@@ -19,7 +19,7 @@ from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import border_weight, locate
 from rdstitch.io.reduction import block_mean
-from rdstitch.progress import ShareProgress, unheard
+from rdstitch.system.progress import ShareProgress, unheard
 
 NO_OWNER = -1
 

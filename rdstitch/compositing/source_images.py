@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.errors import InputError
+from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import block_mean, fitting_reduction, reduced_size
 

@@ -14,7 +14,7 @@ from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection, ove
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.source_images import ImageReader, PlacedImage
 from rdstitch.compositing.warp import Warp, locate, plan_warps, sample, sample_opacity
-from rdstitch.progress import ShareProgress, unheard
+from rdstitch.system.progress import ShareProgress, unheard
 
 _MAX_IMAGE = 200_000
 _MAX_TOTAL = 16_000_000  # pixels of one image and of all on the reduced canvas; OpenCV finds seams at 100,000

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array, cut
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.photometric import DEPTHS, full_scale
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.render import Layer

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.cache import Cache, Stored
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.render import Renderer
 from rdstitch.io.encoding import STRIP_ROWS
-from rdstitch.opencv_state import one_opencv_thread
-from rdstitch.progress import ShareProgress, unheard
+from rdstitch.system.cache import Cache, Stored
+from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.progress import ShareProgress, unheard
 
 OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
 """Samples (h, W, C) and alpha (h, W)."""

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
-from rdstitch.planar_motion import nearest_rotation
+from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.robust.verification import binomial_tail
 
 Segment = tuple[float, float, float, float]

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, Float32Array, encloses, grown, intersection
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.compositing.source_images import OPAQUE, Displacement, LoadedImage, PlacedImage
-from rdstitch.radial_homography import to_plane
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import to_plane
 
 LATTICE_STEPS = (32, 16, 8, 4, 2, 1)
 """Spacings of lattices, canvas pixels; all have the nodes of the first."""

@@ -9,8 +9,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
 
-from rdstitch.cache import Cache, software
 from rdstitch.errors import ArgumentError, LimitError
+from rdstitch.system.cache import Cache, software
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")

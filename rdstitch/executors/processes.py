@@ -18,8 +18,8 @@ from types import TracebackType
 from typing import IO, Any, ParamSpec, TypeVar
 
 from rdstitch.errors import LimitError
-from rdstitch.opencv_state import one_opencv_thread
-from rdstitch.process_memory import return_freed_memory
+from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.process_memory import return_freed_memory
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")

@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike
 
 from rdstitch.alignment.position_priors import POSITION_STD
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.crs import WGS84, Crs
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.crs import WGS84, Crs
+from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.io.tiff import ExtraTag
-from rdstitch.radial_homography import to_plane
 from rdstitch.robust.similarity_fit import fit_similarity
 
 MIN_POSITIONS = 3

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.features.feature_options import FeatureOptions
 from rdstitch.features.keypoints import Correspondences, Features
-from rdstitch.features.options import FeatureOptions
-from rdstitch.opencv_state import silent_opencv
+from rdstitch.system.opencv_state import silent_opencv
 
 
 @dataclass(frozen=True, eq=False)

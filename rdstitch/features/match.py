@@ -14,7 +14,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.features.nearest import Similarity, mutual_nearest
-from rdstitch.late_imports import spatial
+from rdstitch.system.late_imports import spatial
 
 Matcher = Callable[[Features, Features], Correspondences]
 """Matches the features of two images: :func:`match`, or a network's."""

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.features.feature_options import FeatureOptions
 from rdstitch.features.keypoints import Descriptors, Features
-from rdstitch.features.options import FeatureOptions
-from rdstitch.process_memory import scratch_memory
+from rdstitch.system.process_memory import scratch_memory
 
 Grey = NDArray[np.uint8]
 

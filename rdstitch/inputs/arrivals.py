@@ -10,10 +10,10 @@ from typing import IO
 import cv2
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.file_access import file_state
 from rdstitch.inputs.find import images_in, is_rdstitch_output, natural_key
 from rdstitch.inputs.frame import Frame, Named, array_as_image
 from rdstitch.io.video import VIDEO_SUFFIXES, opened_capture, write_frame
+from rdstitch.system.file_access import file_state
 
 _POLL_SECONDS = 0.2  # seconds between two looks at a folder
 _COMPLETE_AFTER_SECONDS = 1.0  # seconds after its last change from which on a file is read at the first look

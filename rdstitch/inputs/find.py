@@ -11,14 +11,22 @@ from functools import cache, partial
 from pathlib import Path
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import MAX_FILE, canonical_name, canonical_text, is_url, read_limited, read_text, remote_names
 from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.keyframes import wanted_frames
 from rdstitch.inputs.rosbag import extract_images, is_bag
 from rdstitch.io.opening import HEIF_SUFFIXES, RAW_SUFFIXES
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
-from rdstitch.messages import Message, names_of, shortened
-from rdstitch.outputs import TemporaryFolder
+from rdstitch.results.messages import Message, names_of, shortened
+from rdstitch.system.file_access import (
+    MAX_FILE,
+    canonical_name,
+    canonical_text,
+    is_url,
+    read_limited,
+    read_text,
+    remote_names,
+)
+from rdstitch.system.outputs import TemporaryFolder
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
 IMAGE_SUFFIXES = frozenset(

@@ -5,9 +5,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import file_state, is_url, remote_status
 from rdstitch.io.read import DecodedImage
-from rdstitch.messages import Message
+from rdstitch.results.messages import Message
+from rdstitch.system.file_access import file_state, is_url, remote_status
 
 _Stamp = tuple[int, int] | str
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.features.corner_flow import CornerFlow, corners_of, fitted_affine
 from rdstitch.features.prepared_image import PreparedImage
-from rdstitch.inputs.corner_flow import CornerFlow, corners_of, fitted_affine
-from rdstitch.messages import Message
+from rdstitch.results.messages import Message
 
 _SHARED = (0.65, 0.8, 0.9)  # of two frames in a row, in the smaller direction; more where few frames would be left
 _ENOUGH = 12  # frames, from which on fewer shared matches do no harm to λ

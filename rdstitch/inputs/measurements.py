@@ -11,11 +11,11 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
-from rdstitch.file_access import canonical_text, file_state, read_text
+from rdstitch.geometry.exif_orientation import turning_matrix
+from rdstitch.geometry.planar_motion import tilt_from_normal, turned_tilt
 from rdstitch.inputs.source import Source
-from rdstitch.messages import shortened
-from rdstitch.orientation import turning_matrix
-from rdstitch.planar_motion import tilt_from_normal, turned_tilt
+from rdstitch.results.messages import shortened
+from rdstitch.system.file_access import canonical_text, file_state, read_text
 
 XMP = "xmp"
 """The value of ``attitude`` that stands for the images' own XMP."""

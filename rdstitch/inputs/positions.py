@@ -19,13 +19,13 @@ from pathlib import Path, PureWindowsPath
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.crs import WGS84, Crs, epsg_of
 from rdstitch.errors import InputError
-from rdstitch.file_access import canonical_text, read_text
+from rdstitch.geometry.crs import WGS84, Crs, epsg_of
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition, GroundControl
-from rdstitch.records import parse_json, parse_xml
+from rdstitch.system.file_access import canonical_text, read_text
+from rdstitch.system.records import parse_json, parse_xml
 
 _COLUMNS = {
     "name": "name filename sourcefile image imagename file label",

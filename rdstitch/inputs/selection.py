@@ -6,11 +6,11 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.file_access import canonical_name
 from rdstitch.inputs.find import IMAGE_SUFFIXES
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
 from rdstitch.io.mask import mask_frame
+from rdstitch.system.file_access import canonical_name
 
 
 def selected(frames: Sequence[Frame], exclude: Sequence[str], include_only: Sequence[str]) -> list[Frame]:

@@ -9,12 +9,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.cache import Cache
-from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
-from rdstitch.features.options import WORK_MEGAPIXELS
+from rdstitch.features.feature_options import WORK_MEGAPIXELS
 from rdstitch.features.prepared_image import View, halving
-from rdstitch.file_access import canonical_name, held_in_memory, is_url
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.exif_orientation import inverse, turned_size
+from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.input_guard import InputGuard
@@ -23,9 +23,9 @@ from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import GroundControl, Metadata, read_metadata
 from rdstitch.io.read import DecodedImage, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
-from rdstitch.messages import Message, left_out
-from rdstitch.orientation import inverse, turned_size
-from rdstitch.planar_motion import rotation_from_tilt
+from rdstitch.results.messages import Message, left_out
+from rdstitch.system.cache import Cache
+from rdstitch.system.file_access import canonical_name, held_in_memory, is_url
 
 _HELD_UPRIGHT = 6  # EXIF orientation
 

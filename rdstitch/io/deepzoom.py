@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rdstitch.io.encoding import Layout, Strip, as_eight_bit, jpeg_pieces, pyramid, pyramid_sizes, with_alpha
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image
-from rdstitch.outputs import tiles_folder
+from rdstitch.system.outputs import tiles_folder
 
 MAX_TILE_PROFILE = 2**16
 """Bytes of a colour profile that is written into every tile; the larger ones of RGB images have 60 kB."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rdstitch.errors import InputError
 from rdstitch.io.opening import check_readable, decoding
 from rdstitch.io.reduction import block_mean
-from rdstitch.late_imports import tifffile
+from rdstitch.system.late_imports import tifffile
 
 
 @dataclass(frozen=True, eq=False)

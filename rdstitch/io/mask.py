@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.errors import InputError
+from rdstitch.geometry.exif_orientation import inverse, turned, turned_size
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
-from rdstitch.orientation import inverse, turned, turned_size
 
 _OPAQUE = 255
 

@@ -12,8 +12,8 @@ from xml.etree import ElementTree
 
 from PIL import ExifTags, Image
 
-from rdstitch.camera import is_focal_length
-from rdstitch.file_access import open_regular
+from rdstitch.geometry.camera import is_focal_length
+from rdstitch.geometry.exif_orientation import turned_size, turning_matrix
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
 from rdstitch.io.colour import ink_transform
 from rdstitch.io.opening import (
@@ -26,8 +26,8 @@ from rdstitch.io.opening import (
     raw_exif,
     raw_size,
 )
-from rdstitch.late_imports import tifffile
-from rdstitch.orientation import turned_size, turning_matrix
+from rdstitch.system.file_access import open_regular
+from rdstitch.system.late_imports import tifffile
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}

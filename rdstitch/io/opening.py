@@ -37,8 +37,8 @@ from PIL import (
 )
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import is_url, open_regular, remote_status
-from rdstitch.late_imports import tifffile
+from rdstitch.system.file_access import is_url, open_regular, remote_status
+from rdstitch.system.late_imports import tifffile
 
 Factory = Callable[[IO[bytes], str], ImageFile.ImageFile]
 

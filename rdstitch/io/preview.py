@@ -10,7 +10,7 @@ from PIL import Image, JpegImagePlugin
 
 from rdstitch.io.deepzoom import read_deep_zoom
 from rdstitch.io.read import read_image
-from rdstitch.late_imports import tifffile
+from rdstitch.system.late_imports import tifffile
 
 _JPEG_QUALITY = 80
 _OVERVIEW_FROM = 60_000_000  # pixels; of larger TIFF files the smallest overview that is large enough is read

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import open_regular
+from rdstitch.geometry.exif_orientation import turned
 from rdstitch.io.colour import srgb_of_lab, without_inks
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata, read_ome
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image, read_raw
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
-from rdstitch.late_imports import tifffile
-from rdstitch.opencv_state import silent_opencv
-from rdstitch.orientation import turned
+from rdstitch.system.file_access import open_regular
+from rdstitch.system.late_imports import tifffile
+from rdstitch.system.opencv_state import silent_opencv
 
 _END_OF_IMAGE = b"\xff\xd9"
 _PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")

@@ -22,7 +22,7 @@ from PIL import ExifTags, Image
 
 from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, pyramid, pyramid_sizes, with_alpha
 from rdstitch.io.metadata import Metadata
-from rdstitch.late_imports import tifffile
+from rdstitch.system.late_imports import tifffile
 
 OME_SUFFIXES = (".ome.tif", ".ome.tiff")
 _TILE = 256

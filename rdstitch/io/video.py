@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.errors import InputError, OutputError
 from rdstitch.io.opening import check_readable
-from rdstitch.opencv_state import silent_opencv
+from rdstitch.system.opencv_state import silent_opencv
 
 _FFMPEG_LEVEL, _FFMPEG_QUIET = "OPENCV_FFMPEG_LOGLEVEL", "-8"
 

@@ -19,7 +19,15 @@ from rdstitch.io.deepzoom import write_deep_zoom
 from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, as_eight_bit, check_strips, jpeg_pieces, png_pieces
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import OME_SUFFIXES, ExtraTag, write_ome_tiff, write_tiff
-from rdstitch.outputs import IMAGE_SUFFIXES, Fingerprint, Outputs, check_tiles_folder, fingerprint, naming, tiles_folder
+from rdstitch.system.outputs import (
+    IMAGE_SUFFIXES,
+    Fingerprint,
+    Outputs,
+    check_tiles_folder,
+    fingerprint,
+    naming,
+    tiles_folder,
+)
 
 # Width and height that the formats (or their one encoder) can hold.
 SIDE_LIMITS = {".jpg": 65500, ".jpeg": 65500, ".webp": 16383, ".png": 1_000_000}

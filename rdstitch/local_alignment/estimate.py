@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.late_imports import ndimage
+from rdstitch.system.late_imports import ndimage
 
 _DECIMALS = 3  # pixels; what a sidecar stores is what was used
 # Nodes by which a field goes on as it does at the border, so that a spline, which is level at its end, is so beyond it.

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.late_imports import sparse, sparse_linalg
+from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_shape, node_points
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches
+from rdstitch.system.late_imports import sparse, sparse_linalg
 
 # Residuals are trusted up to about this many times their median, or their noise where relief makes them larger, but at
 # least so many pixels; at first, up to this percentile of them, then by this factor less from round to round, and as

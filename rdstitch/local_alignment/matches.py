@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.nearest_points import nearest_points
-from rdstitch.radial_homography import from_directions, from_plane, to_directions, to_plane
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.nearest_points import nearest_points
+from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
 
 # Matches that the alignment expects farther away than this share of the image's diagonal are taken to be wrong; where
 # the ground rises by a tenth of the camera's height, and the alignment is that of the valleys, right ones are nearly as

@@ -11,12 +11,12 @@ from itertools import combinations, islice
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.camera import Camera
-from rdstitch.late_imports import sparse
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.nearest_points import nearest_points
+from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.retrieval import Similarity, similarity
-from rdstitch.nearest_points import nearest_points
-from rdstitch.radial_homography import from_plane, to_plane
+from rdstitch.system.late_imports import sparse
 
 EXHAUSTIVE_UP_TO = 30
 """Number of images up to which every pair is tried."""

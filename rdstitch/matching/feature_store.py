@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.cache import Cache, Stored
-from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, PackedFeatures
+from rdstitch.geometry.camera import Camera
+from rdstitch.system.cache import Cache, Stored
 
 Size = tuple[int, int]
 

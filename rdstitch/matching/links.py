@@ -8,7 +8,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import ArgumentError
-from rdstitch.radial_homography import RadialHomography
+from rdstitch.geometry.radial_homography import RadialHomography
 
 
 def spread_choice(points: FloatArray, most: int | None) -> IntArray:

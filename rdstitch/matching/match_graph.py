@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.late_imports import csgraph, sparse
+from rdstitch.system.late_imports import csgraph, sparse
 
 
 def connected_components(count: int, image1: ArrayLike, image2: ArrayLike) -> list[list[int]]:

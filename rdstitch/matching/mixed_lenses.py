@@ -12,12 +12,12 @@ from typing import Self
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.camera import Camera
-from rdstitch.late_imports import sparse, sparse_linalg
+from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import spread_choice
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.own_lenses import OwnLenses, own_lenses
+from rdstitch.system.late_imports import sparse, sparse_linalg
 
 _MAX_DISTANCE = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two
 _MAX_MATCHES = 250  # matches of a pair that are used

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.features import Features
-from rdstitch.late_imports import sparse
 from rdstitch.matching.feature_store import FeatureStore
+from rdstitch.system.late_imports import sparse
 
 _FEATURES_PER_IMAGE = 1000  # strongest features that describe an image
 _DESCRIPTORS_PER_WORD = 16  # few enough that a word is rare, enough that one place on the ground is one word

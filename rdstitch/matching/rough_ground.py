@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.arrays import BoolArray
-from rdstitch.division_model import undistort
+from rdstitch.geometry.division_model import undistort
+from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.nearest_points import nearest_points
 from rdstitch.solvers.homography import direct_linear
 
 _NEIGHBOURS = 6

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.late_imports import spatial
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.system.late_imports import spatial
 
 _MIN_IMAGES, _MIN_SHARE = 3, 0.5
 """Images, in number and as a share, that pairs which move must connect: two could agree by chance."""

@@ -12,13 +12,13 @@ from threading import Lock
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.cache import Cache
-from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, Matcher, match_overlap
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.feature_store import StoredFeatures, StoredMatches
 from rdstitch.matching.links import Link
-from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
+from rdstitch.system.cache import Cache
 
 Pair = tuple[int, int]
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from rdstitch.cache import NO_CACHE, Cache
-from rdstitch.camera import Camera
 from rdstitch.executors import batches, in_order
 from rdstitch.features import Matcher, match_near
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.candidate_pairs import pairs_that_matter
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
@@ -29,9 +29,9 @@ from rdstitch.matching.two_view import (
     estimate_pairs,
     match_pairs,
 )
-from rdstitch.progress import Progress
-from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions
+from rdstitch.system.cache import NO_CACHE, Cache
+from rdstitch.system.progress import Progress
 
 _PAIRS_MATCHED_AT_ONCE, _MIN_BATCHES = 32, 8  # pairs of a task at the most; tasks at the least
 _PRESCREEN_FEATURES = 500  # strongest features of an image, by which pairs are prescreened

@@ -8,13 +8,13 @@ import numpy as np
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.alignment.unaligned import explain_unaligned
-from rdstitch.cache import Cache
 from rdstitch.errors import PartialResultError, RegistrationError
-from rdstitch.messages import Message, names_of, told_once
-from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, Purpose, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
-from rdstitch.registration import Registration
+from rdstitch.results.messages import Message, names_of, told_once
+from rdstitch.results.registration import Registration
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.system.cache import Cache
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding, messages_of
 from rdstitch.verification.limits import limit

@@ -11,21 +11,21 @@ from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.frames import stored, turned_alignment, turned_link, turned_tilts, turns
 from rdstitch.arrays import FloatArray
-from rdstitch.cache import Cache
-from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
-from rdstitch.file_access import canonical_name
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.exif_orientation import quarter_turn
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.messages import names_of
-from rdstitch.options import StitchOptions
-from rdstitch.orientation import quarter_turn
 from rdstitch.pipeline.working_size import at_working_size
-from rdstitch.process_memory import return_freed_memory
+from rdstitch.results.messages import names_of
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.system.cache import Cache
+from rdstitch.system.file_access import canonical_name
+from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.verification.limits import limit
 
 Purpose = Literal["pano", "mosaic", "calibrate", "trajectory"]

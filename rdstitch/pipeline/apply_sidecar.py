@@ -10,26 +10,24 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
-from rdstitch.file_access import canonical_name, canonical_text
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs, files_of
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.opening import check_readable
-from rdstitch.messages import Message, told_once
-from rdstitch.messages import left_out as left_out_message
-from rdstitch.options import StitchOptions
-from rdstitch.orientation import inverse
-from rdstitch.outputs import Outputs, check_output, json_bytes
 from rdstitch.pipeline.compose import compose_images, plainly_viewed, write_page
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
-from rdstitch.pipeline.upright import turned_anew
-from rdstitch.progress import Progress, silent
+from rdstitch.pipeline.straighten import turned_anew
+from rdstitch.results.messages import Message, told_once
+from rdstitch.results.messages import left_out as left_out_message
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.results.stitch_result import OutputImage
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
 from rdstitch.sidecar.write import (
     VERSION,
@@ -41,12 +39,14 @@ from rdstitch.sidecar.write import (
     to_output,
     versions,
 )
-from rdstitch.stitch_result import OutputImage
+from rdstitch.system.file_access import canonical_name, canonical_text
+from rdstitch.system.outputs import Outputs, check_output, json_bytes
+from rdstitch.system.progress import Progress, silent
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Recomposition(OutputImage):
-    """An image made from a saved registration; also as :class:`rdstitch.stitch_result.OutputImage` has it.
+    """An image made from a saved registration; also as :class:`rdstitch.results.stitch_result.OutputImage` has it.
 
     Attributes
     ----------

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rdstitch.cache import Cache, Stored
 from rdstitch.compositing import (
     Canvas,
     CompositeOptions,
@@ -29,13 +28,14 @@ from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
-from rdstitch.messages import Message, names_of, shortened
-from rdstitch.outputs import Outputs, check_output, text_bytes
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages
-from rdstitch.process_memory import return_freed_memory
-from rdstitch.progress import Progress
-from rdstitch.stitch_result import OutputImage, StitchResult
+from rdstitch.results.messages import Message, names_of, shortened
+from rdstitch.results.stitch_result import OutputImage, StitchResult
+from rdstitch.system.cache import Cache, Stored
+from rdstitch.system.outputs import Outputs, check_output, text_bytes
+from rdstitch.system.process_memory import return_freed_memory
+from rdstitch.system.progress import Progress
 from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
 
 # Reduction of an image of which only the kind of its samples is wanted.

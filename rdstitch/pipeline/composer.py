@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.options import CompositeOptions, Interpolation
+from rdstitch.compositing.composite_options import CompositeOptions, Interpolation
 from rdstitch.compositing.tables import CompositeTables
 from rdstitch.inputs.frame import in_order
 from rdstitch.pipeline.apply_sidecar import Recomposition
 from rdstitch.pipeline.placed_images import PlacedImages
-from rdstitch.stitch_result import StitchResult
+from rdstitch.results.stitch_result import StitchResult
 
 
 class Composer:

@@ -22,10 +22,10 @@ from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.selection import is_selected, with_masks
 from rdstitch.inputs.source import Source
 from rdstitch.io.write import write_image
-from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import alignment_options
 from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
+from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.tracking import CameraPose, Preview, Tracked, TrackingOptions
 from rdstitch.tracking import Tracker as FrameTracker
 

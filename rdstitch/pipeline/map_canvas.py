@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.compositing import Canvas, CompositeOptions
-from rdstitch.crs import Crs
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import MIN_POSITIONS, Georeference, georeference, has_place
+from rdstitch.geometry.crs import Crs
 from rdstitch.inputs.source import Source
-from rdstitch.messages import MAX_NAMED, Message
 from rdstitch.pipeline.placed_images import PlacedImages, plan
+from rdstitch.results.messages import MAX_NAMED, Message
 
 
 def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:

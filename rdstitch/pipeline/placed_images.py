@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.compositing.canvas import NearPart
 from rdstitch.compositing.source_images import Displacement, PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference, has_place
+from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.local_alignment import LocalAlignment, LocalAlignmentMode, Match, align_locally
-from rdstitch.registration import Registration
+from rdstitch.results.registration import Registration
 
 _COMPARED, _COMPARED_SIDE = 8, 400
 """Images, and pixels of their longer side, that are compared to find what is static in them."""
@@ -70,7 +70,7 @@ class PlacedImages:
     # whether the camera turned on the spot, so that the homographies lead to directions, not to a plane
     turned: bool = False
     place: Georeference | None = None  # of the plane, where it is known from an earlier run
-    # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.upright`
+    # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
 
     @classmethod

@@ -14,9 +14,9 @@ from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.flat_field import read_flat_field
 from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO
-from rdstitch.messages import Message
-from rdstitch.options import StitchOptions
-from rdstitch.process_memory import return_freed_memory
+from rdstitch.results.messages import Message
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.system.process_memory import return_freed_memory
 
 
 def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
@@ -76,7 +76,7 @@ def check_size(sources: Sequence[Source]) -> None:
 def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
     """The tiles, which are read without the illumination that all have; and what there is to say of that."""
     # Imported late: images that are no tiles have no use for it.
-    from rdstitch.stage.flat_field import estimate_illumination
+    from rdstitch.stage.estimate_flat_field import estimate_illumination
 
     if wanted == "off":
         return list(sources), []

@@ -12,15 +12,12 @@ from rdstitch.alignment.frames import stored, turned_alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
+from rdstitch.geometry.exif_orientation import quarter_turn
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.source import Source
 from rdstitch.local_alignment import LocalAlignment
-from rdstitch.messages import Message, told_once
-from rdstitch.options import StitchOptions
-from rdstitch.orientation import quarter_turn
-from rdstitch.outputs import Outputs, TemporaryFolder, check_distinct, check_output, json_bytes, text_bytes
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.aligner import Purpose
 from rdstitch.pipeline.compose import blocks_on, compose_images, viewed_images, write_page
@@ -28,12 +25,15 @@ from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs
 from rdstitch.pipeline.register import register, with_frontal_reference
-from rdstitch.pipeline.upright import turned
+from rdstitch.pipeline.straighten import turned
 from rdstitch.pipeline.whole_pixels import on_whole_pixels
-from rdstitch.progress import Progress, silent
-from rdstitch.registration import Registration
+from rdstitch.results.messages import Message, told_once
+from rdstitch.results.registration import Registration
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.write import sidecar
-from rdstitch.stitch_result import StitchResult
+from rdstitch.system.outputs import Outputs, TemporaryFolder, check_distinct, check_output, json_bytes, text_bytes
+from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.verdict import RefusedError
 
 TrajectoryFormat = Literal["csv", "tum", "kitti"]

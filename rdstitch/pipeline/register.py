@@ -8,23 +8,23 @@ from functools import partial
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames import frontal_reference, in_frame_of
 from rdstitch.alignment.unaligned import explain_unaligned
-from rdstitch.cache import Cache
 from rdstitch.features import LightGlue, Matcher, match
-from rdstitch.inputs.image_circle import with_image_circle
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.messages import Message, names_of, shortened
-from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, Purpose, close_loops, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
-from rdstitch.pipeline.repeated_pattern import match_crossings, settle_repeated_pattern
+from rdstitch.pipeline.image_circle import with_image_circle
+from rdstitch.pipeline.settle_repeated_pattern import match_crossings, settle_repeated_pattern
 from rdstitch.pipeline.working_size import at_working_size
-from rdstitch.process_memory import return_freed_memory
-from rdstitch.progress import Progress, silent
-from rdstitch.registration import Registration
+from rdstitch.results.messages import Message, names_of, shortened
+from rdstitch.results.registration import Registration
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.system.cache import Cache
+from rdstitch.system.process_memory import return_freed_memory
+from rdstitch.system.progress import Progress, silent
 
 _STATIC_BACKGROUND = Message(
     "a part of what the images show stays where it is in them (a vehicle's body, a background, dirt, a date); "

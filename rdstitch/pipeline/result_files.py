@@ -13,19 +13,19 @@ from rdstitch.alignment.frames import stored, turned_alignment
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import intersection
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.trajectory_files import as_csv
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.exif_orientation import quarter_turn, turning_matrix
+from rdstitch.geometry.planar_motion import nearest_rotation, rotation_from_tilt
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.io.tiff import write_cropped_tiff
-from rdstitch.orientation import quarter_turn, turning_matrix
-from rdstitch.outputs import Outputs, check_outputs
 from rdstitch.pipeline.apply_sidecar import Recomposition
 from rdstitch.pipeline.composer import placed_by
-from rdstitch.planar_motion import nearest_rotation, rotation_from_tilt
-from rdstitch.stitch_result import StitchResult
+from rdstitch.results.stitch_result import StitchResult
+from rdstitch.system.outputs import Outputs, check_outputs
 
 
 def layer_files(names: list[str], folder: str | Path) -> list[Path]:

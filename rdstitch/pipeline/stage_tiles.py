@@ -14,6 +14,7 @@ from rdstitch.alignment import Alignment
 from rdstitch.alignment.result import LinkFit, ReliefTest
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Correspondences
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
@@ -22,19 +23,18 @@ from rdstitch.io.reduction import mean_of_channels
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.messages import Message, names_of, shortened
-from rdstitch.options import StitchOptions
-from rdstitch.outputs import Outputs, check_distinct, check_output, text_bytes
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
-from rdstitch.progress import Progress, silent
-from rdstitch.radial_homography import RadialHomography
-from rdstitch.registration import Registration
+from rdstitch.results.messages import Message, names_of, shortened
+from rdstitch.results.registration import Registration
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.results.stitch_result import StitchResult
 from rdstitch.stage.grid import TileGrid
-from rdstitch.stage.options import TileOptions
 from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table, oriented
-from rdstitch.stage.register import TileRegistration, evidence, places_table, register_tiles
-from rdstitch.stitch_result import StitchResult
+from rdstitch.stage.register_tiles import TileRegistration, evidence, places_table, register_tiles
+from rdstitch.stage.tile_options import TileOptions
+from rdstitch.system.outputs import Outputs, check_distinct, check_output, text_bytes
+from rdstitch.system.progress import Progress, silent
 
 
 def tiles(

@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedImage, compose
 from rdstitch.errors import ArgumentError, OutputError
+from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, in_order
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
-from rdstitch.messages import Message, ignored
-from rdstitch.outputs import IMAGE_SUFFIXES, check_outputs
 from rdstitch.pipeline.result_files import make_folder
-from rdstitch.progress import Progress, silent
+from rdstitch.results.messages import Message, ignored
+from rdstitch.system.outputs import IMAGE_SUFFIXES, check_outputs
+from rdstitch.system.progress import Progress, silent
 
 Framing = Literal["same", "all", "valid"]
 

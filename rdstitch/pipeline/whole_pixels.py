@@ -7,7 +7,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.matching.match_graph import spanning_tree
-from rdstitch.registration import Registration
+from rdstitch.results.registration import Registration
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
 
 _RESOLVED = 0.1

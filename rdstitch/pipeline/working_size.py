@@ -8,10 +8,10 @@ homographies are in half diagonals, which are the same at every size; only pixel
 from collections.abc import Sequence
 from dataclasses import replace
 
-from rdstitch.camera import Camera
 from rdstitch.features.prepared_image import halving
+from rdstitch.geometry.camera import Camera
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.registration import Registration
+from rdstitch.results.registration import Registration
 
 
 def at_working_size(camera: Camera, megapixels: float | None) -> Camera:

@@ -4,11 +4,11 @@ import numpy as np
 
 from rdstitch.alignment.lens_description import describe_lens, radius_std
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.matching.distortion_consensus import Consensus, vote
-from rdstitch.registration import Registration
 from rdstitch.report.pairs import residuals
 from rdstitch.report.svg import BLUE, RED, Markup, counted, drawing, element, label, line, path, section
+from rdstitch.results.registration import Registration
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 720.0, 280.0, 60.0, 40.0, 24.0
 _RIGHT, _BASE = _WIDTH - 36.0, _HEIGHT - _BOTTOM

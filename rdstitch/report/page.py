@@ -11,9 +11,6 @@ import numpy as np
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import InputError
 from rdstitch.io.preview import read_preview
-from rdstitch.messages import of_severity
-from rdstitch.outputs import Outputs
-from rdstitch.registration import Registration
 from rdstitch.report.lens import lens_curve, votes
 from rdstitch.report.pairs import match_graph, matched, residual_map
 from rdstitch.report.svg import (
@@ -31,8 +28,11 @@ from rdstitch.report.svg import (
     table,
 )
 from rdstitch.report.svg import path as outline
-from rdstitch.stage.register import TileRegistration
-from rdstitch.stitch_result import StitchResult
+from rdstitch.results.messages import of_severity
+from rdstitch.results.registration import Registration
+from rdstitch.results.stitch_result import StitchResult
+from rdstitch.stage.register_tiles import TileRegistration
+from rdstitch.system.outputs import Outputs
 from rdstitch.viewer import viewer_path
 
 REPORT_SUFFIXES = (".html", ".htm")
@@ -72,7 +72,7 @@ def write_report(
     path : path
     result : StitchResult or Registration
     stages : sequence of (str, float)
-        Name and seconds of each stage; see :class:`rdstitch.progress.StageTimer`.
+        Name and seconds of each stage; see :class:`rdstitch.system.progress.StageTimer`.
     command : str
         The command line that made the result, if any.
     outputs : Outputs, optional

@@ -7,9 +7,8 @@ import numpy as np
 from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.projection import PROJECTIONS
+from rdstitch.geometry.radial_homography import to_directions, to_plane
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.radial_homography import to_directions, to_plane
-from rdstitch.registration import Registration
 from rdstitch.report.svg import (
     BLUE,
     GREEN,
@@ -26,6 +25,7 @@ from rdstitch.report.svg import (
     path,
     section,
 )
+from rdstitch.results.registration import Registration
 
 _POINTS_PER_SIDE = 16
 _GRAPH_SIDE, _GRAPH_MARGIN = 900.0, 20.0

@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.camera import Camera
 from rdstitch.choices import SolverName
 from rdstitch.errors import ArgumentError
-from rdstitch.radial_homography import RadialHomography
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.robust.estimation_options import EstimationOptions
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
-from rdstitch.robust.options import EstimationOptions
 from rdstitch.robust.pair_models import PlanarPairModel
 from rdstitch.robust.ransac import ransac
 from rdstitch.robust.verification import MIN_PLACES, places, rejection_reason
@@ -87,7 +87,8 @@ def estimate_radial_homography(
     focal : float, optional
         Focal length, pixels of image 1; guessed if not given. Models of planar motion use it.
     focal_source : str, optional
-        How much the focal length can be trusted, a key of :data:`rdstitch.camera.FOCAL_LOG_STD`; "option" if not given.
+        How much the focal length can be trusted, a key of :data:`rdstitch.geometry.camera.FOCAL_LOG_STD`;
+        "option" if not given.
     center : (float, float), optional
         Distortion centre of image 1, pixels; the image centre if not given.
     solver : str

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, Rows
-from rdstitch.division_model import distorted_ratio
+from rdstitch.geometry.division_model import distorted_ratio
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
 from rdstitch.robust.loss import loss_ratio, robust_weight
 from rdstitch.robust.measurements import Measurements

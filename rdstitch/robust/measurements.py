@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
-from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
+from rdstitch.geometry.camera import Camera
 
 _STEPS_PER_OCTAVE = 4
 _MIN_WIDTH = 16

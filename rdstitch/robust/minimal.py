@@ -8,7 +8,7 @@ import numpy as np
 
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
-from rdstitch.division_model import SEARCHED_DISTORTION
+from rdstitch.geometry.division_model import SEARCHED_DISTORTION
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.solvers.solutions import Solutions
 

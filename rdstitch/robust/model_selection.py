@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.division_model import OBSERVABLE_STD
+from rdstitch.geometry.division_model import OBSERVABLE_STD
 from rdstitch.robust.loss import loss_width, robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel

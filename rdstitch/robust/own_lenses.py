@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import LENS_STD
-from rdstitch.nearest_points import nearest_points
-from rdstitch.radial_homography import RadialHomography
+from rdstitch.geometry.camera import LENS_STD
+from rdstitch.geometry.nearest_points import nearest_points
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.robust.levenberg_marquardt import descend
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel

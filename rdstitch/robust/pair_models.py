@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.planar_motion import (
+from rdstitch.geometry.planar_motion import (
     ABOUT_X,
     ABOUT_Y,
     ABOUT_Z,

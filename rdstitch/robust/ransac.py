@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
+from rdstitch.robust.estimation_options import EstimationOptions
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
-from rdstitch.robust.options import EstimationOptions
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel
 from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
 from rdstitch.robust.sampling import Sampler

@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
-from rdstitch.division_model import MAX_ABS_DISTORTION
+from rdstitch.geometry.division_model import MAX_ABS_DISTORTION
 from rdstitch.robust.covariance import covariances
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, descend
 from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence

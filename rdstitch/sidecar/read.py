@@ -14,17 +14,27 @@ import numpy as np
 from msgspec import Meta, Struct, field
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera, CameraRecord, FocalSource, LensRecord
 from rdstitch.choices import ProjectionName
 from rdstitch.compositing import CompositeOptions
-from rdstitch.crs import Crs
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.georeference import Georeference, Residual
-from rdstitch.file_access import read_text
+from rdstitch.geometry.camera import Camera, CameraRecord, FocalSource, LensRecord
+from rdstitch.geometry.crs import Crs
 from rdstitch.local_alignment import DisplacementField
-from rdstitch.outputs import Fingerprint, fingerprint, tiles_folder
-from rdstitch.records import Count, Matrix, NonNegative, Pair, Size, Triple, check_invertible, convert, parse_json
 from rdstitch.sidecar.write import VERSION
+from rdstitch.system.file_access import read_text
+from rdstitch.system.outputs import Fingerprint, fingerprint, tiles_folder
+from rdstitch.system.records import (
+    Count,
+    Matrix,
+    NonNegative,
+    Pair,
+    Size,
+    Triple,
+    check_invertible,
+    convert,
+    parse_json,
+)
 
 Lens = Literal["division", "division-center", "division2", "division3"]
 Model = Literal["rigid", "similarity", "tilting", "pose", "homography", "rotation"]

@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas
 from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
 from rdstitch.export.georeference import Georeference
+from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment import DisplacementField
-from rdstitch.outputs import Fingerprint
-from rdstitch.registration import Registration
-from rdstitch.stitch_result import StitchResult
+from rdstitch.results.registration import Registration
+from rdstitch.results.stitch_result import StitchResult
+from rdstitch.system.outputs import Fingerprint
 
 VERSION = 2
 """Version 1 had no more of a lens than λ and μ, as ``lambda`` and ``lambda2``."""

@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.division_model import SOLVED_DISTORTION
+from rdstitch.geometry.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.homography import Quadrangles
 from rdstitch.solvers.lines import determinants, squared_radii
-from rdstitch.solvers.orientation import oriented_samples
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
+from rdstitch.solvers.triangle_orientation import oriented_samples
 
 _DEGREE = 4
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.division_model import SOLVED_DISTORTION
+from rdstitch.geometry.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, solve_in_blocks
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.solutions import Solutions

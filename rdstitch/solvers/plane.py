@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.planar_motion import rotation_from_tilt
+from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.solvers.batch import IndexArray, SampleArrays
 from rdstitch.solvers.lines import Lines, squared_radii
 

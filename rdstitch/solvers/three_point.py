@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.division_model import SOLVED_DISTORTION
 from rdstitch.errors import ArgumentError
+from rdstitch.geometry.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.lines import Lines, squared_radii, triangle_determinants
-from rdstitch.solvers.orientation import mirrored, oriented_samples
 from rdstitch.solvers.plane import TiltRotations, lens_range, motion_homography
 from rdstitch.solvers.solutions import Solutions
+from rdstitch.solvers.triangle_orientation import mirrored, oriented_samples
 
 RealArray = NDArray[np.floating[Any]]
 

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.division_model import SOLVED_DISTORTION
+from rdstitch.geometry.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.lines import Lines, triangle_determinants
-from rdstitch.solvers.orientation import mirrored, oriented_samples
 from rdstitch.solvers.plane import TiltRotations, depths, differences, motion_homography, visible_range
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
+from rdstitch.solvers.triangle_orientation import mirrored, oriented_samples
 
 _DEGREE = 8
 

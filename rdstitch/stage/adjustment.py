@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.late_imports import sparse, sparse_linalg
 from rdstitch.stage.grid import TileGrid
+from rdstitch.system.late_imports import sparse, sparse_linalg
 
 _ROUNDS = 12
 _GENEROUS = 20.0  # widths of the robust loss in the first round; it is halved until it is 1

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.late_imports import fft
+from rdstitch.system.late_imports import fft
 
 Image = NDArray[np.float32]
 

@@ -13,10 +13,10 @@ import numpy as np
 import tifffile
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.file_access import canonical_name, canonical_text, open_regular, read_text
 from rdstitch.io.metadata import read_ome
 from rdstitch.io.opening import TIFF_MAGIC, decoding
 from rdstitch.stage.grid import TileGrid
+from rdstitch.system.file_access import canonical_name, canonical_text, open_regular, read_text
 
 _NAMES = ("name", "file", "filename", "image")
 _METADATA_FILE = "metadata.txt"

@@ -1,4 +1,4 @@
-"""Lenses to render with. :class:`rdstitch.camera.Camera` is one; the others are no division model."""
+"""Lenses to render with. :class:`rdstitch.geometry.camera.Camera` is one; the others are no division model."""
 
 import math
 from collections.abc import Callable
@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera, border_of
 from rdstitch.camera_files.lens_models import LensModel
 from rdstitch.errors import ArgumentError
+from rdstitch.geometry.camera import Camera, border_of
 
 _FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]] = {
     "equidistant": (lambda angle: angle, lambda r: r),

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
-from rdstitch.radial_homography import project
+from rdstitch.geometry.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
+from rdstitch.geometry.radial_homography import project
 from rdstitch.synthetic.lenses import Lens, focal_length
 
 Tilt = tuple[float, float]

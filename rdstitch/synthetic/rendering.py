@@ -72,7 +72,7 @@ class Sequence:
     texture : Texture
         The plane. Its coordinates, texels, are the plane's; see :mod:`rdstitch.synthetic.poses`.
     lens : Lens
-        Of all images; a :class:`rdstitch.camera.Camera` with a focal length, or another lens.
+        Of all images; a :class:`rdstitch.geometry.camera.Camera` with a focal length, or another lens.
     poses : Poses
     photometry : Photometry
     relief : Relief, optional

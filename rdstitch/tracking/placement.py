@@ -8,9 +8,9 @@ from typing import Self
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.planar_motion import nearest_rotation
-from rdstitch.radial_homography import to_plane
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.planar_motion import nearest_rotation
+from rdstitch.geometry.radial_homography import to_plane
 
 _SAMPLES = 5  # points of an image's outline, a side, by which two planes are brought together
 

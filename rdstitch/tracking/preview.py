@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.radial_homography import from_plane
+from rdstitch.geometry.radial_homography import from_plane
 from rdstitch.tracking.placement import Placement
 
 _FRAME_SIDE = 240  # longer side of a frame in the preview at first, pixels

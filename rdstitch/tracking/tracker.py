@@ -12,14 +12,14 @@ import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.errors import RegistrationError
 from rdstitch.features import Features, Matcher
+from rdstitch.features.corner_flow import CornerFlow, corners_of, matched_corners
 from rdstitch.features.prepared_image import PreparedImage
-from rdstitch.inputs.corner_flow import CornerFlow, corners_of, matched_corners
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import from_plane
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
-from rdstitch.radial_homography import from_plane
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 

@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.alignment.result import Alignment, LinkFit
-from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.matching.two_view import Pair
-from rdstitch.registration import Registration
+from rdstitch.results.registration import Registration
+from rdstitch.system.cache import NO_CACHE, Cache
 from rdstitch.verification.limits import limit
 from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps
 from rdstitch.verification.second_motion import (

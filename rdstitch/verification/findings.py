@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from rdstitch.messages import MAX_NAMED, Message, Severity, names_of, shortened
-from rdstitch.registration import Registration
+from rdstitch.results.messages import MAX_NAMED, Message, Severity, names_of, shortened
+from rdstitch.results.registration import Registration
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,8 @@ class Finding:
 
     kind: str  # a key of :data:`TEXTS`
     images: tuple[int, ...] = ()  # indices of the images that it concerns; empty where it concerns the whole
-    # as of :class:`rdstitch.messages.Message`. A failure of one image or of a pair may be mended without these; one of
+    # as of :class:`rdstitch.results.messages.Message`. A failure of one image or of a pair may be mended without
+    # these; one of
     # the whole, or of more images, may not
     severity: Severity = "failure"
     values: Mapping[str, object] = field(default_factory=dict)  # what was measured: sizes, shares and counts, by name

@@ -10,12 +10,12 @@ import numpy as np
 
 from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.arrays import FloatArray
-from rdstitch.cache import NO_CACHE, Cache
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import fitting_reduction
-from rdstitch.planar_motion import nearest_rotation
-from rdstitch.registration import Registration
+from rdstitch.results.registration import Registration
+from rdstitch.system.cache import NO_CACHE, Cache
 from rdstitch.verification.photometric_agreement import (
     COMPARED_SIDE,
     Agreement,

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.warp import Lattice
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import mean_of_channels
-from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.verification.limits import limit
 
 Grey = NDArray[np.float32]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from rdstitch.alignment.result import LinkFit
 from rdstitch.alignment.unaligned import few_features
 from rdstitch.inputs.source import Source
-from rdstitch.messages import Severity
+from rdstitch.results.messages import Severity
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
 from rdstitch.verification.limits import limit

@@ -17,11 +17,11 @@ import numpy as np
 
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.camera import Camera
 from rdstitch.executors import batches
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.two_view import PAIRS_ESTIMATED_AT_ONCE, Pair, PairRegistration
-from rdstitch.radial_homography import RadialHomography
-from rdstitch.registration import Registration
+from rdstitch.results.registration import Registration
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.verification.limits import limit
 from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, share_alike

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.radial_homography import to_plane
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.verification.limits import limit
 from rdstitch.verification.photometric_agreement import ComparedImage, Grey
 

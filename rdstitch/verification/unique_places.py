@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.radial_homography import from_plane, to_plane
+from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.verification.limits import limit
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE, ComparedImage, Grey
 from rdstitch.verification.self_similarity import Drawing, Overlaps, draw, drawing_scale

@@ -7,8 +7,8 @@ from rdstitch.alignment.result import LinkFit
 from rdstitch.errors import RegistrationError
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import Pair
-from rdstitch.messages import Message
-from rdstitch.registration import Registration
+from rdstitch.results.messages import Message
+from rdstitch.results.registration import Registration
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding

@@ -11,10 +11,10 @@ from PIL import Image
 import rdstitch
 from examples.judging import AlignmentError, alignment_error
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.exif_orientation import turned, turning_matrix
+from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.io.read import read_image
-from rdstitch.orientation import turned, turning_matrix
-from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 from tests.sampled import sampled
 

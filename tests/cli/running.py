@@ -16,13 +16,13 @@ import numpy as np
 from jsonschema import Draft202012Validator
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera, CameraRecord
 from rdstitch.features import FeatureOptions
-from rdstitch.options import StitchOptions
-from rdstitch.radial_homography import project
-from rdstitch.records import convert
+from rdstitch.geometry.camera import Camera, CameraRecord
+from rdstitch.geometry.radial_homography import project
+from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.sidecar.read import json_schema
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
+from rdstitch.system.records import convert
 
 SIDECAR_SCHEMA = Draft202012Validator(json_schema())
 

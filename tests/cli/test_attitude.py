@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 import rdstitch
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 from tests.cli.running import CACHED, Run
 from tests.drone_xmp import euler_angles, xmp_of

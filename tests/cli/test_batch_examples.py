@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image
 from tests.cli.running import FAST, Outcome
 from tests.sampled import sampled

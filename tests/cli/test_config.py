@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from rdstitch_cli.config import read_config
 from rdstitch_cli.main import cli
 
-from rdstitch.camera import Camera
 from rdstitch.errors import InputError
+from rdstitch.geometry.camera import Camera
 from tests.cli.running import Run
 from tests.damaged_texts import damaged_text
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from rdstitch.doctor import examine
+from rdstitch.pipeline.doctor import examine
 from tests.cli.running import Run
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import CameraRecord
-from rdstitch.records import convert
+from rdstitch.geometry.camera import CameraRecord
+from rdstitch.system.records import convert
 from tests.cli.running import Run, transfers
 from tests.sampled import sampled
 

@@ -11,7 +11,7 @@ from rdstitch_cli.main import cli
 from rdstitch_cli.stitching import stitch_options
 from rdstitch_cli.terminal import Reporter
 
-from rdstitch.options import StitchOptions
+from rdstitch.results.stitch_options import StitchOptions
 from tests.cli.running import Run
 
 COMMANDS = sorted(set(cli.commands) - {"help"})

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from examples.judging import alignment_error
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image, write_image
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.messages import Message
 from rdstitch.pipeline import accept
+from rdstitch.results.messages import Message
 from rdstitch.synthetic import Sequence
 from rdstitch.verification.findings import Finding
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, flight, start, transfers

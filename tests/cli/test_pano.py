@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from examples.judging import alignment_error, compare_with_plane
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image
 from rdstitch.synthetic import Sequence
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, transfers

@@ -81,7 +81,7 @@ def test_whatever_fails(
 
 _KILLED_WHILE_PUBLISHING = """
 import os, signal
-from rdstitch.outputs import Outputs
+from rdstitch.system.outputs import Outputs
 from rdstitch_cli.main import main
 place, left = Outputs._place, [{published}]
 def publish(outputs, item):

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rdstitch.camera import Camera
 from rdstitch.errors import ImpossibleCameraError
+from rdstitch.geometry.camera import Camera
 from rdstitch.inputs import source as sources
 from rdstitch.io import Metadata, read_image, read_metadata
 from rdstitch.pipeline import accept, recipes, register

@@ -15,14 +15,14 @@ from PIL import Image
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.io import preview
-from rdstitch.messages import Message
-from rdstitch.options import StitchOptions
 from rdstitch.pipeline import accept
 from rdstitch.pipeline.recipes import calibrate, pano
 from rdstitch.report import page as report
 from rdstitch.report import report_page, write_report
 from rdstitch.report.pairs import matched
-from rdstitch.stitch_result import StitchResult
+from rdstitch.results.messages import Message
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.results.stitch_result import StitchResult
 from rdstitch.verification.findings import Finding
 from tests.cli.running import CACHED, OPTIONS, Run
 

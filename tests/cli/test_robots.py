@@ -15,8 +15,8 @@ from PIL import ExifTags, Image
 
 import rdstitch
 from examples.judging.trajectories import compare_trajectories
-from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image
 from rdstitch.synthetic import Photometry, Sequence, drive_poses, ground, sequence_over
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, start

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image, read_metadata
 from rdstitch.synthetic import Sequence
 from tests.cli.running import DISTORTION, FAST, Run

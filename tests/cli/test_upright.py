@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
-from rdstitch.options import StitchOptions
-from rdstitch.planar_motion import rotation_from_tilt
-from rdstitch.radial_homography import to_plane
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.planar_motion import rotation_from_tilt
+from rdstitch.geometry.radial_homography import to_plane
+from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import ImageTexture, Photometry, Sequence, ground, sequence_over
 from rdstitch.synthetic.poses import Poses
 from rdstitch.synthetic.textures import Texture

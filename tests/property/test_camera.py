@@ -8,12 +8,12 @@ from hypothesis.extra.numpy import arrays
 
 from rdstitch.alignment.motion_models import HOMOGRAPHY, SIMILARITY, TILTING, inverses
 from rdstitch.alignment.motion_models.homography import _TRACELESS
-from rdstitch.camera import Camera
-from rdstitch.division_model import distort, undistort, valid_radius
 from rdstitch.errors import ArgumentError
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.division_model import distort, undistort, valid_radius
+from rdstitch.geometry.exif_orientation import inverse, turned, turning_matrix
+from rdstitch.geometry.planar_motion import PlanarMotion, rotation_from_tilt, tilt_from_normal
 from rdstitch.matching.links import spread_choice
-from rdstitch.orientation import inverse, turned, turning_matrix
-from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt, tilt_from_normal
 
 coordinates = st.floats(-1.0, 1.0, allow_subnormal=False)
 distortions = st.floats(-0.95, 0.45)

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera, save_camera
 from rdstitch.errors import InputError
-from rdstitch.options import StitchOptions
+from rdstitch.geometry.camera import Camera
+from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.sidecar.read import read_sidecar
 from rdstitch.sidecar.write import plain
 from tests.damaged_texts import damaged, damaged_text

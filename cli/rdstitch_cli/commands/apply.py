@@ -48,8 +48,8 @@ def apply(
     another band of the same flight, the originals of reduced images, masks. They may have another size of the same
     shape. Compositing options that are not given are those of the sidecar.
     """
-    from rdstitch.messages import told_once
     from rdstitch.pipeline.apply_sidecar import apply as recipe
+    from rdstitch.results.messages import told_once
     from rdstitch.sidecar.read import read_sidecar
 
     chosen = {name: value for name, value in composite_fields(given).items() if options.is_given(name)}

@@ -28,8 +28,8 @@ def doctor(inputs: tuple[Path, ...], every: int | None, topic: str | None, as_js
     on small versions of the images, overlap, size of the mosaic, and memory and time of compositing it. Nothing is
     written.
     """
-    from rdstitch.doctor import examine
-    from rdstitch.outputs import json_bytes
+    from rdstitch.pipeline.doctor import examine
+    from rdstitch.system.outputs import json_bytes
 
     examination = examine(options.resolve(inputs), every=every, topic=topic, progress=reporter)
     reporter.finish()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rdstitch.messages import shortened
+from rdstitch.results.messages import shortened
 from rdstitch_cli import following as live
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import command

@@ -10,7 +10,7 @@ import numpy as np
 from examples.paper.common.report import Table, curves
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
-from rdstitch.radial_homography import lift
+from rdstitch.geometry.radial_homography import lift
 from rdstitch.solvers import Solutions
 from tests.instances import PlanarInstances
 

@@ -14,8 +14,8 @@ import numpy as np
 from examples.judging.fitting import apply
 from examples.paper.common.report import Pixels
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, detect, match
+from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import read_image
 from rdstitch.synthetic import Photometry, ground, pair_poses, sequence_over
 from rdstitch.synthetic import Sequence as RenderedSequence

@@ -10,8 +10,8 @@ import numpy as np
 from examples.paper.common.contenders import optional_module
 from examples.paper.common.estimation_pairs import JudgedPair
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.radial_homography import RadialHomography, transfer
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography, transfer
 from rdstitch.robust import SolverName, estimate_radial_homography
 
 THRESHOLD = 3.0

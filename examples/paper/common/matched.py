@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, detect, match
+from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import read_image
 from rdstitch.synthetic import Photometry, Sequence, ground, pair_poses, sequence_over
 from rdstitch.synthetic.lenses import Lens

@@ -8,7 +8,7 @@ import numpy as np
 
 from examples.paper.common.contenders import HOMLIB, homlib_solver
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver, Solve, minimal_solvers
 from rdstitch.robust.pair_models import HomographyPairModel

@@ -11,7 +11,7 @@ import numpy as np
 
 from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.planar_motion import ABOUT_X, ABOUT_Y, nearest_in_plane, rigid_in_plane, rotation_from_tilt
+from rdstitch.geometry.planar_motion import ABOUT_X, ABOUT_Y, nearest_in_plane, rigid_in_plane, rotation_from_tilt
 
 YAW, X, Y, LOG_HEIGHT, PSI, THETA = range(6)
 """Columns of a planar model's poses."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel
 from rdstitch.arrays import FloatArray
-from rdstitch.planar_motion import nearest_rotation
+from rdstitch.geometry.planar_motion import nearest_rotation
 
 _FOCAL_STARTS = tuple(math.log(focal) for focal in (0.6, 0.9, 1.4, 2.2, 3.6, 6.0))
 """Logarithms of focal lengths in half diagonals: from fisheyes to long lenses, near enough to each other that the

@@ -14,12 +14,12 @@ from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import CONTRADICTS, Alignment, PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.alignment.unaligned import explain_unaligned
-from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.planar_motion import PlanarMotion
+from rdstitch.geometry.radial_homography import RadialHomography, transfer
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import SpanningTree, spanning_tree
-from rdstitch.planar_motion import PlanarMotion
-from rdstitch.radial_homography import RadialHomography, transfer
 from tests.alignment_scenes import Scene, grid, jittered, robot_path, scene
 from tests.sampled import sampled
 

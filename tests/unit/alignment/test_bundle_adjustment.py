@@ -9,7 +9,7 @@ from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING,
 from rdstitch.alignment.normal_equations import PoseBlocks, chain
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors
-from rdstitch.radial_homography import transfer_jacobian
+from rdstitch.geometry.radial_homography import transfer_jacobian
 from rdstitch.robust.loss import robust_cost, robust_weight
 from tests.alignment_scenes import Scene, grid, jittered, scene
 

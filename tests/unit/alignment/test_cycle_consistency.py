@@ -12,7 +12,7 @@ from rdstitch.alignment.motion_models import HOMOGRAPHY, Y
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import BoolArray
-from rdstitch.camera import LENS_PARAMETERS
+from rdstitch.geometry.camera import LENS_PARAMETERS
 from rdstitch.matching.links import Link
 from tests.alignment_scenes import Scene, grid, scene
 

@@ -10,7 +10,7 @@ import pytest
 from rdstitch.alignment import lens_selection
 from rdstitch.alignment.lens_selection import LensChoice
 from rdstitch.alignment.observations import Observations
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from tests.lens_scenes import FISHEYE, SIZE, aligned, lens_distance, lens_scene
 
 align_module = importlib.import_module("rdstitch.alignment.align")

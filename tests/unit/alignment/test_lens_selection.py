@@ -15,8 +15,8 @@ from rdstitch.alignment.lens_selection import LensChoice, _Judge, _parts, free_p
 from rdstitch.alignment.noise import NoiseModel
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.errors import ArgumentError
+from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from tests.alignment_scenes import Scene, grid, scene
 from tests.alignment_stubs import adjusted, independent_errors, observations
 from tests.lens_scenes import FISHEYE, SIZE, aligned, lens_distance, lens_scene

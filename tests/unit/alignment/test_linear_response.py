@@ -12,7 +12,7 @@ from rdstitch.alignment.motion_models import MODELS, MotionModel, inverses
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Prior, Priors
 from rdstitch.arrays import FloatArray
-from rdstitch.radial_homography import project
+from rdstitch.geometry.radial_homography import project
 from tests.alignment_scenes import grid, scene
 
 LENS = np.array([True, True, False, False, False])

@@ -15,7 +15,7 @@ from rdstitch.alignment.motion_models import (
     X,
     Y,
 )
-from rdstitch.planar_motion import PlanarMotion
+from rdstitch.geometry.planar_motion import PlanarMotion
 
 SIGNS = np.array([[1.0], [-1.0]])
 

@@ -11,7 +11,7 @@ from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
 from rdstitch.alignment.select import ModelChoice
-from rdstitch.radial_homography import measurement_whitening
+from rdstitch.geometry.radial_homography import measurement_whitening
 from tests.alignment_scenes import Scene, grid, scene
 
 

@@ -8,10 +8,10 @@ import pytest
 from rdstitch.alignment import align
 from rdstitch.alignment.frames import level_frame
 from rdstitch.alignment.motion_models.rotation import ROTATION, rotation_from_vector
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.planar_motion import nearest_rotation
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
-from rdstitch.planar_motion import nearest_rotation
-from rdstitch.radial_homography import RadialHomography
 from rdstitch.synthetic.panorama import camera_rotations, panorama_rotations
 
 LENS = Camera((640, 480), -0.2, focal=554.0, focal_source="guess")

@@ -13,8 +13,8 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Prior, Priors
 from rdstitch.alignment.uncertainty import sandwich_covariances
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.camera import LENS_STD, Camera
-from rdstitch.radial_homography import project
+from rdstitch.geometry.camera import LENS_STD, Camera
+from rdstitch.geometry.radial_homography import project
 from tests.alignment_scenes import grid, scene
 from tests.lens_scenes import SIZE, aligned, lens_scene
 

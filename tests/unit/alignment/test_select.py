@@ -14,9 +14,9 @@ from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.motion_models import PSI, RIGID, ROTATION, SIMILARITY, MotionModel
 from rdstitch.alignment.select import Hypothesis, ModelChoice, Posterior, _best, select_model
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
-from rdstitch.radial_homography import RadialHomography
 from rdstitch.synthetic.panorama import camera_rotations
 from tests.alignment_scenes import grid, scene
 

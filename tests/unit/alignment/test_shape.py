@@ -8,7 +8,7 @@ import pytest
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.motion_models import X
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from tests.alignment_scenes import Scene, grid, scene
 
 

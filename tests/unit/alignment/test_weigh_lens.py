@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment import Alignment
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from tests.alignment_scenes import Scene, grid, scene
 from tests.lens_scenes import SIZE, aligned
 

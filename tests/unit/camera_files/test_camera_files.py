@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.camera_files import export_note, load_camera, read_camera_file, save_camera
 from rdstitch.camera_files.lens_models import LensModel
 from rdstitch.camera_files.polynomials import fitted_polynomial
 from rdstitch.errors import InputError, OutputError
-from rdstitch.records import parse_yaml
+from rdstitch.geometry.camera import Camera
+from rdstitch.system.records import parse_yaml
 
 OPENCV = ["c.yml", "c.yaml", "opencv.json", "left.opencv.json", "a.fisheye.yml"]
 FOREIGN = [*OPENCV, "cameras.json", "c.pto", "camera_info.yaml", "camchain.yaml", "cameras.txt"]

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray
-from rdstitch.camera import Camera
 from rdstitch.compositing import plan_canvas
 from rdstitch.compositing.boxes import Box, aligned, bounds, cut, encloses, grown, intersection, without
 from rdstitch.compositing.survey import crop_box, crop_rows, largest_rectangle
 from rdstitch.errors import ArgumentError, LimitError
+from rdstitch.geometry.camera import Camera
 
 FLAT = Camera((400, 300))
 

@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, gain_compensation, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
 from rdstitch.compositing.gain_compensation import compare_overlaps
@@ -19,6 +18,7 @@ from rdstitch.compositing.source_images import ImageReader, PlacedImage
 from rdstitch.compositing.static_pixels import static_pixels
 from rdstitch.compositing.survey import Survey, survey_images
 from rdstitch.compositing.warp import locate, plan_warp
+from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import ground
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import as_image, place_images, render

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
 from rdstitch.compositing.canvas import NearPart, near_parts, plan_canvas
 from rdstitch.compositing.panorama_canvas import (
@@ -21,10 +20,11 @@ from rdstitch.compositing.projection import PLANE, PROJECTIONS
 from rdstitch.compositing.upright import Edges, Focal, nearest_axis, of_edges, of_rectangle, of_scene
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError, LimitError
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.planar_motion import rotation_from_tilt
+from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage
-from rdstitch.planar_motion import rotation_from_tilt
-from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import as_image, gradient, grey, place_images

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, plan_canvas
 from rdstitch.compositing.warp import locate, plan_warp
+from rdstitch.geometry.camera import Camera
 from tests.compositing_scenes import as_image, grey, inner, place_images, render
 
 PLAIN = CompositeOptions(exposure="none", seam="none", blend="none")

@@ -12,19 +12,19 @@ import rasterio.warp
 from PIL import ExifTags, Image
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
-from rdstitch.crs import Crs, epsg_of, utm
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.georeference import Georeference, georeference
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.crs import Crs, epsg_of, utm
+from rdstitch.geometry.radial_homography import from_plane
 from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition, GroundControl
-from rdstitch.options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.pipeline.result_files import poses_table
-from rdstitch.radial_homography import from_plane
 from rdstitch.report import report_page
+from rdstitch.results.stitch_options import StitchOptions
 from tests.cli.running import flight, transfers
 
 

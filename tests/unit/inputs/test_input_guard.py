@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, LimitError
+from rdstitch.geometry.camera import Camera
 from rdstitch.inputs import source as sources
 from rdstitch.inputs.arrivals import Arrivals
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache

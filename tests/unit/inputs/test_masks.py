@@ -12,17 +12,17 @@ from PIL import Image
 
 import rdstitch
 from examples.judging import registration_error
-from rdstitch.cache import Cache
-from rdstitch.camera import Camera
 from rdstitch.errors import InputError
-from rdstitch.inputs.image_circle import find_circle, with_image_circle
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.exif_orientation import SIDEWAYS, turned, turned_size
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import DecodedImage, read_image
 from rdstitch.io.mask import mask_frame, read_mask
 from rdstitch.io.metadata import Metadata
-from rdstitch.orientation import SIDEWAYS, turned, turned_size
+from rdstitch.pipeline.image_circle import find_circle, with_image_circle
 from rdstitch.synthetic import FisheyeLens, grid_poses, ground, sequence_over
+from rdstitch.system.cache import Cache
 
 SIZE = (40, 30)
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rdstitch.camera import Camera
-from rdstitch.crs import Crs
 from rdstitch.errors import InputError
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.crs import Crs
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.positions import with_ground_control, with_positions
 from rdstitch.inputs.source import Source

@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from rdstitch.geometry.exif_orientation import turned, turning_matrix
+from rdstitch.geometry.planar_motion import tilt_from_normal
 from rdstitch.io import Attitude, Metadata, read_metadata
 from rdstitch.io.attitude import read_attitude
-from rdstitch.orientation import turned, turning_matrix
-from rdstitch.planar_motion import tilt_from_normal
 from rdstitch.synthetic import Poses
 from tests.drone_xmp import DIALECTS, euler_angles, xmp_of
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
 from rdstitch.local_alignment import DisplacementField, LocalAlignment, Match, align_locally, fit
 from rdstitch.local_alignment.field import grid_shape, node_points
 from rdstitch.local_alignment.fit import Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches, place_matches
 from rdstitch.pipeline.placed_images import align_registration_locally
-from rdstitch.radial_homography import from_directions, from_plane, to_directions, to_plane
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
 
 SIZE = (640, 480)

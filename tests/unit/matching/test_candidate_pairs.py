@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rdstitch.arrays import FloatArray
-from rdstitch.cache import Cache
-from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features
 from rdstitch.features.keypoints import Descriptors
+from rdstitch.geometry.camera import Camera
 from rdstitch.matching.candidate_pairs import CANDIDATES, EXHAUSTIVE_UP_TO, neighbours, pairs_that_matter
 from rdstitch.matching.candidate_pairs import first_pairs as _first_pairs
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
+from rdstitch.system.cache import Cache
 
 
 def first_pairs(features: list[Features], seed: int, positions: FloatArray | None = None) -> list[tuple[int, int]]:

@@ -4,10 +4,10 @@ import itertools
 
 import numpy as np
 
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link, in_alternate_directions, spread_choice
 from rdstitch.matching.match_graph import connected_components, spanning_forest, spanning_tree
-from rdstitch.radial_homography import RadialHomography
 
 
 def _link(image1: int, image2: int) -> Link:

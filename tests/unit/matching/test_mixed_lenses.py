@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.features import Correspondences
+from rdstitch.geometry.camera import Camera
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.mixed_lenses import TwoLenses, Votes, two_lenses

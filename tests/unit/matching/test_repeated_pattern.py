@@ -9,14 +9,14 @@ import pytest
 
 import rdstitch
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, FeatureOptions, Features, detect
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features, show_motion
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.radial_homography import RadialHomography
 from rdstitch.synthetic import ImageTexture, Sequence, grid_poses, ground, sequence_over
 
 CAMERA = Camera((640, 480), -0.2)

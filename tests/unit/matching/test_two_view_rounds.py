@@ -7,14 +7,14 @@ from functools import partial
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, match
+from rdstitch.geometry.camera import Camera
 from rdstitch.matching.candidate_pairs import neighbours
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.static_background import is_static_pair, moving_features
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.progress import silent
 from rdstitch.robust import EstimationOptions
+from rdstitch.system.progress import silent
 
 LENS = Camera((640, 480), distortion=-0.2, focal=520.0)
 IMAGES = 4

@@ -10,20 +10,20 @@ import pytest
 
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
-from rdstitch.cache import NO_CACHE
-from rdstitch.camera import Camera
 from rdstitch.executors import open_executor
 from rdstitch.features import Correspondences, FeatureOptions
+from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import write_image
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.messages import Message, left_out
-from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import _without, accept
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, reselect_inliers, select_by_whole_lens
 from rdstitch.pipeline.register import register
+from rdstitch.results.messages import Message, left_out
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.system.cache import NO_CACHE
 from rdstitch.verification.verdict import RefusedError
 from tests.alignment_scenes import grid, scene
 from tests.cli.running import flight

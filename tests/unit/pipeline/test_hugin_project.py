@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.camera_files import read_camera_file
 from rdstitch.errors import ArgumentError
-from rdstitch.options import StitchOptions
+from rdstitch.geometry.camera import Camera
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.pipeline.result_files import project_of_hugin
+from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic.panorama import panorama_rotations, turning_sequence
 from tests.cli.running import flight
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.division_model import distorted_ratio
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.division_model import distorted_ratio
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
 from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
 from rdstitch.robust.measurements import Measurements

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from rdstitch.camera import Camera
 from rdstitch.choices import SOLVERS, SolverName
 from rdstitch.errors import ArgumentError
+from rdstitch.geometry.camera import Camera
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
 from tests.correspondences import correspondences
 

@@ -7,9 +7,9 @@ import pytest
 
 import rdstitch
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.camera import Camera
-from rdstitch.planar_motion import rigid_in_plane, rotation_from_tilt
-from rdstitch.radial_homography import transfer
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.planar_motion import rigid_in_plane, rotation_from_tilt
+from rdstitch.geometry.radial_homography import transfer
 from rdstitch.robust import SolverName, estimate_radial_homography
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import minimal_solvers

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
+from rdstitch.geometry.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 
 MOTION = PlanarMotion((0.1, -0.15), 0.4, (0.3, -0.2), 1.15)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.planar_motion import PlanarMotion
-from rdstitch.radial_homography import transfer
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.planar_motion import PlanarMotion
+from rdstitch.geometry.radial_homography import transfer
 from rdstitch.robust.covariance import covariances
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel

@@ -5,9 +5,9 @@ import pytest
 from scipy.stats import binom
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
-from rdstitch.radial_homography import transfer
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import transfer
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.robust.verification import MIN_PLACES, binomial_tail, places, rejection_reason

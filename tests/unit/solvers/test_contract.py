@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt
-from rdstitch.radial_homography import lift, transfer
+from rdstitch.geometry.planar_motion import PlanarMotion, rotation_from_tilt
+from rdstitch.geometry.radial_homography import lift, transfer
 from rdstitch.solvers import Solutions
 from tests.instances import planar_instances, rotation_instances
 

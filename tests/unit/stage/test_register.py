@@ -15,7 +15,7 @@ from rdstitch.io.flat_field import FlatField, read_flat_field
 from rdstitch.pipeline.read_inputs import with_flat_field
 from rdstitch.stage import TileRegistration, register_tiles
 from rdstitch.stage.correlation import Overlap, correlate
-from rdstitch.stage.flat_field import estimate_illumination
+from rdstitch.stage.estimate_flat_field import estimate_illumination
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table, oriented
 from tests.stage_grid import Specimen, StageGrid

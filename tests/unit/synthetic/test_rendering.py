@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, OutputError
+from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import (
     RELIEFS,
     BrownLens,

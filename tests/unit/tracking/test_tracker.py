@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from examples.judging.trajectories import compare_trajectories
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, Features, detect, match
+from rdstitch.features.corner_flow import CornerFlow, corners_of, fitted_affine, matched_corners
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
-from rdstitch.inputs.corner_flow import CornerFlow, corners_of, fitted_affine, matched_corners
-from rdstitch.planar_motion import rotation_from_tilt
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, drive_poses, sequence_over
 from rdstitch.tracking import CameraPose, Placement, PlaneSimilarity, Preview, Tracked, Tracker, TrackingOptions

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.motion_models.rotation import rotation_from_vector
 from rdstitch.alignment.result import LinkFit
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.io import DecodedImage, Metadata
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification import overlap_check

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment.result import LinkFit
-from rdstitch.camera import Camera
-from rdstitch.messages import Message
-from rdstitch.radial_homography import RadialHomography
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.results.messages import Message
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import TEXTS, Finding, messages_of

@@ -9,9 +9,9 @@ import pytest
 
 from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.radial_homography import RadialHomography
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification.overlap_check import CheckedLink, ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey, overlap_agreement

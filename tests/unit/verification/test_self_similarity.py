@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification.photometric_agreement import ComparedImage
 from rdstitch.verification.self_similarity import Ambiguity, draw, drawing_scale, placement_ambiguity

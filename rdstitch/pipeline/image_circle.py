@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.cache import Cache
 from rdstitch.errors import InputError
 from rdstitch.executors import in_order
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import mean_of_channels
+from rdstitch.system.cache import Cache
 
 _IMAGES = 5  # looked at, from all parts of the sequence: what is dark in their mean is dark in each
 _DARK = 0.1  # of the brightest twentieth, up to which a pixel is dark: a surround has stray light, and noise

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rdstitch.alignment.evidence import Evidence
+from rdstitch.alignment.residual_likelihood import Evidence
 from rdstitch.arrays import FloatArray
 from tests.alignment_stubs import SCALE, independent_errors, observations
 

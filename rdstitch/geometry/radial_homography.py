@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.camera import Camera
-from rdstitch.division_model import distort, divisor, divisor_slope, measured_ratio
-from rdstitch.planar_motion import PlanarMotion
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.division_model import distort, divisor, divisor_slope, measured_ratio
+from rdstitch.geometry.planar_motion import PlanarMotion
 
 
 def lift(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
@@ -118,7 +118,7 @@ class TransferJacobian:
         return entries.reshape(2, 9, -1).transpose(2, 0, 1)
 
     def by_lens(self, free: BoolArray) -> FloatArray:
-        """By those of :data:`rdstitch.camera.LENS_PARAMETERS` that are ``free`` (5,), shape (2, K, N).
+        """By those of :data:`rdstitch.geometry.camera.LENS_PARAMETERS` that are ``free`` (5,), shape (2, K, N).
 
         The centre shifts in both images.
         """

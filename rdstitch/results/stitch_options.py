@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Self
 
 from rdstitch.alignment import LENSES, MODELS
-from rdstitch.camera import Camera
 from rdstitch.choices import LensName, ModelName, SolverName
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.executors import LOCAL, open_executor
 from rdstitch.features import FeatureOptions
+from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.local_alignment import MAX_CELLS, LocalAlignmentMode
-from rdstitch.machine import processor_count
 from rdstitch.robust import SOLVERS, EstimationOptions
+from rdstitch.system.machine import processor_count
 
 _SELECT_MODEL_BELOW = 50
 """Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""

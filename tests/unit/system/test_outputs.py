@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from rdstitch.errors import InputError, OutputError
-from rdstitch.file_access import is_url, url_of
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
-from rdstitch.outputs import Outputs, TemporaryFolder, check_output, write_bytes_atomic
+from rdstitch.system.file_access import is_url, url_of
+from rdstitch.system.outputs import Outputs, TemporaryFolder, check_output, write_bytes_atomic
 from tests.faults import OPERATIONS, Operation, failing_disk
 
 _NAMES = ("a.dzi", "a.dzw", "a.dzi.json")
@@ -167,8 +167,8 @@ def test_whatever_is_no_tile_keeps_a_folder(tmp_path: Path, name: str) -> None:
 _KILLED = """
 import os, signal, sys
 from pathlib import Path
-from rdstitch.outputs import Outputs
-from rdstitch.outputs import TemporaryFolder
+from rdstitch.system.outputs import Outputs
+from rdstitch.system.outputs import TemporaryFolder
 with TemporaryFolder() as folder, Outputs(False) as outputs:
     (folder / "frame.png").write_bytes(b"half")
     with outputs.writing(sys.argv[1]) as staged:

@@ -24,8 +24,8 @@ from typing import Any, Generic, Self, TypeVar, cast
 import numpy as np
 
 from rdstitch.errors import ArgumentError, InputError, OutputError
-from rdstitch.file_access import is_url, open_regular, read_limited, remote_status
-from rdstitch.outputs import TemporaryFolder
+from rdstitch.system.file_access import is_url, open_regular, read_limited, remote_status
+from rdstitch.system.outputs import TemporaryFolder
 
 Value = TypeVar("Value")
 

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
 from rdstitch.io.reduction import block_mean
-from rdstitch.late_imports import csgraph, sparse
-from rdstitch.progress import Progress, silent
 from rdstitch.stage.adjustment import Adjustment, LinkedPoints, adjust
 from rdstitch.stage.correlation import Overlap, Surfaces, best_place, correlate
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.refinement import BlockMatches, Transfer, refine
+from rdstitch.system.late_imports import csgraph, sparse
+from rdstitch.system.progress import Progress, silent
 
 Reader = Callable[[int], NDArray[Any]]
 """Gives a tile as it is registered, (h, w)."""

@@ -22,8 +22,8 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from rdstitch.errors import OutputError, RdstitchError
-from rdstitch.file_access import local_file
-from rdstitch.messages import Message
+from rdstitch.results.messages import Message
+from rdstitch.system.file_access import local_file
 
 # On Windows nothing proves a process dead, and its leftovers stay.
 if sys.platform != "win32":

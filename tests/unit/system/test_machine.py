@@ -10,9 +10,9 @@ from threading import Thread
 
 import pytest
 
-from rdstitch import machine, process_memory
-from rdstitch.machine import available_memory, processor_count
-from rdstitch.process_memory import scratch_memory
+from rdstitch.system import machine, process_memory
+from rdstitch.system.machine import available_memory, processor_count
+from rdstitch.system.process_memory import scratch_memory
 from tests.cli.running import flight
 
 FREE = {"proc/meminfo": "MemTotal: 16000 kB\nMemAvailable:    8000 kB\n"}
@@ -86,7 +86,7 @@ def test_where_the_system_says_nothing_there_is_a_guess(tmp_path: Path, monkeypa
 _LARGE_AND_SMALL = """
 from os import sysconf
 import numpy as np
-from rdstitch.process_memory import return_freed_memory
+from rdstitch.system.process_memory import return_freed_memory
 
 def resident():
     with open("/proc/self/statm") as file:
@@ -114,7 +114,7 @@ def test_large_arrays_go_back_though_small_ones_were_made_between_them() -> None
 _AGAIN_AND_AGAIN = """
 import resource, sys
 import numpy as np
-from rdstitch.process_memory import return_freed_memory, reuse_freed_memory
+from rdstitch.system.process_memory import return_freed_memory, reuse_freed_memory
 return_freed_memory()
 if len(sys.argv) > 1:
     reuse_freed_memory()
@@ -196,7 +196,7 @@ _NOT_YET = (
     *("scipy", "tifffile", "tqdm", "matplotlib", "email"),
     *(
         "rdstitch.report",
-        "rdstitch.doctor",
+        "rdstitch.pipeline.doctor",
         "rdstitch.synthetic",
         "rdstitch.tracking",
         "rdstitch.camera_files",

@@ -12,7 +12,7 @@ from rdstitch.alignment import LENSES, MODELS
 from rdstitch.choices import LensName, ModelName, ProjectionName
 from rdstitch.compositing.projection import PROJECTIONS
 from rdstitch.errors import ArgumentError
-from rdstitch.messages import Message, left_out, told_once
+from rdstitch.results.messages import Message, left_out, told_once
 from rdstitch.verification.findings import TEXTS
 from rdstitch.verification.verdict import RefusedError
 
@@ -38,7 +38,7 @@ def test_the_temporary_folder_of_a_video_is_not_named() -> None:
     assert str(left_out("/tmp/rdstitch-x1.part/drive_0003.jpg", "is blurred")).startswith("left out drive_0003.jpg: ")
 
 
-_ROOT = Path(__file__).parents[2]
+_ROOT = Path(__file__).parents[3]
 
 
 def test_every_code_has_a_paragraph_and_every_paragraph_a_code() -> None:

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 import rdstitch
 from examples.judging import registration_error
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions
+from rdstitch.geometry.camera import Camera
 from rdstitch.io import write_image
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline import register as stages
-from rdstitch.pipeline import repeated_pattern
+from rdstitch.pipeline import settle_repeated_pattern
 from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, repeated, sequence_over
 from rdstitch.verification.unique_places import UniqueShift
 from tests.compositing_scenes import render
@@ -94,7 +94,7 @@ def test_images_that_look_alike_nowhere_else_keep_their_places(monkeypatch: pyte
     sequence = sequence_over(partial(ground, seed=2), LENS, grid_poses(LENS, 3, 1, overlap=0.6, seed=3), seed=3)
     decided = {(0, 1): UniqueShift(np.zeros(2), 1.0, 1.0, 0.0)}
     monkeypatch.setattr(Pairing, "shows_repeated_pattern", property(lambda pairing: True))
-    monkeypatch.setattr(repeated_pattern, "unique_shifts", lambda placed, pairs, workers: decided)
+    monkeypatch.setattr(settle_repeated_pattern, "unique_shifts", lambda placed, pairs, workers: decided)
     result = rdstitch.mosaic([sequence.frame(k) for k in range(3)], None, OPTIONS)
     assert result.registration.alignment.used.all(), result.registration.messages
 

@@ -16,12 +16,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from rdstitch import cache
-from rdstitch.cache import Cache, Stored, digest, pack, unpack
-from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.options import StitchOptions
-from rdstitch.outputs import TemporaryFolder
+from rdstitch.geometry.camera import Camera
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.system import cache
+from rdstitch.system.cache import Cache, Stored, digest, pack, unpack
+from rdstitch.system.outputs import TemporaryFolder
 
 
 @pytest.fixture(autouse=True)
@@ -117,7 +117,7 @@ def test_abandoned_unfinished_files_are_removed(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="nothing proves a process dead there")
 def test_the_store_of_a_killed_run_is_removed_by_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    script = "import os; from rdstitch.cache import Cache; c = Cache.for_this_run(); os.kill(os.getpid(), 9)"
+    script = "import os; from rdstitch.system.cache import Cache; c = Cache.for_this_run(); os.kill(os.getpid(), 9)"
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     subprocess.run([sys.executable, "-c", script], env=environment, check=False)
     (left,) = tmp_path.iterdir()

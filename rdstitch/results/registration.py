@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 from rdstitch.alignment import Alignment
-from rdstitch.camera import Camera
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.inputs.source import Source
 from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.messages import Message, of_severity
-from rdstitch.orientation import inverse
+from rdstitch.results.messages import Message, of_severity
 
 if TYPE_CHECKING:
-    from rdstitch.stage.register import TileRegistration
+    from rdstitch.stage.register_tiles import TileRegistration
 
 
 @dataclass(frozen=True)

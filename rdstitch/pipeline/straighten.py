@@ -21,9 +21,9 @@ from rdstitch.compositing.upright import (
 )
 from rdstitch.errors import ArgumentError
 from rdstitch.features.prepared_image import prepare
-from rdstitch.messages import Message
+from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.pipeline.placed_images import PlacedImages
-from rdstitch.planar_motion import nearest_rotation
+from rdstitch.results.messages import Message
 
 _MEGAPIXELS = 0.6  # of the images that edges are found in
 _MAX_IMAGES = 40

@@ -5,13 +5,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rdstitch import division_model
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.division_model import distort, horizon_radius, nearest_one_parameter, undistort, valid_radius
 from rdstitch.errors import ArgumentError
-from rdstitch.planar_motion import PlanarMotion
-from rdstitch.radial_homography import (
+from rdstitch.geometry import division_model
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.division_model import distort, horizon_radius, nearest_one_parameter, undistort, valid_radius
+from rdstitch.geometry.planar_motion import PlanarMotion
+from rdstitch.geometry.radial_homography import (
     RadialHomography,
     from_plane,
     measurement_whitening,

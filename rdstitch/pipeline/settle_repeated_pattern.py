@@ -11,15 +11,15 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import RegistrationError
 from rdstitch.features import Correspondences
 from rdstitch.features.crossings import find_crossings
-from rdstitch.features.options import CLOSER, WORK_MEGAPIXELS
+from rdstitch.features.feature_options import CLOSER, WORK_MEGAPIXELS
 from rdstitch.features.prepared_image import Stretch, prepare
+from rdstitch.geometry.nearest_points import nearest_points
+from rdstitch.geometry.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.nearest_points import nearest_points
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
-from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.robust.verification import places
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE
@@ -52,7 +52,7 @@ def settle_repeated_pattern(
     Parameters
     ----------
     stretch : (float, float) or None
-        Grey levels of black and white, see :class:`rdstitch.registration.Registration`.
+        Grey levels of black and white, see :class:`rdstitch.results.registration.Registration`.
     workers : int
         Images that are read and compared at the same time.
 
@@ -125,7 +125,7 @@ def match_crossings(
     aligned : AlignedPairs
         By keypoints; right to less than a period of the pattern.
     stretch : (float, float) or None
-        Grey levels of black and white, see :class:`rdstitch.registration.Registration`.
+        Grey levels of black and white, see :class:`rdstitch.results.registration.Registration`.
     workers : int
         Images that are read at the same time.
 

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import pytest
 
-from rdstitch.opencv_state import one_opencv_thread, silent_opencv
+from rdstitch.system.opencv_state import one_opencv_thread, silent_opencv
 
 LOGGING: Any = getattr(cv2.utils, "logging", cv2)
 THREADS = (one_opencv_thread, cv2.getNumThreads, cv2.setNumThreads, 1)
@@ -41,7 +41,7 @@ import os, sys
 import cv2
 import numpy as np
 from rdstitch.features.detect import detect
-from rdstitch.opencv_state import one_opencv_thread
+from rdstitch.system.opencv_state import one_opencv_thread
 
 image = np.random.default_rng(0).integers(0, 255, (400, 600), dtype=np.uint8)
 cv2.setNumThreads(4)

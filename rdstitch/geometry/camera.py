@@ -5,7 +5,8 @@ Points are in pixels ``(u, v)`` with the centre of the top-left pixel at ``(0, 0
 :class:`Camera` keeps it for ``s`` = half the image diagonal, so that ``1 + λ`` is the factor at the image
 corner; where the lens draws a circle that is smaller than the image, ``s`` is the radius of that circle.
 
-The lens is the division model of :mod:`rdstitch.division_model`, with λ alone or with further even coefficients.
+The lens is the division model of :mod:`rdstitch.geometry.division_model`, with λ alone or with further even
+coefficients.
 """
 
 import math
@@ -19,7 +20,8 @@ from msgspec import field as record_field
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.division_model import (
+from rdstitch.errors import ArgumentError, ImpossibleCameraError
+from rdstitch.geometry.division_model import (
     distort,
     folds,
     horizon_radius,
@@ -28,12 +30,11 @@ from rdstitch.division_model import (
     stretch_radius,
     undistort,
 )
-from rdstitch.errors import ArgumentError, ImpossibleCameraError
-from rdstitch.file_access import read_text
-from rdstitch.orientation import SIDEWAYS, turned_size, turning_matrix
-from rdstitch.outputs import check_output, json_bytes, write_bytes_atomic
-from rdstitch.planar_motion import turned_tilt
-from rdstitch.records import NonNegative, Pair, Size, Triple, convert, parse_json
+from rdstitch.geometry.exif_orientation import SIDEWAYS, turned_size, turning_matrix
+from rdstitch.geometry.planar_motion import turned_tilt
+from rdstitch.system.file_access import read_text
+from rdstitch.system.outputs import check_output, json_bytes, write_bytes_atomic
+from rdstitch.system.records import NonNegative, Pair, Size, Triple, convert, parse_json
 
 FILE_VERSION = 2
 """Of camera files; version 1 had λ and μ only, as ``lambda`` and ``lambda2``."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rdstitch.nearest_points import nearest_points
+from rdstitch.geometry.nearest_points import nearest_points
 
 
 @pytest.mark.parametrize(("points", "queries", "dimensions"), [(1, 3, 2), (40, 7, 2), (900, 50, 3)])

@@ -15,10 +15,10 @@ from rdstitch.inputs.frame import ChannelOrder, in_order
 from rdstitch.io.preview import encode_preview, read_preview
 from rdstitch.io.read import read_image
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
-from rdstitch.messages import Message
-from rdstitch.options import StitchOptions
-from rdstitch.outputs import Fingerprint
-from rdstitch.registration import Registration, Verdict
+from rdstitch.results.messages import Message
+from rdstitch.results.registration import Registration, Verdict
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.system.outputs import Fingerprint
 
 _PREVIEW = 800  # pixels of the longer side
 

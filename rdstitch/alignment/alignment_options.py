@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.priors import CameraPriors, known_focal
-from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
+from rdstitch.geometry.camera import Camera
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""The nouns of the field: camera, lens, homography, coordinate systems."""

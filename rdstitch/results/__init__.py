@@ -1,0 +1,1 @@
+"""What a recipe takes and gives: options, registration, stitch result, messages."""

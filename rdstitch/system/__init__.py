@@ -1,0 +1,1 @@
+"""Files and the machine: what is not about images."""
