@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from tempfile import mkdtemp
 
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, Named, files_of
@@ -202,13 +203,15 @@ class _Clip:
 
     def extract(self, every: int | None, topic: str | None, notes: list[Message]) -> list[Frame]:
         """Write the frames that are wanted; what was passed over is added to the notes."""
+        # A folder of its own: two cameras may call their videos the same.
+        folder = Path(mkdtemp(dir=self.folder()))
         if is_bag(self.path):
-            images, wanted = extract_images(self.path, self.folder(), every, topic)
+            images, wanted = extract_images(self.path, folder, every, topic)
             notes += wanted.messages(self.path)
             return images
         wanted = wanted_frames(every, partial(grey_frames, self.path))
         notes += wanted.messages(self.path)
-        return [Frame(*frame) for frame in extract_frames(self.path, self.folder(), wanted.__contains__)]
+        return [Frame(*frame) for frame in extract_frames(self.path, folder, wanted.__contains__)]
 
     def among(self, images: int) -> Message:
         """Why it is not used beside images."""

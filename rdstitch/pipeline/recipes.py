@@ -23,7 +23,7 @@ from rdstitch.pipeline.aligner import Purpose
 from rdstitch.pipeline.compose import blocks_on, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
-from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs
+from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag
 from rdstitch.pipeline.register import register, with_frontal_reference
 from rdstitch.pipeline.straighten import turned
 from rdstitch.pipeline.whole_pixels import on_whole_pixels
@@ -222,12 +222,13 @@ def _stitch(
 ) -> StitchResult:
     """The stages of :func:`mosaic`, and, where every image must be readable and one gives the plane, :func:`pano`."""
     given = as_inputs(inputs, options.channel_order)
+    options, notes = with_camera_in_bag(given, options)
     with found_images(given, output=output, every=every, topic=options.topic) as listed:
         _check_outputs(output, options, listed.files)
         sources, unread = read_inputs(in_lasting_order(listed.frames), options, skip_bad=not pano)
         check_map(sources, options.composite)
         with options.executor(len(sources)) as executor:
-            known = [*unread, *listed.messages]
+            known = [*unread, *listed.messages, *notes]
             accepted = _accepted(sources, known, options, executor, progress, "pano" if pano else "mosaic")
             registration = on_whole_pixels(with_frontal_reference(accepted, options, always=pano))
             local = align_registration_locally(registration, options.local_alignment)
@@ -316,7 +317,9 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = replace(options or StitchOptions(), pose_covariance=True)
-    with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
+    given = as_inputs(inputs, options.channel_order)
+    options, notes = with_camera_in_bag(given, options)
+    with found_images(given, every=every, topic=options.topic) as listed:
         files = [file for file in (output, plot) if file is not None]
         for file in files:
             read = [*listed.files, *options.files, *([] if timestamps is None else [timestamps])]
@@ -325,7 +328,7 @@ def trajectory(
         sources, unread = read_inputs(listed.frames, options, skip_bad=True)
         times = timestamps_of(sources, timestamps)
         with options.executor(len(sources)) as executor:
-            known = [*unread, *listed.messages]
+            known = [*unread, *listed.messages, *notes]
             registration = _accepted(sources, known, options, executor, progress, "trajectory")
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import rdstitch
 from rdstitch.arrays import FloatArray
-from rdstitch.camera_files.lens_models import LensModel
+from rdstitch.geometry.lens_model import LensModel
 from rdstitch.errors import RdstitchError
 
 BOARDS = {
