@@ -63,6 +63,9 @@ class StitchOptions:
         Measured tilt of each image: CSV of name, psi, theta, degrees; or "xmp".
     attitude_std : float
         Standard deviation of these tilts, radians; 0: exact.
+    timestamps : path, optional
+        Times of the images, see :func:`rdstitch.inputs.measurements.with_times`; otherwise those of the video, the bag,
+        or EXIF.
     positions : path, optional
         Positions of the images instead of those of EXIF; see :mod:`rdstitch.inputs.positions`. Their x and y are in the
         system of ``composite.epsg``.
@@ -130,6 +133,7 @@ class StitchOptions:
     tilt: tuple[float, float] | None = None
     attitude: str | Path | None = None
     attitude_std: float = math.radians(1.0)
+    timestamps: str | Path | None = None
     positions: str | Path | None = None
     positions_offset: float = 0.0
     gcp: str | Path | None = None
@@ -211,7 +215,15 @@ class StitchOptions:
     @property
     def files(self) -> list[Path]:
         """The files that are read besides the images, none of which may be written over."""
-        named = (self.mask, self.attitude, self.positions, self.gcp, self.lightglue_model, self.features.aliked_model)
+        named = (
+            self.mask,
+            self.attitude,
+            self.timestamps,
+            self.positions,
+            self.gcp,
+            self.lightglue_model,
+            self.features.aliked_model,
+        )
         given = [Path(file) for file in named if file is not None]
         return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
 
