@@ -40,6 +40,7 @@ from rdstitch.sidecar.write import (
     versions,
 )
 from rdstitch.system.file_access import canonical_name, canonical_text
+from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_output, json_bytes
 from rdstitch.system.progress import Progress, silent
 
@@ -159,6 +160,7 @@ MatchBy = Literal["auto", "name", "order"]
 _MATCHES = ("auto", "name", "order")
 
 
+@one_opencv_thread()
 def apply(
     sidecar: str | Path,
     images: Images,

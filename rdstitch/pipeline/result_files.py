@@ -25,6 +25,7 @@ from rdstitch.io.tiff import write_cropped_tiff
 from rdstitch.pipeline.apply_sidecar import Recomposition
 from rdstitch.pipeline.composer import placed_by
 from rdstitch.results.stitch_result import StitchResult
+from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_outputs
 
 
@@ -45,6 +46,7 @@ def make_folder(folder: str | Path) -> None:
         raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
 
 
+@one_opencv_thread()
 def write_layers(
     result: StitchResult | Recomposition,
     folder: str | Path,
