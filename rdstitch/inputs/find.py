@@ -1,15 +1,16 @@
 """What the user names as input: folders, files, patterns, lists, videos; in the end a list of frames."""
 
 import glob
+import hashlib
 import json
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import count
 from pathlib import Path
-from tempfile import mkdtemp
 
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, Named, files_of
@@ -133,7 +134,25 @@ def find_images(
             frames.append(frame)
     if outputs and not frames:
         raise InputError(f"{outputs[0].parent}: there are no images but those that rdstitch wrote")
-    return FoundImages(frames, outputs, tuple(containers), tuple(notes))
+    return FoundImages(_labelled(frames), outputs, tuple(containers), tuple(notes))
+
+
+def _labelled(frames: Sequence[Frame]) -> list[Frame]:
+    """The same; those of one file name are called by as many of their folders too as tell them from each other."""
+    places: dict[str, set[tuple[str, ...]]] = {}
+    for frame in frames:
+        places.setdefault(frame.path.name, set()).add(_entry(frame.path).parts)
+    depth = {
+        name: next(n for n in count(1) if len({parts[-n:] for parts in alike}) == len(alike))
+        for name, alike in places.items()
+        if len(alike) > 1
+    }
+    return [
+        replace(frame, label=canonical_name("/".join(_entry(frame.path).parts[-depth[frame.path.name] :])))
+        if frame.path.name in depth and not frame.label and frame.image is None
+        else frame
+        for frame in frames
+    ]
 
 
 def _entry(path: Path) -> Path:
@@ -203,8 +222,10 @@ class _Clip:
 
     def extract(self, every: int | None, topic: str | None, notes: list[Message]) -> list[Frame]:
         """Write the frames that are wanted; what was passed over is added to the notes."""
-        # A folder of its own: two cameras may call their videos the same.
-        folder = Path(mkdtemp(dir=self.folder()))
+        # Of its own: another one may have the same name, in another folder.
+        place = _entry(self.path)
+        folder = self.folder() / hashlib.sha256(os.fsencode(place)).hexdigest()[:8] / place.parent.name
+        folder.mkdir(parents=True, exist_ok=True)
         if is_bag(self.path):
             images, wanted = extract_images(self.path, folder, every, topic)
             notes += wanted.messages(self.path)
