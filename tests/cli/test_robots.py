@@ -95,8 +95,9 @@ def test_without_times_numbers_stand_for_them_and_that_is_said(
 
 def test_what_cannot_be_read_keeps_its_time_and_is_counted(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     (folder := tmp_path / "drive").mkdir()
-    for number, content in enumerate([frames[0], b"", frames[1], b"broken", frames[2]]):
-        (folder / f"{number}.png").write_bytes(content if isinstance(content, bytes) else content.read_bytes())
+    good = [frame.read_bytes() for frame in frames]
+    for number, content in enumerate([good[0], b"", good[1], b"broken", good[2]]):
+        (folder / f"{number}.png").write_bytes(content)
     Image.fromarray(np.full((300, 400), 90, np.uint8)).save(folder / "5.png")
     (tmp_path / "times.txt").write_text("".join(f"{100 + k}\n" for k in range(6)), encoding="utf-8")
     known = ("--timestamps", tmp_path / "times.txt", "--focal", "380", *CACHED)
