@@ -69,6 +69,8 @@ class StitchOptions:
         Seconds to add to the images' times for those of a GPX track, which are in UTC.
     gcp : path, optional
         Ground control points, as OpenDroneMap's ``gcp_list.txt``: they alone place the output on the Earth.
+    check_points : path, optional
+        Points in the same format that are compared with the map, and take no part in it.
     mask : path, optional
         Image, or folder of them, that is dark where the images do not count.
     channel_order : str
@@ -132,6 +134,7 @@ class StitchOptions:
     positions: str | Path | None = None
     positions_offset: float = 0.0
     gcp: str | Path | None = None
+    check_points: str | Path | None = None
     mask: str | Path | None = None
     channel_order: ChannelOrder = "bgr"
     exclude: tuple[str, ...] = ()
@@ -207,7 +210,15 @@ class StitchOptions:
     @property
     def files(self) -> list[Path]:
         """The files that are read besides the images, none of which may be written over."""
-        named = (self.mask, self.attitude, self.positions, self.gcp, self.lightglue_model, self.features.aliked_model)
+        named = (
+            self.mask,
+            self.attitude,
+            self.positions,
+            self.gcp,
+            self.check_points,
+            self.lightglue_model,
+            self.features.aliked_model,
+        )
         given = [Path(file) for file in named if file is not None]
         return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
 
