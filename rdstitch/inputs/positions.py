@@ -10,25 +10,23 @@ a coordinate system, then lines   OpenDroneMap's ``geo.txt``: NAME X Y [Z … HO
 ================================= ====================================================================
 """
 
-import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.crs import WGS84, Crs, NamedSystem
-from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.source import Source
+from rdstitch.inputs.tables import Row, by_image, csv_rows, json_rows, listed_rows
+from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points
 from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.system.file_access import canonical_text, read_text
-from rdstitch.system.records import parse_json, parse_xml
 
 _COLUMNS = {
     "name": "name filename sourcefile image imagename file label",
@@ -45,12 +43,9 @@ _COLUMNS = {
 }
 _SIDES = (("latitude", "south"), ("longitude", "west"))
 _LISTED = ("name", "x", "y", "altitude", "yaw", "pitch", "roll", "north_std", "up_std")  # in geo.txt
-_MEANING = {alias: column for column, aliases in _COLUMNS.items() for alias in aliases.split()}
-_NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?")
-_DELIMITERS = ",;\t"
-
-_Rows = Iterable[tuple[str, Mapping[str, str]]]
-"""Of each image: where in the file it is, and its values by the keys of :data:`_COLUMNS`."""
+_WANTED = ("name,latitude,longitude", "name,x,y")
+_UNITS = ("deg", "degrees", "m", "metres", "meters")
+_RECORDS = "a list of objects with SourceFile, GPSLatitude and GPSLongitude"
 
 
 def with_positions(
@@ -63,18 +58,18 @@ def with_positions(
     system = None if epsg is None else NamedSystem(f"EPSG:{epsg}", epsg)
     lines = text.split("\n", 1)
     if text.lstrip().startswith("<"):
-        places = _on_track(sources, _track_points(text, name), name, offset)
-    elif points := _subtitle_points(text):
-        places = _on_track(sources, points, name, offset)
-    elif _EVENT.match(text):
-        places = _by_events(sources, text, name)
+        places = on_track(sources, track_points(text, name), name, offset)
+    elif points := subtitle_points(text):
+        places = on_track(sources, points, name, offset)
+    elif is_list_of_events(text):
+        places = by_events(sources, text, name)
     else:
         if text.lstrip().startswith(("[", "{")):
-            rows = _json_rows(text, name)
+            rows = json_rows(text, name, _COLUMNS, _RECORDS)
         elif (named := NamedSystem.named_by(lines[0])) is not None:
-            rows, system = _listed_rows(lines[1:]), named
+            rows, system = listed_rows("".join(lines[1:]).splitlines(), name, _LISTED, 2), named
         else:
-            rows = _csv_rows(text, name)
+            rows = csv_rows(text, name, _COLUMNS, _WANTED, _UNITS)
         table = _table(rows, name, system)
         called = _same_names(sources, table)
         places = [table.get(called[source.name]) for source in sources]
@@ -86,73 +81,29 @@ def with_positions(
     ]
 
 
-def _csv_rows(text: str, file: str) -> _Rows:
-    lines = text.splitlines()
-    header = lines[0].lstrip("# ") if lines else ""
-    delimiter = max(_DELIMITERS, key=header.count)
-    table = csv.DictReader([header, *lines[1:]], delimiter=delimiter, skipinitialspace=True)
-    columns = {_meaning(column) for column in table.fieldnames or ()}
-    if "name" not in columns or not ({"latitude", "longitude"} <= columns or {"x", "y"} <= columns):
-        raise InputError(f"{file}: its first line names no columns like name,lat,lon or name,x,y")
-    try:
-        yield from ((f"line {table.line_num}", _known(row)) for row in table)
-    except csv.Error as error:
-        raise InputError(f"{file}: is not a CSV file: {error}") from error
-
-
-def _json_rows(text: str, file: str) -> _Rows:
-    content = parse_json(text, file)
-    if not isinstance(content, list) or not all(isinstance(item, dict) for item in content):
-        raise InputError(f"{file}: expected a list of objects with SourceFile, GPSLatitude and GPSLongitude")
-    return ((f"[{number}]", _known(item)) for number, item in enumerate(content))
-
-
-def _listed_rows(lines: Iterable[str]) -> _Rows:
-    for number, line in enumerate("\n".join(lines).splitlines(), start=2):
-        if fields := line.split():
-            yield f"line {number}", dict(zip(_LISTED, fields, strict=False))
-
-
-def _meaning(column: object) -> str | None:
-    """Which of :data:`_COLUMNS` a column is, without its group (``EXIF:``) and unit."""
-    plain = re.sub(r"[\[(].*", "", str(column).rpartition(":")[2])
-    return _MEANING.get(re.sub(r"[^a-z]", "", plain.lower()))
-
-
-def _known(row: Mapping[str, object]) -> dict[str, str]:
-    """The values that mean something; of several the last, which in exiftool's output is the one with a sign."""
-    named = ((_meaning(key), str(value or "").strip()) for key, value in row.items())
-    return {key: value for key, value in named if key and value}
-
-
-def _table(rows: _Rows, file: str, system: NamedSystem | None) -> dict[str, GpsPosition]:
+def _table(rows: Iterable[Row], file: str, system: NamedSystem | None) -> dict[str, GpsPosition]:
     """The positions by the names of the images; what has no position, or no fix, is not in it."""
     table: dict[str, GpsPosition] = {}
     projected: dict[str, tuple[float, float]] = {}
-    for where, row in rows:
-        name = canonical_text(PureWindowsPath(row.get("name", "")).name)
-        geographic = row.keys() & {"latitude", "longitude"}
-        first, second = ("latitude", "longitude") if geographic else ("y", "x")
-        y, x = (_number(row, *part) for part in ((first, "south"), (second, "west")))
-        if x is None or y is None or (geographic and x == y == 0.0):
-            continue
-        if not name or name in table:
-            raise InputError(f"{file}: {where}: {f'{name} is here twice; remove one' if name else 'has no name'}")
-        altitude = _number(row, "altitude")
-        if altitude is not None and "below" in row["altitude"].lower():
+    placed = []
+    for row in rows:
+        geographic = not row.values.keys().isdisjoint(("latitude", "longitude"))
+        y, x = (_degrees(row, *c) for c in _SIDES) if geographic else (row.number("y"), row.number("x"))
+        if x is not None and y is not None and not (geographic and x == y == 0.0):
+            placed.append((row, x, y, geographic))
+    by_image(row for row, *_ in placed)
+    for row, x, y, geographic in placed:
+        altitude = next(iter(row.numbers_within("altitude")), None)
+        if altitude is not None and "below" in row.values["altitude"].lower():
             altitude = -altitude
         if geographic or (system is not None and system.epsg == WGS84):
             if not (abs(y) <= 90.0 and abs(x) <= 180.0):
-                raise InputError(f"{file}: {where}: expected latitude and longitude in degrees, not {y:g} and {x:g}")
-            if geographic and any("deg" in row[key] and _side(row, key, ref) is None for key, ref in _SIDES):
-                raise InputError(
-                    f"{file}: {where}: does not say whether north or south, east or west; add N, S, E or W"
-                )
+                raise InputError(f"{row.where}: expected latitude and longitude in degrees, not {y:g} and {x:g}")
         elif system is None:
-            raise InputError(f"{file}: {where}: in which coordinate system x and y are is not known; give --crs")
+            raise InputError(f"{row.where}: in which coordinate system x and y are is not known; give --crs")
         else:
-            projected[name] = x, y
-        table[name] = GpsPosition(y, x, altitude, _accuracy(row))
+            projected[row.image] = x, y
+        table[row.image] = GpsPosition(y, x, altitude, _accuracy(row))
     if projected:
         assert system is not None
         places = _geographic(system, np.array(list(projected.values())), file)
@@ -161,9 +112,9 @@ def _table(rows: _Rows, file: str, system: NamedSystem | None) -> dict[str, GpsP
     return table
 
 
-def _accuracy(row: Mapping[str, str]) -> tuple[float, float] | None:
+def _accuracy(row: Row) -> tuple[float, float] | None:
     """Standard deviations of one horizontal coordinate and of the altitude, m; None where the row has none."""
-    along, across, up = (_number(row, name) for name in ("north_std", "east_std", "up_std"))
+    along, across, up = (row.number(name) for name in ("north_std", "east_std", "up_std"))
     if not (along and along > 0.0):
         return None
     across = across if across and across > 0.0 else along
@@ -181,22 +132,16 @@ def _geographic(system: NamedSystem, places: FloatArray, file: str) -> list[tupl
     return [(latitude, longitude) for latitude, longitude in found.tolist()]
 
 
-def _number(row: Mapping[str, str], key: str, reference: str = "") -> float | None:
-    """A number, or degrees, minutes and seconds, of this or the other side (N, S, E, W); None where there is none."""
-    text = row.get(key, "")
-    parts = [float(part.replace(",", ".")) for part in _NUMBER.findall(text)]
-    if not parts or not all(map(math.isfinite, parts)):
+def _degrees(row: Row, column: str, reference: str) -> float | None:
+    """Degrees, or degrees, minutes and seconds, of this or the other side (N, S, E, W); None where there are none."""
+    if not (parts := row.numbers_within(column)):
         return None
-    if not reference or key in "xy":
-        return parts[0]
+    text = row.values[column]
     value = sum(abs(part) / 60.0**k for k, part in enumerate(parts[:3]))
-    return -value if text.startswith("-") or _side(row, key, reference) in ("S", "W") else value
-
-
-def _side(row: Mapping[str, str], key: str, reference: str) -> str | None:
-    """N, S, E or W of a coordinate; None where it is not said."""
-    side = re.search(r"\b([NSEW])\w*\s*$", f"{row.get(key, '')} {row.get(reference, '')}", re.IGNORECASE)
-    return None if side is None else side[1].upper()
+    side = re.search(r"\b([NSEW])\w*\s*$", f"{text} {row.values.get(reference, '')}", re.IGNORECASE)
+    if side is None and "deg" in text:
+        raise InputError(f"{row.where}: '{text}' does not say whether north or south, east or west; add N, S, E or W")
+    return -value if text.startswith("-") or (side is not None and side[1] in "SsWw") else value
 
 
 def _same_names(sources: Sequence[Source], listed: Iterable[str]) -> dict[str, str]:
@@ -208,98 +153,6 @@ def _same_names(sources: Sequence[Source], listed: Iterable[str]) -> dict[str, s
         alike = lines.get(source.name.casefold(), source.name)
         found[source.name] = alike if source.name not in known and names[alike.casefold()] == 1 else source.name
     return found
-
-
-def _by_events(sources: Sequence[Source], text: str, file: str) -> list[GpsPosition | None]:
-    """Positions of DJI's ``.MRK``: events by their number, which the names of images end with.
-
-    They are those of the middle of the sensor; the offsets of the antenna are in them.
-    """
-    events: dict[int, GpsPosition] = {}
-    for line in text.splitlines():
-        if match := _EVENT.match(line):
-            number, latitude, longitude, height, *std = (float(value) for value in match.groups())
-            accuracy = (math.hypot(std[0], std[1]) / math.sqrt(2.0), std[2])
-            events[int(number)] = GpsPosition(latitude, longitude, height, accuracy if min(std) > 0.0 else None)
-    if not events:
-        raise InputError(f"{file}: has no events of a DJI .MRK file")
-    numbers = [_SEQUENCE.search(Path(source.name).stem) for source in sources]
-    places = [None if number is None else events.get(int(number[1])) for number in numbers]
-    if sum(place is not None for place in places) * 2 < len(places):
-        raise InputError(
-            f"{file}: has events {min(events)} to {max(events)}, which the numbers at the end of the names, as of "
-            f"{sources[0].name}, are not; give a CSV file with name,lat,lon"
-        )
-    return places
-
-
-_EVENT = re.compile(
-    r"\s*(\d+)\s+[\d.]+\s+\[\d+\].*?(-?[\d.]+),\s*Lat\s+(-?[\d.]+),\s*Lon\s+(-?[\d.]+),\s*Ellh\s+([\d.]+),\s*([\d.]+),"
-    r"\s*([\d.]+)"
-)
-_SEQUENCE = re.compile(r"_(\d{4})(?:_[A-Z]+)?$", re.IGNORECASE)
-_SUBTITLE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
-_IN_SUBTITLE = re.compile(
-    r"lat\w*\s*:\s*(?P<lat>-?[\d.]+).*?lon\w*\s*:\s*(?P<lon>-?[\d.]+)(?:.*?abs_alt\s*:\s*(?P<alt>-?[\d.]+))?"
-    r"|GPS\s*\((?P<lon2>-?[\d.]+),\s*(?P<lat2>-?[\d.]+)",
-    re.IGNORECASE | re.DOTALL,
-)
-
-
-def _subtitle_points(text: str) -> list[tuple[float, float, float, float]]:
-    """Seconds since the video began, latitude, longitude and altitude in the subtitles of a DJI video."""
-    starts = list(_SUBTITLE.finditer(text))
-    points = []
-    for start, end in zip(starts, [*(s.start() for s in starts[1:]), len(text)], strict=False):
-        if place := _IN_SUBTITLE.search(text, start.end(), end):
-            hours, minutes, seconds, milliseconds = (float(part) for part in start.groups())
-            latitude, longitude = (float(place[k] or place[f"{k}2"]) for k in ("lat", "lon"))
-            if latitude or longitude:  # 0, 0 is what is written without a fix
-                time = 3600.0 * hours + 60.0 * minutes + seconds + milliseconds / 1000.0
-                points.append((time, latitude, longitude, float(place["alt"] or "nan")))
-    return points
-
-
-def _track_points(text: str, file: str) -> list[tuple[float, float, float, float]]:
-    """Seconds since 1970, latitude, longitude and altitude of the points of a GPX track."""
-    points = []
-    for item in parse_xml(text, file).iter():
-        time = item.findtext("time")
-        if item.tag not in ("trkpt", "rtept", "wpt") or time is None:
-            continue
-        try:
-            moment = datetime.fromisoformat(time.strip())
-            values = (float(item.get("lat", "")), float(item.get("lon", "")), float(item.findtext("ele") or "nan"))
-        except ValueError as error:
-            raise InputError(f"{file}: a point of the track at {time!r} cannot be read: {error}") from error
-        points.append(((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp(), *values))
-    return points
-
-
-def _on_track(
-    sources: Sequence[Source], points: Sequence[tuple[float, float, float, float]], file: str, offset: float
-) -> list[GpsPosition | None]:
-    """Where the images are on a track, straight from point to point."""
-    if not points:
-        raise InputError(f"{file}: has no points with a time; give a GPX track or the subtitles (.SRT) of the video")
-    seconds, latitude, longitude, altitude = np.array(sorted(points)).T
-    times = timestamps_of(sources) + offset
-    if not ((times >= seconds[0]) & (times <= seconds[-1])).any():
-        taken = f"from {_moment(np.nanmin(times))} to {_moment(np.nanmax(times))}" if np.isfinite(times).any() else ""
-        raise InputError(
-            f"{file}: the track goes from {_moment(seconds[0])} to {_moment(seconds[-1])} UTC, the images "
-            f"{f'were taken {taken}; give --positions-offset' if taken else 'have no time'}"
-        )
-    known = (latitude, np.unwrap(longitude, period=360.0), altitude)
-    rows = np.stack([np.interp(times, seconds, values, left=np.nan, right=np.nan) for values in known], axis=1)
-    return [
-        None if math.isnan(y) else GpsPosition(y, (x + 180.0) % 360.0 - 180.0, None if math.isnan(z) else z)
-        for y, x, z in rows.tolist()
-    ]
-
-
-def _moment(seconds: float) -> str:
-    return str(np.datetime64(int(seconds), "s"))
 
 
 def with_ground_control(sources: Sequence[Source], file: str | Path | None, *, check: bool = False) -> list[Source]:
