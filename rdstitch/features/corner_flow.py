@@ -7,6 +7,7 @@ SIFT's matches 0.11.
 
 from collections.abc import Callable
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -17,6 +18,7 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features.prepared_image import PreparedImage
 
 _CORNERS, _QUALITY, _SPACING = 200, 0.005, 0.02  # the spacing is in sides of the image
+_TILES = 4, 3  # that corners are spread over: a vehicle's body has the strongest, and one place of a floor another
 _WINDOW, _LEVELS = (15, 15), 3
 _MARGIN = 8.0  # pixels, half a window
 _EXPECTED_LEVELS = 1  # where the expected motion has been taken out
@@ -57,9 +59,17 @@ class CornerFlow:
 
 
 def corners_of(frame: PreparedImage) -> FloatArray:
-    """Detect corners (N, 2) clear of the mask, pixels of ``grey``."""
-    detected = cv2.goodFeaturesToTrack(frame.grey, _CORNERS, _QUALITY, _SPACING * max(frame.grey.shape))
-    corners = np.empty((0, 2)) if detected is None else detected[:, 0].astype(np.float64)
+    """Detect corners (N, 2) clear of the mask, pixels of ``grey``, as many in each part of the image."""
+    height, width = frame.grey.shape
+    across, down = (np.linspace(0, side, count + 1).astype(int) for side, count in zip((width, height), _TILES, strict=True))
+    most, spacing = _CORNERS // (_TILES[0] * _TILES[1]), _SPACING * max(frame.grey.shape)
+    found = [np.empty((0, 2))]
+    for top, bottom in pairwise(down.tolist()):
+        for left, right in pairwise(across.tolist()):
+            corners = cv2.goodFeaturesToTrack(frame.grey[top:bottom, left:right], most, _QUALITY, spacing)
+            if corners is not None:
+                found.append(corners[:, 0] + (left, top))
+    corners = np.concatenate(found).astype(np.float64)
     return corners[_usable(frame, corners)]
 
 
