@@ -18,9 +18,10 @@ from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.inputs.frame import Frame, Image, as_inputs
-from rdstitch.inputs.measurements import time_of, timestamps_of
-from rdstitch.inputs.selection import is_selected, with_masks
+from rdstitch.inputs.measurements import XMP, time_of, timestamps_of, with_attitudes
+from rdstitch.inputs.selection import is_selected, mask_of, with_masks
 from rdstitch.inputs.source import Source
+from rdstitch.io.opening import check_readable
 from rdstitch.io.write import write_image
 from rdstitch.pipeline.aligner import alignment_options
 from rdstitch.pipeline.read_inputs import read_frames
@@ -152,7 +153,7 @@ def follow(
     Pose
         One a frame; and one more for keyframes that find their place only later.
     """
-    tracker = Tracker(options, poses)
+    tracker = Tracker(options, poses, patient=True)
     sketch = None if preview is None else _Sketch(preview, refresh)
     numbers = count()
     unread: dict[Path, int] = {}  # numbers of frames that come again
@@ -200,13 +201,18 @@ class Tracker:
     (False, None, 'the first frames wait for others')
     """
 
-    def __init__(self, options: StitchOptions | None = None, poses: FollowedPoses | None = None) -> None:
+    def __init__(
+        self, options: StitchOptions | None = None, poses: FollowedPoses | None = None, *, patient: bool = False
+    ) -> None:
         self._options, self._poses = options or StitchOptions(), poses or FollowedPoses()
         self._detection = _live_features(self._options.features)
-        how = TrackingOptions(self._options.estimation, alignment_options([], self._options))
+        for file in (self._options.attitude, self._options.mask):  # before the first frame, not at each
+            if file is not None and file != XMP and not Path(file).is_dir():
+                check_readable(Path(file))
+        how = TrackingOptions(self._options.estimation, alignment_options([], self._options), patient)
         # Of frames that have been made ready.
         features = replace(self._detection, work_megapixels=None, stretch=None, equalize=False)
-        apart = self._options.threads > 1 and bool(sys.executable)
+        apart = (self._options.threads > 1 or not patient) and bool(sys.executable)
         executor = ProcessExecutor(1) if apart else ThreadPoolExecutor(1)
         weakref.finalize(self, executor.shutdown, wait=False, cancel_futures=True)
         matcher = partial(match, ratio=self._options.ratio)
@@ -215,7 +221,7 @@ class Tracker:
         self._numbers = count()
         self.revised: tuple[Pose, ...] = ()
 
-    def add(self, image: Image, timestamp: float | None = None) -> Pose:
+    def add(self, image: Image, timestamp: float | None = None, attitude: tuple[float, float] | None = None) -> Pose:
         """Register the next frame.
 
         Parameters
@@ -224,6 +230,9 @@ class Tracker:
             Arrays are as :func:`rdstitch.mosaic` takes them.
         timestamp : float, optional
             s.
+        attitude : (float, float), optional
+            Tilt (ψ, θ) of this frame, radians, as an IMU has measured it, with ``attitude_std`` of the options; instead
+            of a table of them.
 
         Returns
         -------
@@ -235,11 +244,13 @@ class Tracker:
         (named,) = as_inputs(image, self._options.channel_order)
         frame = replace(named, path=Path(f"image_{number:04d}")) if isinstance(named, Frame) else Frame(Path(named))
         frame = replace(frame, number=number, timestamp=timestamp)
-        *revised, pose = self.register(frame, *self.read(frame))
+        *revised, pose = self.register(frame, *self.read(frame, attitude))
         self.revised = tuple(revised)
         return pose
 
-    def read(self, frame: Frame) -> tuple[Source | None, PreparedImage | None, str]:
+    def read(
+        self, frame: Frame, attitude: tuple[float, float] | None = None
+    ) -> tuple[Source | None, PreparedImage | None, str]:
         """The frame as a source, and as it is tracked; or why it is not."""
         options, features = self._options, self._detection
         if options.timestamps is not None and (time := time_of(frame, options.timestamps)) is not None:
@@ -247,14 +258,20 @@ class Tracker:
         sources, unread = read_frames([frame], options, skip_bad=True)
         if not sources:
             return None, None, unread[0].text
-        common = options.mask is not None and not Path(options.mask).is_dir()
-        source = with_masks(sources, options.mask if common else None)[0]
-        megapixels = features.limits[1]
+        source, megapixels = replace(sources[0], attitude=attitude), features.limits[1]
         try:
+            (source,) = self._measured(source)
             view = source.view(megapixels)
             return source, prepare(view, megapixels, stretch=features.stretch, equalize=bool(features.equalize)), ""
         except InputError as error:
             return source, None, str(error)
+
+    def _measured(self, source: Source) -> list[Source]:
+        """The frame with its mask and attitude; of a folder of masks not every frame needs one."""
+        options = self._options
+        if options.mask is None or not Path(options.mask).is_dir() or mask_of(source, options.mask) is not None:
+            source = with_masks([source], options.mask)[0]
+        return [source] if source.attitude is not None else with_attitudes([source], options.attitude)
 
     def register(self, frame: Frame, source: Source | None, image: PreparedImage | None, reason: str) -> list[Pose]:
         """Register a frame that was read; it comes last, after those before it that only now have found their place."""
@@ -263,13 +280,13 @@ class Tracker:
             return [label]
         label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))
         camera = at_working_size(source.camera, self._detection.limits[1])
-        results = self._frames.add(image, camera)
+        results = self._frames.add(image, camera, source.attitude)
         self._labels[results[-1].number] = label
         poses = [
             replace(
                 self._labels[result.number],
                 tracked=result,
-                reason="" if result.placement is not None else _why(self._frames, result),
+                reason=result.reason,
             )
             for result in results
         ]
@@ -315,13 +332,6 @@ def _features(options: FeatureOptions, image: PreparedImage) -> Features:
     """Of a frame, in its pixels."""
     mask = None if image.clearance is None else image.clearance > 0.0
     return detect_view(lambda _: View(image.grey, mask), options)
-
-
-def _why(tracker: FrameTracker, result: Tracked) -> str:
-    """Why a frame has no place."""
-    if result.inliers or not result.number:
-        return "the first frames wait for others" if tracker.waits else "its motion fits no plane yet"
-    return "it begins a new map" if result.keyframe else "no keyframe shows what it shows"
 
 
 def _known(value: float) -> float | None:

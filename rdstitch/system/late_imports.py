@@ -24,4 +24,11 @@ else:
         ),
     )
 
-__all__ = ["csgraph", "fft", "ndimage", "sparse", "sparse_linalg", "spatial", "tifffile"]
+
+def import_late_modules() -> None:
+    """Import those of SciPy now: nothing that follows should wait for them."""
+    for module in (ndimage, sparse, spatial, csgraph, sparse_linalg):
+        import_module(module.__name__)
+
+
+__all__ = ["csgraph", "fft", "import_late_modules", "ndimage", "sparse", "sparse_linalg", "spatial", "tifffile"]
