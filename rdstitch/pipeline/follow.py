@@ -12,9 +12,12 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.executors import ProcessExecutor
-from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
+from rdstitch.export.trajectory_files import TrajectoryFrame, covariance_in_frame, in_frame, ros_covariance
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.inputs.frame import Frame, Image, as_inputs
@@ -26,6 +29,7 @@ from rdstitch.io.write import write_image
 from rdstitch.pipeline.aligner import alignment_options
 from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
+from rdstitch.results.messages import Message
 from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.tracking import CameraPose, Preview, Tracked, TrackingOptions
 from rdstitch.tracking import Tracker as FrameTracker
@@ -44,7 +48,7 @@ class FollowedPoses:
     height : float
         Of the first keyframe above the plane, in the unit that positions shall have.
     frame : str
-        "enu" or "camera", see :mod:`rdstitch.export.trajectory_files`.
+        "enu", "ros" or "camera", see :mod:`rdstitch.export.trajectory_files`.
     """
 
     height: float = 1.0
@@ -53,9 +57,19 @@ class FollowedPoses:
     def fields(self, pose: CameraPose | None) -> dict[str, float | None]:
         """x, y, yaw and height."""
         if pose is None:
-            return dict.fromkeys(("x", "y", "yaw_deg", "height"))
+            return dict.fromkeys(("x", "y", "yaw_deg", "yaw", "height"))
         x, y = in_frame(pose.x * self.height, pose.y * self.height, self.frame)
-        return {"x": x, "y": y, "yaw_deg": math.degrees(pose.yaw), "height": pose.height * self.height}
+        yaw = {"yaw_deg": math.degrees(pose.yaw), "yaw": pose.yaw}
+        return {"x": x, "y": y, **yaw, "height": pose.height * self.height}
+
+    def covariance(self, tracked: Tracked) -> FloatArray | None:
+        """Of x, y, height and yaw (4, 4), in the axes of the first image; with what all lengths share."""
+        if (pose := tracked.pose) is None or tracked.covariance is None:
+            return None
+        place = np.array([pose.x, pose.y, 0.0, 0.0])
+        shared = 0.0 if math.isnan(tracked.length_std) else tracked.length_std
+        unit = np.array([self.height, self.height, self.height, 1.0])
+        return np.asarray((tracked.covariance + shared**2 * np.outer(place, place)) * np.outer(unit, unit))
 
 
 @dataclass(frozen=True)
@@ -75,6 +89,8 @@ class Pose:
         Why there is no place; empty where there is one.
     poses : FollowedPoses
         How the pose is printed.
+    messages : tuple of Message
+        What the user should know, and what this frame has shown.
     """
 
     name: str
@@ -83,6 +99,7 @@ class Pose:
     tracked: Tracked | None
     reason: str = ""
     poses: FollowedPoses = FollowedPoses()
+    messages: tuple[Message, ...] = ()
 
     def __bool__(self) -> bool:
         return self.tracked is not None and self.tracked.pose is not None
@@ -99,15 +116,50 @@ class Pose:
         """Heading, radians, counterclockwise as seen from above; None where there is no place."""
         return None if self.tracked is None or self.tracked.pose is None else self.tracked.pose.yaw
 
+    @property
+    def covariance(self) -> FloatArray | None:
+        """Of x, y, height and yaw, (4, 4), in the frame and unit of the tracker and radians; None where not known.
+
+        Relative to the first keyframe, with the growth of the errors from keyframe to keyframe and the scale that all
+        share.
+        """
+        known = None if self.tracked is None else self.poses.covariance(self.tracked)
+        return None if known is None else covariance_in_frame(known, self.poses.frame)
+
+    @property
+    def ros_covariance(self) -> FloatArray | None:
+        """The same as messages of ROS have it, (6, 6); see :func:`rdstitch.export.trajectory_files.ros_covariance`."""
+        known = None if self.tracked is None else self.poses.covariance(self.tracked)
+        return None if known is None else ros_covariance(known, self.poses.frame)
+
+    @property
+    def map(self) -> int | None:
+        """Number of the map that the pose belongs to: those of different maps have nothing in common."""
+        return None if self.tracked is None else self.tracked.map_number
+
+    @property
+    def quality(self) -> float:
+        """Share of the matches that agree, 0 to 1."""
+        return self.tracked.quality if self.tracked is not None and self else 0.0
+
+    @property
+    def length_std(self) -> float:
+        """Relative standard deviation that all lengths share, by the focal length; NaN where it is not known."""
+        return math.nan if self.tracked is None else self.tracked.length_std
+
     def as_dict(self) -> dict[str, Any]:
         """As a line of JSON takes it; null for what is not known."""
         tracked = self.tracked
         placement = None if tracked is None else tracked.placement
+        covariance = self.ros_covariance
         return {
             "name": self.name,
             "frame": self.number,
             "timestamp": _known(self.timestamp),
             **self.poses.fields(None if tracked is None else tracked.pose),
+            "covariance": None if covariance is None else covariance.ravel().tolist(),
+            "length_std": _known(self.length_std),
+            "quality": self.quality,
             "homography": None if placement is None else placement.homography.tolist(),
             "lambda": None if tracked is None else _known(tracked.distortion),
             "lambda_std": None if tracked is None else _known(tracked.distortion_std),
@@ -117,6 +169,7 @@ class Pose:
             "inliers": 0 if tracked is None else tracked.inliers,
             "revised": tracked is not None and tracked.revised,
             "reason": self.reason,
+            "messages": [str(message) for message in self.messages],
         }
 
 
@@ -198,7 +251,7 @@ class Tracker:
     >>> tracker = rdstitch.Tracker()
     >>> pose = tracker.add(cv2.imread("left.png"), 0.0)
     >>> bool(pose), pose.position, pose.reason
-    (False, None, 'the first frames wait for others')
+    (False, None, 'first frame')
     """
 
     def __init__(
@@ -220,6 +273,12 @@ class Tracker:
         self._labels: dict[int, Pose] = {}  # of the frames that may still find their place
         self._numbers = count()
         self.revised: tuple[Pose, ...] = ()
+        self._told = 0  # messages that poses had
+
+    @property
+    def messages(self) -> tuple[Message, ...]:
+        """What the user should know of all that has come so far."""
+        return tuple(self._frames.messages)
 
     def add(self, image: Image, timestamp: float | None = None, attitude: tuple[float, float] | None = None) -> Pose:
         """Register the next frame.
@@ -290,6 +349,8 @@ class Tracker:
             )
             for result in results
         ]
+        told, self._told = self._frames.messages[self._told :], len(self._frames.messages)
+        poses[-1] = replace(poses[-1], messages=tuple(told))
         waiting = self._frames.numbers_without_place
         self._labels = {number: known for number, known in self._labels.items() if number in waiting}
         return poses
