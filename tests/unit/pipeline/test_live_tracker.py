@@ -176,7 +176,7 @@ def test_an_alignment_that_fails_is_survived(drive: Sequence, monkeypatch: pytes
     monkeypatch.setattr(tracker_module, "align", fails)
     monkeypatch.setattr(tracker_module, "_ALIGNMENT_DELAY", 1)
     options = TrackingOptions(EstimationOptions(distortion=DISTORTION), AlignmentOptions(tilt=TILT, lens_known=True))
-    tracker = FrameTracker(options, lambda _: detect(drive.frame(0)), match, ThreadPoolExecutor(1))
+    tracker = FrameTracker(options, lambda image: detect(image.grey), match, ThreadPoolExecutor(1))
     for image in drive.frames():
         *_, last = tracker.add(prepare(View(image), None), CAMERA)
     assert last.pose is not None
