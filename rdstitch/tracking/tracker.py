@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Features, Matcher
 from rdstitch.features.corner_flow import CornerFlow, corners_of, matched_corners
@@ -23,7 +24,7 @@ from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.system.late_imports import import_late_modules
-from rdstitch.tracking.metric_plane import MetricPlane, SeenPair, chained, tilt_of
+from rdstitch.tracking.metric_plane import MetricPlane, SeenPair, chained, shown_camera
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 
 _WINDOW = 48  # keyframes that are aligned together
@@ -171,6 +172,8 @@ class Tracker:
         self._distortion = options.pair.distortion
         self._std = 0.0 if self.distortion_known else math.inf
         self._length_std = math.nan
+        # Of positions, relative to their distance from the first, and of yaw, by a lens that is still estimated.
+        self._shape_std = (0.0, 0.0)
         self._focal: float | None = None  # half diagonals, once one was found with a lens that is kept
         self._plane: MetricPlane | None = None
         self.messages: list[Message] = []
@@ -471,10 +474,11 @@ class Tracker:
                 seen(by_number[link.image2], link.points2),
             )
             pairs.append(SeenPair(rays1, rays2, one, two))
-        tilt, std, rms = tilt_of(pairs)
-        if not (std < _TILT_STD and rms * focal < _RIGID):
+        shown = shown_camera(pairs)
+        uncertain = math.hypot(shown.log_focal_std, frame.camera.focal_log_std)
+        if not (shown.tilt_std < _TILT_STD and shown.rms * focal < _RIGID and abs(shown.log_focal) < 3.0 * uncertain):
             return []
-        self._plane = MetricPlane(focal / frame.camera.scale, tilt, rigid=True)
+        self._plane = MetricPlane(focal / frame.camera.scale, shown.tilt, rigid=True)
         self._length_std, waiting = frame.camera.focal_log_std, self.numbers_without_place
         first, *others = self._keyframes
         first.place, first.covariance = self._plane.below(first.camera, first.attitude), np.zeros((4, 4))
@@ -525,7 +529,7 @@ class Tracker:
             most=_MATCHES,
             attitudes=np.array(attitudes) if len(attitudes) == len(cameras) else None,
             reference=None,
-            pose_covariance=False,
+            pose_covariance=known is None,
         )
         executor = self._executor if self._mapped else self._first_executor
         self._alignment = list(self._keyframes), executor.submit(align, cameras, links, options)
@@ -564,6 +568,11 @@ class Tracker:
         self._mapped = True
         if self._focal is None:
             self._length_std = alignment.length_std
+        if any(message.code == "focal-contradicted" for message in alignment.messages):
+            # The unit of the map was another one: all keyframes are placed anew.
+            self._focal, self._length_std = alignment.focal, alignment.length_std
+            for keyframe in (*self._older, *self._keyframes):
+                keyframe.aligned = False
         waiting, move = self.numbers_without_place, _to_map(placed)
         for keyframe, placement in placed:
             keyframe.place, keyframe.aligned = move.applied(placement), True
@@ -578,6 +587,15 @@ class Tracker:
     def _learn(self, alignment: Alignment, keyframes: Sequence[_Frame]) -> None:
         """Keep what an alignment shows of the camera, for the frames to come."""
         poses, tilt = alignment.poses, alignment.tilt
+        self._shape_std = (0.0, 0.0)
+        if poses is not None and poses.covariance is not None:
+            path = Trajectory.from_poses(poses)
+            far = np.linalg.norm(path.position, axis=1)
+            last = int(np.argmax(far))
+            if path.covariance is not None and far[last] > 0.0:
+                variance = float(np.linalg.eigvalsh(path.covariance[last, :2, :2])[-1]) / far[last] ** 2
+                yaw_std = math.sqrt(float(path.covariance[:, 3, 3].max()))
+                self._shape_std = math.sqrt(max(variance - alignment.length_std**2, 0.0)), yaw_std
         measured = [keyframe.attitude for keyframe in keyframes]
         known = ("rigid", "similarity", *(("tilting",) if None not in measured else ()))
         if alignment.model in known and poses is not None and tilt and alignment.focal:
@@ -599,6 +617,19 @@ class Tracker:
             pair = replace(self._options.pair, distortion=self._distortion, solver="auto")
             self._options = replace(self._options, pair=pair)
             self._model, self._focal = alignment.model, alignment.focal
+
+    def _covariance(self, frame: _Frame, pose: CameraPose) -> FloatArray | None:
+        """Of a frame's pose, with what all frames have in common but for the unit of lengths."""
+        known, (relative, yaw_std) = frame.covariance, self._shape_std
+        if known is None:
+            if not relative:
+                return None
+            known = np.zeros((4, 4))
+        place = (relative * math.hypot(pose.x, pose.y)) ** 2
+        if frame.attitude is not None:
+            # The foot of the camera is off by the error of its tilt, and so is that of the first frame.
+            place += 2.0 * (pose.height * self._options.alignment.attitudes_std) ** 2
+        return np.asarray(known + np.diag([place, place, 0.0, yaw_std**2]))
 
     def _tell(self, text: str, code: str = "") -> None:
         """Keep a message, if it is new."""
@@ -623,7 +654,7 @@ class Tracker:
             keyframe=keyframe,
             inliers=inliers,
             quality=frame.quality,
-            covariance=frame.covariance if placement is not None else None,
+            covariance=None if placement is None or placement.pose is None else self._covariance(frame, placement.pose),
             length_std=self._length_std,
             reason=reason,
         )
