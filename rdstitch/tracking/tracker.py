@@ -24,7 +24,7 @@ from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.system.late_imports import import_late_modules
-from rdstitch.tracking.metric_plane import MetricPlane, SeenPair, chained, shown_camera
+from rdstitch.tracking.metric_plane import MetricPlane, SeenPair, ShownCamera, chained, shown_camera
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 
 _WINDOW = 48  # keyframes that are aligned together
@@ -40,6 +40,7 @@ _KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of an image of 640
 _MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
 _GRID = 8  # points a side by which that is measured
+_CONTRADICTED = 3.7  # standard deviations: odds of a thousand to one
 _TILT_STD, _RIGID = 0.004, 1.0  # radians and pixels, up to which a tilt found by few keyframes makes metric poses
 _MAX_LOST_FRAMES = 10  # frames in a row without a place, after which a new map begins, if all keyframes were searched
 _MAX_WAITING = 500  # frames between the first keyframes that are placed with them
@@ -176,6 +177,8 @@ class Tracker:
         self._shape_std = (0.0, 0.0)
         self._focal: float | None = None  # half diagonals, once one was found with a lens that is kept
         self._plane: MetricPlane | None = None
+        self._doubt = 0.0  # of the logarithm of the focal length, where the images contradict it
+        self._settled = False  # whether an alignment has weighed what is given
         self.messages: list[Message] = []
         self._start_map()
 
@@ -443,7 +446,7 @@ class Tracker:
         self._window_links = [link for link in links if link.image1 in kept and link.image2 in kept]
         if not self.distortion_known:
             self._vote()
-        revised = [] if self._mapped or self._plane is not None else self._find_plane(frame)
+        revised = self._find_plane(frame)
         if self._options.patient and self._keyframes_seen >= self._taken_over_at:
             revised += self._take_over(None)
         if self._keyframes_seen + 1 >= self._next_alignment and self._alignment is None:
@@ -456,10 +459,8 @@ class Tracker:
             self._align_window()
         return revised
 
-    def _find_plane(self, frame: _Frame) -> list[Tracked]:
-        """The map by the tilt that a few keyframes show, where lens and focal length are given."""
-        if not self._metric_camera(frame.camera) or self._model not in ("auto", "rigid"):
-            return []
+    def _shown_camera(self, frame: _Frame) -> ShownCamera:
+        """What the links of the keyframes show of a camera whose lens and focal length are given."""
         focal, by_number = frame.camera.focal, {keyframe.number: keyframe for keyframe in self._keyframes}
         assert focal is not None
 
@@ -469,17 +470,33 @@ class Tracker:
 
         pairs = []
         for link in self._window_links:
-            (rays1, one), (rays2, two) = (
-                seen(by_number[link.image1], link.points1),
-                seen(by_number[link.image2], link.points2),
-            )
+            rays1, one = seen(by_number[link.image1], link.points1)
+            rays2, two = seen(by_number[link.image2], link.points2)
             pairs.append(SeenPair(rays1, rays2, one, two))
         shown = shown_camera(pairs)
         uncertain = math.hypot(shown.log_focal_std, frame.camera.focal_log_std)
-        if not (shown.tilt_std < _TILT_STD and shown.rms * focal < _RIGID and abs(shown.log_focal) < 3.0 * uncertain):
+        if abs(shown.log_focal) > _CONTRADICTED * uncertain:
+            self._doubt = math.hypot(shown.log_focal, shown.log_focal_std)
+            self._length_std = max(self._length_std, self._doubt)
+            self._tell(
+                f"the images contradict the given focal length of {focal:.1f} pixels: they show about "
+                f"{focal * math.exp(shown.log_focal):.1f}; lengths are as uncertain until that is settled",
+                "focal-contradicted",
+            )
+        return shown
+
+    def _find_plane(self, frame: _Frame) -> list[Tracked]:
+        """The map by the tilt that a few keyframes show, where lens and focal length are given."""
+        if not self._metric_camera(frame.camera) or self._settled or self._model not in ("auto", "rigid"):
+            return []
+        shown, focal = self._shown_camera(frame), frame.camera.focal
+        if self._plane is not None or self._mapped:
+            return []
+        assert focal is not None
+        if not (shown.tilt_std < _TILT_STD and shown.rms * focal < _RIGID):
             return []
         self._plane = MetricPlane(focal / frame.camera.scale, shown.tilt, rigid=True)
-        self._length_std, waiting = frame.camera.focal_log_std, self.numbers_without_place
+        self._length_std, waiting = max(self._doubt, frame.camera.focal_log_std), self.numbers_without_place
         first, *others = self._keyframes
         first.place, first.covariance = self._plane.below(first.camera, first.attitude), np.zeros((4, 4))
         first.aligned = self._mapped = True
@@ -565,7 +582,7 @@ class Tracker:
             )
             if used
         ]
-        self._mapped = True
+        self._mapped = self._settled = True
         if self._focal is None:
             self._length_std = alignment.length_std
         if any(message.code == "focal-contradicted" for message in alignment.messages):
