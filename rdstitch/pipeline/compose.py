@@ -1,11 +1,13 @@
 """The last stage of every image: from registered images to pixels, in memory or in a file with a page beside it."""
 
+import math
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -13,9 +15,13 @@ from rdstitch.compositing import (
     Canvas,
     CompositeOptions,
     CompositePlan,
+    Decisions,
     FileComposite,
+    PlacedImage,
+    SeamQuality,
     compose,
     compose_to_file,
+    decide,
     plan_composite,
 )
 from rdstitch.compositing.tiles import Block, BlockRunner, OutputStrip
@@ -50,8 +56,35 @@ class Composed(OutputImage):
     written: FileComposite | None = None  # the image in its file
 
 
+@dataclass(frozen=True)
+class Layout:
+    """Images on a canvas, and what was decided on small versions of them."""
+
+    placed: PlacedImages
+    canvas: Canvas
+    images: Sequence[PlacedImage]
+    georeference: Georeference | None
+    not_georeferenced: str  # why
+    decisions: Decisions | None = None
+
+    @classmethod
+    def of(cls, placed: PlacedImages, options: CompositeOptions) -> Self:
+        """Plan the canvas."""
+        canvas, place, reason = plan_on_map(placed, options)
+        return cls(placed, canvas, placed.images(canvas.near), place, reason)
+
+    def decided(self, options: CompositeOptions, threads: int) -> Self:
+        """With exposure and seams."""
+        return replace(self, decisions=decide(self.images, self.canvas, replace(options, workers=threads)))
+
+    @property
+    def seams(self) -> SeamQuality:
+        """What its seams are like."""
+        return SeamQuality() if self.decisions is None else self.decisions.quality
+
+
 def compose_images(
-    placed: PlacedImages,
+    placed: PlacedImages | Layout,
     output: str | Path | None,
     options: CompositeOptions,
     threads: int,
@@ -66,6 +99,8 @@ def compose_images(
 
     Parameters
     ----------
+    placed : PlacedImages or Layout
+        A layout where the canvas is planned already.
     output : path or None
         File that the image is written to, a strip at a time, with colour profile and EXIF of the first image, and
         with its place on the Earth where three images have a GPS position; without it the image is made in memory.
@@ -79,32 +114,35 @@ def compose_images(
         Only plan.
     """
     return_freed_memory()
-    world_files = _files_beside(output, placed, overwrite)
-    canvas, place, reason = plan_on_map(placed, options)
-    notes = [*_masked(placed), *place_messages(place, reason, placed)]
+    world_files = _files_beside(output, placed.placed if isinstance(placed, Layout) else placed, overwrite)
+    layout = placed if isinstance(placed, Layout) else Layout.of(placed, options)
+    placed, canvas, images, place = layout.placed, layout.canvas, layout.images, layout.georeference
+    notes = [*_masked(placed), *place_messages(place, layout.not_georeferenced, placed)]
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)
         check_memory(output, canvas.size, options.max_memory)
-    options = replace(options, workers=threads)
-    images = placed.images(canvas.near)
     composed = Composed(
         canvas=canvas,
         output=None if output is None else Path(output),
         georeference=place,
-        not_georeferenced=reason,
+        not_georeferenced=layout.not_georeferenced,
         messages=tuple(notes),
     )
     if dry_run:
-        return replace(composed, plan=_planned(placed, canvas, options))
+        return replace(composed, plan=_planned(placed, canvas, replace(options, workers=threads)))
+    layout = layout if layout.decisions is not None else layout.decided(options, threads)
+    options = replace(options, workers=threads)
+    notes += seam_messages(layout.seams, [str(source.path) for source in placed.sources])
 
     def report(share: float) -> None:
         progress("compositing", round(100 * share), 100)
 
     if output is None:
-        composite = compose(images, canvas, options, report, elsewhere)
+        composite = compose(images, canvas, options, report, elsewhere, layout.decisions)
         place, messages = moved(place, canvas, composite.canvas), (*notes, *composite.messages)
-        return replace(composed, canvas=composite.canvas, composite=composite, georeference=place, messages=messages)
+        composed = replace(composed, canvas=composite.canvas, composite=composite, seams=layout.seams)
+        return replace(composed, georeference=place, messages=messages)
 
     def tags(final: Canvas) -> list[ExtraTag]:
         on_final = moved(place, canvas, final)
@@ -115,7 +153,16 @@ def compose_images(
         scaled = None if options.max_size is not None else metadata.pixel_size / options.scale
         metadata = replace(metadata, pixel_size=scaled)
     written = compose_to_file(
-        output, images, canvas, options, report, elsewhere, metadata=metadata, extra_tags=tags, outputs=outputs
+        output,
+        images,
+        canvas,
+        options,
+        report,
+        elsewhere,
+        layout.decisions,
+        metadata=metadata,
+        extra_tags=tags,
+        outputs=outputs,
     )
     place = moved(place, canvas, written.canvas)
     beside = []
@@ -135,7 +182,24 @@ def compose_images(
         fingerprint=written.fingerprint,
         written=written,
         georeference=place,
+        seams=layout.seams,
     )
+
+
+def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
+    """Where seams are broken: one warning where a person sees it, else a detail."""
+    if not seams.breaks:
+        return []
+    worst, others = seams.breaks[0], len(seams.breaks) - 1
+    images = tuple(paths[k] for k in worst.images)
+    (x, y), (first, second) = worst.position, names_of(images)
+    shift = "" if math.isnan(worst.size) else f", its sides {worst.size:.0f} pixels apart"
+    more = f", and {others} more" if others else ""
+    text = (
+        f"a break of {worst.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}{shift}{more}: "
+        "something moved, or is nearer than the rest; leave one of the two out, or mask it"
+    )
+    return [Message(text, images, "warning" if seams.seen else "detail", "seam-break")]
 
 
 def _planned(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> CompositePlan:

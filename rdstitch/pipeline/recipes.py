@@ -10,6 +10,7 @@ from typing import Literal
 
 from rdstitch.alignment.frames import stored, turned_alignment
 from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.choices import Purpose
 from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
 from rdstitch.geometry.exif_orientation import quarter_turn
@@ -17,16 +18,13 @@ from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.source import Source
-from rdstitch.local_alignment import LocalAlignment
-from rdstitch.pipeline.accept import accept, scale_uncertainty
-from rdstitch.pipeline.aligner import Purpose
+from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty
+from rdstitch.pipeline.choose_layout import LaidOut, choose_layout
 from rdstitch.pipeline.compose import blocks_on, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
-from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs
-from rdstitch.pipeline.register import register, with_frontal_reference
-from rdstitch.pipeline.straighten import turned
-from rdstitch.pipeline.whole_pixels import on_whole_pixels
+from rdstitch.pipeline.register import register
+from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, told_once
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_options import StitchOptions
@@ -228,11 +226,11 @@ def _stitch(
         check_map(sources, options.composite)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages]
-            accepted = _accepted(sources, known, options, executor, progress, "pano" if pano else "mosaic")
-            registration = on_whole_pixels(with_frontal_reference(accepted, options, always=pano))
-            local = align_registration_locally(registration, options.local_alignment)
+            purpose: Purpose = "pano" if pano else "mosaic"
+            accepted = _accepted(sources, known, options, executor, progress, purpose)
+            chosen = choose_layout(accepted, options, aligner_of(accepted, options, purpose), pano=pano)
             with Outputs(options.overwrite) as outputs:
-                return compose_registration(registration, local, executor, output, options, progress, beside, outputs)
+                return compose_registration(chosen, executor, output, options, progress, beside, outputs)
 
 
 def calibrate(
@@ -268,7 +266,7 @@ def calibrate(
         sources, unread = read_inputs(listed.frames, options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages]
-            result = _finished(_accepted(sources, known, options, executor, progress, "calibrate"))
+            result = _finished(at_full_size(_accepted(sources, known, options, executor, progress, "calibrate")))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
         if beside is not None:
@@ -326,7 +324,7 @@ def trajectory(
         times = timestamps_of(sources, timestamps)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages]
-            registration = _accepted(sources, known, options, executor, progress, "trajectory")
+            registration = at_full_size(_accepted(sources, known, options, executor, progress, "trajectory"))
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])
@@ -352,7 +350,10 @@ def _accepted(
     progress: Progress,
     purpose: Purpose,
 ) -> Registration:
-    """Register and check, with what is known of the inputs already; a failure names those that could not be read."""
+    """Register and check, with what is known of the inputs already; a failure names those that could not be read.
+
+    In pixels of the working size.
+    """
     try:
         registration = register(sources, options, executor, purpose=purpose, progress=progress)
         return accept(registration.with_messages(known), options, purpose)
@@ -376,8 +377,7 @@ def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Se
 
 
 def compose_registration(
-    registration: Registration,
-    local: LocalAlignment,
+    chosen: LaidOut,
     executor: Executor,
     output: str | Path | None,
     options: StitchOptions,
@@ -386,25 +386,22 @@ def compose_registration(
     outputs: Outputs,
 ) -> StitchResult:
     """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
-    placed, said = turned(PlacedImages.of(registration, local.fields or None), options.composite)
-    if placed.orientation is not None:
-        homographies = placed.orientation @ registration.alignment.homographies
-        registration = replace(registration, alignment=replace(registration.alignment, homographies=homographies))
+    registration = chosen.registration
     composed = compose_images(
-        placed,
+        chosen.layout,
         output,
         options.composite,
         options.threads,
         progress,
         overwrite=options.overwrite,
         outputs=outputs,
-        elsewhere=blocks_on(executor, placed.sources, options.cache),
+        elsewhere=blocks_on(executor, chosen.layout.placed.sources, options.cache),
         dry_run=options.dry_run,
     )
     result = StitchResult(
-        registration=_finished(registration).with_messages((*said, *composed.messages)),
+        registration=_finished(registration).with_messages((*chosen.messages, *composed.messages)),
         options=options.for_images(len(registration.sources)),
-        local_alignment=local,
+        local_alignment=chosen.local,
         **composed.output_fields,
     )
     if options.dry_run:

@@ -23,6 +23,7 @@ from rdstitch.io.reduction import mean_of_channels
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.pipeline.choose_layout import lay_out
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
 from rdstitch.results.messages import Message, names_of, shortened
@@ -77,8 +78,8 @@ def tiles(
         registration, tiled = _registered(listed, output, positions_file, options, progress)
         with Outputs(options.overwrite) as outputs, stitch.executor(len(registration.sources)) as executor:
             _write_beside(outputs, positions_file, options, registration, tiled)
-            local = no_local_alignment("tiles on a stage")
-            return compose_registration(registration, local, executor, output, stitch, progress, beside, outputs)
+            chosen = lay_out(registration, no_local_alignment("tiles on a stage"), stitch.composite)
+            return compose_registration(chosen, executor, output, stitch, progress, beside, outputs)
 
 
 def place_tiles(

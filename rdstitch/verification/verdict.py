@@ -52,6 +52,8 @@ def judge(evidence: Evidence) -> tuple[Finding, ...]:
     else:
         disagreeing = {(f.images[0], f.images[1]): f for f in rules.disagreeing_pairs(evidence)}
         of_matches += [disagreeing[pair] for pair in decisive_pairs(disagreeing, evidence.used, count)]
+    if evidence.picture:  # matches that disagree say that the scene has depth, unless the pixels say so too
+        of_matches = [f for f in of_matches if f.kind == "lenses mixed" or not evidence.looks_right(f.images)]
     if of_matches:
         return tuple(of_matches)
     suspicions = {(f.images[0], f.images[1]): f for find in rules.OF_PAIRS for f in find(evidence)}
@@ -89,6 +91,7 @@ def _aloud(findings: Sequence[Finding], evidence: Evidence) -> tuple[Finding, ..
     for k in sorted(range(len(findings)), key=lambda k: rank.get(findings[k].kind, -1)):
         rule = rules.ALOUD.get(findings[k].kind, rules.Aloud(findings[k].kind))
         speaks = findings[k].severity == "warning" and rule.topic not in topics and rule.speaks(evidence)
+        speaks = speaks and not (evidence.picture and findings[k].kind in rules.SEEN_AT_SEAMS)
         if speaks and len(aloud) < rules.MAX_WARNINGS:
             aloud.add(k)
             topics.add(rule.topic)
