@@ -55,6 +55,11 @@ class LaidOut:
         return int(self.layout.seams.seen) + int(_is_stretched(self.layout))
 
     @property
+    def clipped(self) -> int:
+        """Number of images of which only the near part is drawn."""
+        return sum(part is not None for part in self.layout.canvas.near)
+
+    @property
     def broken(self) -> int:
         """Number of places at which its seams are broken; they are as far apart in every layout."""
         return int(self.layout.seams.broken.sum())
@@ -102,7 +107,8 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         except (LimitError, ArgumentError):
             continue
     first = _first(tried, failed)
-    best = min(tried, key=lambda one: (one.faults, one.broken))
+    whole = [one for one in tried if one.clipped <= first.clipped]
+    best = min(whole, key=lambda one: (one.faults, one.broken))
     if failed is None and best.faults == first.faults and best.broken > _CLEARLY * first.broken:
         return first
     return best

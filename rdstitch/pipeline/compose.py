@@ -1,6 +1,5 @@
 """The last stage of every image: from registered images to pixels, in memory or in a file with a page beside it."""
 
-import math
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import closing
@@ -36,7 +35,7 @@ from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages
-from rdstitch.results.messages import Message, names_of, shortened
+from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened
 from rdstitch.results.stitch_result import OutputImage, StitchResult
 from rdstitch.system.cache import Cache, Stored
 from rdstitch.system.outputs import Outputs, check_output, text_bytes
@@ -187,19 +186,25 @@ def compose_images(
 
 
 def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
-    """Where seams are broken: one warning where a person sees it, else a detail."""
-    if not seams.breaks:
+    """How many seams hold, a detail; and one warning where a person sees that they are broken."""
+    if not len(seams.places):
         return []
-    worst, others = seams.breaks[0], len(seams.breaks) - 1
-    images = tuple(paths[k] for k in worst.images)
-    (x, y), (first, second) = worst.position, names_of(images)
-    shift = "" if math.isnan(worst.size) else f", its sides {worst.size:.0f} pixels apart"
-    more = f", and {others} more" if others else ""
-    text = (
-        f"a break of {worst.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}{shift}{more}: "
-        "something moved, or is nearer than the rest; leave one of the two out, or mask it"
-    )
-    return [Message(text, images, "warning" if seams.seen else "detail", "seam-break")]
+    count = int(seams.broken.sum())
+    holding = f"seams hold at {len(seams.places) - count} of {len(seams.places)} places"
+    if not seams.breaks:
+        return [Message(holding, severity="detail")]
+    worst = list({one.images: one for one in reversed(seams.breaks)}.values())[::-1][:MAX_NAMED]
+    told = []
+    for one in worst:
+        (x, y), (first, second) = one.position, names_of(paths[k] for k in one.images)
+        told.append(f"a break of {one.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}")
+    more = f", and {rest} more" if (rest := len(seams.breaks) - len(worst)) else ""
+    breaks = f"{'; '.join(told)}{more}"
+    if not seams.seen:
+        return [Message(f"{holding}; {breaks}", severity="detail")]
+    images = tuple(dict.fromkeys(paths[k] for one in worst for k in one.images))
+    text = f"{breaks}: something moved, or is nearer than the rest; leave one of the two images out, or mask it"
+    return [Message(holding, severity="detail"), Message(text, images, code="seam-break")]
 
 
 def _planned(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> CompositePlan:

@@ -105,10 +105,3 @@ class Evidence:
         images, only overlaps can be wrong, and they are looked at.
         """
         return not self.alignment.on_sphere and int(self.alignment.used.sum()) > 2
-
-    @property
-    def depth(self) -> bool:
-        """Whether the scene has depth: relief, a second motion as small as tree tops have, or any of a turn."""
-        moved = [motion for motion in self.motions if motion.area]
-        near = bool(moved) and (self.alignment.on_sphere or not any(motion.is_far for motion in moved))
-        return self.alignment.relief.found or near

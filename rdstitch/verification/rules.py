@@ -251,6 +251,7 @@ ALOUD = {
     **dict.fromkeys(("shape unknown", "shape bent", "shape free"), Aloud("flatness", _bent)),
     **dict.fromkeys(("rough", "relief"), Aloud("flatness", lambda evidence: evidence.flat or _seen(evidence))),
     **dict.fromkeys(("parallax", "depth of a turn"), Aloud("flatness", _seen)),
+    "second motion": Aloud("second motion"),
     "little alike": Aloud("little alike", _seen),
 }
 """The gravest first; other kinds are always said, and before these."""

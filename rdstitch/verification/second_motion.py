@@ -131,11 +131,6 @@ def share_of(motions: Sequence[SecondMotion]) -> float:
     return sum(motion.area for motion in motions) / max(sum(motion.area + motion.plane_area for motion in motions), 1)
 
 
-def is_separate(motions: Sequence[SecondMotion]) -> bool:
-    """Whether what moves differently covers a good part of the images, and moves by more than tree tops do."""
-    return share_of(motions) >= limit("second motion") and max(motions, key=lambda motion: motion.area).is_far
-
-
 def fills_at_most(compared: Iterable[Agreement]) -> float:
     """Share of the images of some pairs that is not seen to contradict a motion, in [0, 1]."""
     agreements = list(compared)
@@ -151,8 +146,8 @@ def is_clear(images: ComparedImages, motions: Sequence[SecondMotion], checked: S
     """Whether what was aligned may fill more than half of the images, and what moves differently does not."""
     second = {motion.images: motion.relation for motion in motions if motion.relation is not None}
     moved = [_moved(images, link.pair, second[link.pair]) for link in checked if link.pair in second]
-    half = limit("filled by a plane")
-    return fills_at_most(link.agreement for link in checked) >= half and fills_at_most(moved) < half
+    half, other = limit("filled by a plane"), fills_at_most(moved) if moved else share_of(motions)
+    return fills_at_most(link.agreement for link in checked) >= half and other < half
 
 
 def explains(images: ComparedImages, motion: SecondMotion, link: CheckedLink) -> bool:

@@ -52,17 +52,22 @@ def judge(evidence: Evidence) -> tuple[Finding, ...]:
     else:
         disagreeing = {(f.images[0], f.images[1]): f for f in rules.disagreeing_pairs(evidence)}
         of_matches += [disagreeing[pair] for pair in decisive_pairs(disagreeing, evidence.used, count)]
-    if evidence.picture:  # matches that disagree say that the scene has depth, unless the pixels say so too
-        of_matches = [f for f in of_matches if f.kind == "lenses mixed" or not evidence.looks_right(f.images)]
+    of_matches = [finding for finding in of_matches if not _is_depth(finding, evidence)]
     if of_matches:
         return tuple(of_matches)
-    suspicions = {(f.images[0], f.images[1]): f for find in rules.OF_PAIRS for f in find(evidence)}
+    found = [finding for find in rules.OF_PAIRS for finding in find(evidence) if not _is_depth(finding, evidence)]
+    suspicions = {(finding.images[0], finding.images[1]): finding for finding in found}
     hanging = [] if lens_only or evidence.static else decisive_pairs(suspicions, evidence.used, count)
     whole = [finding for find in rules.OF_THE_WHOLE for finding in find(evidence)]
     whole = [f for f in whole if not (f.kind == "little alike" and f.images in suspicions)]
     every = [*(suspicions[pair] for pair in hanging), *whole]
     every += _outvoted([f for pair, f in suspicions.items() if pair not in hanging])
     return _aloud([f for f in every if not (lens_only and f.kind in rules.OF_PLACES)], evidence)
+
+
+def _is_depth(finding: Finding, evidence: Evidence) -> bool:
+    """Whether matches of a picture disagree where its images look alike: the scene has depth, or something moved."""
+    return evidence.picture and "inliers" in finding.values and evidence.looks_right(finding.images)
 
 
 def decisive_pairs(suspicious: Collection[Pair], used: Sequence[LinkFit], count: int) -> list[Pair]:
