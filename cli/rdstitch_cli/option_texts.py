@@ -107,9 +107,8 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 * --max-size N: Longest side of the output, pixels; --scale is reduced to fit.
 --local-alignment auto|off|N: Smooth displacement of each image where the scene has depth. auto: if held-out
     matches come nearer; N: always, with N cells along an image's longer side.
-* --exposure: Brightness: balanced leaves no step at seams, keeps every region near its own images' brightness and clips
-    nothing; gain makes the whole comparable (one factor per image, one vignetting); blocks adds a smooth field per
-    image to that.
+* --exposure: Brightness: gain makes the whole comparable (one factor per image, one vignetting); blocks adds a smooth
+    field per image where needed; balanced also keeps what is bright near its own images' brightness.
 --seam: Seam finder: around differences, midway, or none.
 --blend: Blender; none: hard edges, for measurements.
 --interpolation: Interpolation kernel.

@@ -22,9 +22,9 @@ class CompositeOptions(UprightOptions):
     Attributes
     ----------
     exposure : str
-        Gain compensation. "balanced" makes images agree where they overlap, keeps every region near the brightness of
-        its own images, and clips nothing; "gain" makes the whole comparable, with one factor per image and channel
-        and one vignetting for all; "blocks" adds a smooth field per image to that; "none" is for people who measure.
+        Gain compensation. "gain" makes the whole comparable, with one factor per image and channel and one vignetting
+        for all; "blocks" adds a smooth field per image where one is asked for; "balanced" does the same, but keeps
+        regions near the brightness of their own images where they would be burnt out; "none" is for people who measure.
     seam : str
         Where one image ends and the next begins: "graphcut" goes round what differs between them (parallax,
         people), "voronoi" where their borders are equally far, "none" leaves it to the blending.

@@ -1,6 +1,5 @@
 """What was measured of each image besides: tilt, place and time, by the image's metadata or a table."""
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,16 +13,18 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import tilt_from_normal, turned_tilt
 from rdstitch.inputs.source import Source
+from rdstitch.inputs.tables import by_image, csv_rows, image_name
 from rdstitch.results.messages import shortened
-from rdstitch.system.file_access import canonical_text, file_state, read_text
+from rdstitch.system.file_access import file_state, read_text
 
 XMP = "xmp"
 """The value of ``attitude`` that stands for the images' own XMP."""
 
-_TILT_COLUMNS = ("name", "psi", "theta")
+_NAMES = "name filename file image imagename"
+_TILT_COLUMNS = {"name": _NAMES, "psi": "psi", "theta": "theta"}
 _MAX_TILT = math.radians(80.0)  # beyond, hardly an image shows ground, and more likely angles mean something else
 _EARTH = 6_371_000.0  # m
-_TIME_COLUMNS = ("name", "timestamp")
+_TIME_COLUMNS = {"name": _NAMES, "timestamp": "timestamp time"}
 
 
 def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list[Source]:
@@ -67,25 +68,13 @@ def _of_images(sources: Sequence[Source]) -> list[tuple[float, float]]:
 
 def _of_table(sources: Sequence[Source], file: str | Path) -> list[tuple[float, float]]:
     """(ψ, θ), radians, of each source by its line."""
+    rows = csv_rows(read_text(file), str(file), _TILT_COLUMNS, ("name,psi,theta",), ("deg", "degrees"))
     table: dict[str, tuple[float, float]] = {}
-    try:
-        rows = csv.DictReader(read_text(file).splitlines(), skipinitialspace=True)
-        missing = [name for name in _TILT_COLUMNS if name not in (rows.fieldnames or ())]
-        if missing:
-            raise InputError(f"{file}: has no column {missing[0]!r}; its first line must be {','.join(_TILT_COLUMNS)}")
-        for row in rows:
-            name, where = canonical_text(row["name"] or ""), f"{file}: line {rows.line_num}"
-            try:
-                psi, theta = (math.radians(float(row[column])) for column in _TILT_COLUMNS[1:])
-            except (TypeError, ValueError):
-                raise InputError(f"{where}: psi and theta must be numbers, in degrees") from None
-            if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
-                raise InputError(f"{where}: psi and theta must lie between -90 and 90 degrees")
-            if name in table:
-                raise InputError(f"{where}: {name} is here twice; remove one")
-            table[name] = psi, theta
-    except csv.Error as error:
-        raise InputError(f"{file}: is not a CSV file: {error}") from error
+    for name, row in by_image(rows).items():
+        psi, theta = (math.radians(row.needed(column)) for column in ("psi", "theta"))
+        if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
+            raise InputError(f"{row.where}: psi and theta must lie between -90 and 90 degrees")
+        table[name] = psi, theta
     for source in sources:
         if source.name not in table:
             raise InputError(f"{file}: has no line for {source.name}; add one with its psi and theta")
@@ -140,20 +129,21 @@ def timestamps_of(sources: Sequence[Source], file: str | Path | None = None) -> 
 @lru_cache(maxsize=1)  # frames that are followed ask one after the other
 def _read_times(file: str | Path, state: tuple[int, int] | None) -> list[float] | dict[str, float]:
     """The times in order, or by the names of the images, of a file in a state."""
-    lines = [line.strip() for line in read_text(file).splitlines()]
-    lines = [line for line in lines if line and not line.startswith("#")]
-    if lines and all(_is_number(line) for line in lines):
-        return [float(line) for line in lines]
-    if lines and all(name in lines[0] for name in _TIME_COLUMNS):
-        rows = [(row["timestamp"], row["name"]) for row in csv.DictReader(lines, skipinitialspace=True)]
-    else:
-        rows = [(line.split(maxsplit=1)[0], line.split(maxsplit=1)[-1]) for line in lines]
+    text, where = read_text(file), str(file)
+    lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1)]
+    lines = [(n, line) for n, line in lines if line and not line.startswith("#")]
+    if lines and all(_is_number(line) for _, line in lines):
+        return [float(line) for _, line in lines]
+    if not lines or not _is_number(lines[0][1].split()[0]):
+        rows = csv_rows(text, where, _TIME_COLUMNS, ("name,timestamp",), ("s",))
+        return {name: row.needed("timestamp") for name, row in by_image(rows).items()}
     times: dict[str, float] = {}
-    for time, name in rows:
+    for number, line in lines:
+        time, _, name = line.partition(" ")
         if not name or not _is_number(time):
             wanted = f"a table with the columns {','.join(_TIME_COLUMNS)}, lines TIMESTAMP NAME, or one time a line"
-            raise InputError(f"{file}: found the time {time!r} for the name {name!r}; give {wanted}")
-        times[canonical_text(Path(name).name)] = float(time)
+            raise InputError(f"{file}: line {number}: found '{line}'; give {wanted}")
+        times[image_name(name)] = float(time)
     return times
 
 

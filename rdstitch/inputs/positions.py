@@ -8,13 +8,12 @@ a coordinate system, then lines   OpenDroneMap's ``geo.txt``: NAME X Y [Z …]
 ================================= ====================================================================
 """
 
-import csv
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 
@@ -23,9 +22,10 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.crs import WGS84, Crs, epsg_of
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.source import Source
+from rdstitch.inputs.tables import Row, by_image, csv_rows, json_rows, listed_rows
 from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.system.file_access import canonical_text, read_text
-from rdstitch.system.records import parse_json, parse_xml
+from rdstitch.system.records import parse_xml
 
 _COLUMNS = {
     "name": "name filename sourcefile image imagename file label",
@@ -37,12 +37,10 @@ _COLUMNS = {
     "south": "gpslatituderef",
     "west": "gpslongituderef",
 }
-_MEANING = {alias: column for column, aliases in _COLUMNS.items() for alias in aliases.split()}
-_NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?")
-_DELIMITERS = ",;\t"
-
-_Rows = Iterable[tuple[str, Mapping[str, str]]]
-"""Of each image: where in the file it is, and its values by the keys of :data:`_COLUMNS`."""
+_GEOGRAPHIC = (("longitude", "west"), ("latitude", "south"))
+_WANTED = ("name,latitude,longitude", "name,x,y")
+_UNITS = ("deg", "degrees", "m", "metres", "meters")
+_RECORDS = "a list of objects with SourceFile, GPSLatitude and GPSLongitude"
 
 
 def with_positions(
@@ -57,11 +55,11 @@ def with_positions(
         places = _on_track(sources, text, name, offset)
     else:
         if text.lstrip().startswith(("[", "{")):
-            rows = _json_rows(text, name)
+            rows = json_rows(text, name, _COLUMNS, _RECORDS)
         elif (system := epsg_of(lines[0])) is not None:
-            rows, epsg = _listed_rows(lines[1:]), system
+            rows, epsg = listed_rows("".join(lines[1:]).splitlines(), name, ("name", "x", "y", "altitude"), 2), system
         else:
-            rows = _csv_rows(text, name)
+            rows = csv_rows(text, name, _COLUMNS, _WANTED, _UNITS)
         table = _table(rows, name, epsg)
         places = [table.get(source.name) for source in sources]
         if not any(places):
@@ -72,69 +70,29 @@ def with_positions(
     ]
 
 
-def _csv_rows(text: str, file: str) -> _Rows:
-    lines = text.splitlines()
-    header = lines[0].lstrip("# ") if lines else ""
-    delimiter = max(_DELIMITERS, key=header.count)
-    table = csv.DictReader([header, *lines[1:]], delimiter=delimiter, skipinitialspace=True)
-    columns = {_meaning(column) for column in table.fieldnames or ()}
-    if "name" not in columns or not ({"latitude", "longitude"} <= columns or {"x", "y"} <= columns):
-        raise InputError(f"{file}: its first line names no columns like name,lat,lon or name,x,y")
-    try:
-        yield from ((f"line {table.line_num}", _known(row)) for row in table)
-    except csv.Error as error:
-        raise InputError(f"{file}: is not a CSV file: {error}") from error
-
-
-def _json_rows(text: str, file: str) -> _Rows:
-    content = parse_json(text, file)
-    if not isinstance(content, list) or not all(isinstance(item, dict) for item in content):
-        raise InputError(f"{file}: expected a list of objects with SourceFile, GPSLatitude and GPSLongitude")
-    return ((f"[{number}]", _known(item)) for number, item in enumerate(content))
-
-
-def _listed_rows(lines: Iterable[str]) -> _Rows:
-    for number, line in enumerate("\n".join(lines).splitlines(), start=2):
-        if fields := line.split():
-            yield f"line {number}", dict(zip(("name", "x", "y", "altitude"), fields, strict=False))
-
-
-def _meaning(column: object) -> str | None:
-    """Which of :data:`_COLUMNS` a column is, without its group (``EXIF:``) and unit."""
-    plain = re.sub(r"[\[(].*", "", str(column).rpartition(":")[2])
-    return _MEANING.get(re.sub(r"[^a-z]", "", plain.lower()))
-
-
-def _known(row: Mapping[str, object]) -> dict[str, str]:
-    """The values that mean something; of several the last, which in exiftool's output is the one with a sign."""
-    named = ((_meaning(key), str(value or "").strip()) for key, value in row.items())
-    return {key: value for key, value in named if key and value}
-
-
-def _table(rows: _Rows, file: str, epsg: int | None) -> dict[str, GpsPosition]:
+def _table(rows: Iterable[Row], file: str, epsg: int | None) -> dict[str, GpsPosition]:
     """The positions by the names of the images; what has no position, or no fix, is not in it."""
     table: dict[str, GpsPosition] = {}
     projected: dict[str, tuple[float, float, float | None]] = {}
-    for where, row in rows:
-        name = canonical_text(PureWindowsPath(row.get("name", "")).name)
-        geographic = row.keys() & {"latitude", "longitude"}
-        first, second = ("latitude", "longitude") if geographic else ("y", "x")
-        y, x = (_number(row, *part) for part in ((first, "south"), (second, "west")))
-        if x is None or y is None or (geographic and x == y == 0.0):
-            continue
-        if not name or name in table or name in projected:
-            raise InputError(f"{file}: {where}: {f'{name} is here twice; remove one' if name else 'has no name'}")
-        altitude = _number(row, "altitude")
-        if altitude is not None and "below" in row["altitude"].lower():
+    placed = []
+    for row in rows:
+        geographic = not row.values.keys().isdisjoint(("latitude", "longitude"))
+        x, y = (_degrees(row, *c) for c in _GEOGRAPHIC) if geographic else (row.number("x"), row.number("y"))
+        if x is not None and y is not None and not (geographic and x == y == 0.0):
+            placed.append((row, x, y, geographic))
+    by_image(row for row, *_ in placed)
+    for row, x, y, geographic in placed:
+        altitude = next(iter(row.numbers_within("altitude")), None)
+        if altitude is not None and "below" in row.values["altitude"].lower():
             altitude = -altitude
         if geographic or epsg == WGS84:
             if not (abs(y) <= 90.0 and abs(x) <= 180.0):
-                raise InputError(f"{file}: {where}: expected latitude and longitude in degrees, not {y:g} and {x:g}")
-            table[name] = GpsPosition(y, x, altitude)
+                raise InputError(f"{row.where}: expected latitude and longitude in degrees, not {y:g} and {x:g}")
+            table[row.image] = GpsPosition(y, x, altitude)
         elif epsg is None:
-            raise InputError(f"{file}: {where}: in which coordinate system x and y are is not known; give --crs")
+            raise InputError(f"{row.where}: in which coordinate system x and y are is not known; give --crs")
         else:
-            projected[name] = x, y, altitude
+            projected[row.image] = x, y, altitude
     if projected:
         assert epsg is not None
         values = np.array([(x, y) for x, y, _ in projected.values()])
@@ -151,16 +109,13 @@ def _geographic(epsg: int, places: FloatArray, file: str) -> list[tuple[float, f
     return [(latitude, longitude) for latitude, longitude in found.tolist()]
 
 
-def _number(row: Mapping[str, str], key: str, reference: str = "") -> float | None:
-    """A number, or degrees, minutes and seconds, of this or the other side (N, S, E, W); None where there is none."""
-    text = row.get(key, "")
-    parts = [float(part.replace(",", ".")) for part in _NUMBER.findall(text)]
-    if not parts or not all(map(math.isfinite, parts)):
+def _degrees(row: Row, column: str, reference: str) -> float | None:
+    """Degrees, or degrees, minutes and seconds, of this or the other side (N, S, E, W); None where there are none."""
+    if not (parts := row.numbers_within(column)):
         return None
-    if not reference or key in "xy":
-        return parts[0]
+    text = row.values[column]
     value = sum(abs(part) / 60.0**k for k, part in enumerate(parts[:3]))
-    side = re.search(r"\b([NSEW])\w*\s*$", f"{text} {row.get(reference, '')}", re.IGNORECASE)
+    side = re.search(r"\b([NSEW])\w*\s*$", f"{text} {row.values.get(reference, '')}", re.IGNORECASE)
     return -value if text.startswith("-") or (side is not None and side[1] in "SsWw") else value
 
 
@@ -218,14 +173,17 @@ def with_ground_control(sources: Sequence[Source], file: str | Path | None) -> l
         if not fields or fields[0].startswith("#"):
             continue
         try:
-            values, image = np.array([float(field) for field in fields[:5]]), canonical_text(fields[5])
+            values, rest = np.array([float(field) for field in fields[:5]]), canonical_text(line.split(maxsplit=5)[5])
         except (ValueError, IndexError):
             raise InputError(f"{file}: line {number}: expected X Y Z PX PY IMAGE [NAME]") from None
-        if image in sizes:
+        # Names may hold blanks: the longest one that is an image's.
+        ends = [blank.start() for blank in re.finditer(r"\s+|$", rest)]
+        image = next((rest[:end] for end in reversed(ends) if rest[:end] in sizes), None)
+        if image is not None:
             if not ((values[3:] >= -0.5) & (values[3:] < np.array(sizes[image]) - 0.5)).all():
                 size = "{} x {}".format(*sizes[image])
                 raise InputError(f"{file}: line {number}: is not within the {size} pixels of {image}")
-            shown.append((image, fields[6] if len(fields) > 6 else " ".join(fields[:2]), values))
+            shown.append((image, rest[len(image) :].strip() or " ".join(fields[:2]), values))
     if not shown:
         raise InputError(f"{file}: has no ground control point in any of the images")
     xy = np.array([values[:2] for _, _, values in shown])

@@ -25,7 +25,7 @@ from rdstitch.io.read import DecodedImage, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
 from rdstitch.results.messages import Message, left_out
 from rdstitch.system.cache import Cache
-from rdstitch.system.file_access import canonical_name, held_in_memory, is_url
+from rdstitch.system.file_access import held_in_memory, is_url
 
 _HELD_UPRIGHT = 6  # EXIF orientation
 
@@ -55,8 +55,8 @@ class Source:
 
     @property
     def name(self) -> str:
-        """File name, for messages, reports and tables, the same in every locale."""
-        return canonical_name(self.path.name)
+        """What it is called in messages, reports and tables; see :class:`rdstitch.inputs.frame.Frame`."""
+        return (self.frame or Frame(self.path)).name
 
     @property
     def down(self) -> tuple[float, float, float] | None:

@@ -30,6 +30,7 @@ from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.write import sidecar
+from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, TemporaryFolder, check_distinct, check_output, json_bytes, text_bytes
 from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.verdict import RefusedError
@@ -41,6 +42,7 @@ _NO_TIMES = Message(
 )
 
 
+@one_opencv_thread()
 def pano(
     inputs: Images,
     output: str | Path | None = None,
@@ -87,6 +89,7 @@ def pano(
     return _stitch(inputs, output, options or StitchOptions(), every, progress, beside, pano=True)
 
 
+@one_opencv_thread()
 def mosaic(
     inputs: Images,
     output: str | Path | None = None,
@@ -130,6 +133,7 @@ def mosaic(
     return _stitch(inputs, output, options or StitchOptions(), every, progress, beside, pano=False)
 
 
+@one_opencv_thread()
 def mosaic_blocks(
     inputs: Images,
     output: str | Path,
@@ -233,6 +237,7 @@ def _stitch(
                 return compose_registration(chosen, executor, output, options, progress, beside, outputs)
 
 
+@one_opencv_thread()
 def calibrate(
     inputs: Images,
     options: StitchOptions | None = None,
@@ -274,6 +279,7 @@ def calibrate(
     return result
 
 
+@one_opencv_thread()
 def trajectory(
     inputs: Images,
     output: str | Path | None = None,

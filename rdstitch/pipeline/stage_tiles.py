@@ -34,10 +34,12 @@ from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table, oriented
 from rdstitch.stage.register_tiles import TileRegistration, evidence, places_table, register_tiles
 from rdstitch.stage.tile_options import TileOptions
+from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_distinct, check_output, text_bytes
 from rdstitch.system.progress import Progress, silent
 
 
+@one_opencv_thread()
 def tiles(
     inputs: Images,
     output: str | Path | None = None,
@@ -82,6 +84,7 @@ def tiles(
             return compose_registration(chosen, executor, output, stitch, progress, beside, outputs)
 
 
+@one_opencv_thread()
 def place_tiles(
     inputs: Images,
     positions_file: str | Path | None = None,

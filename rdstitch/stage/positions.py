@@ -1,8 +1,6 @@
 """Nominal places of tiles by what users have: a table, file names, OME-XML, Micro-Manager's metadata."""
 
-import csv
 import json
-import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,12 +11,13 @@ import numpy as np
 import tifffile
 
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.inputs.tables import by_image, csv_rows
 from rdstitch.io.metadata import read_ome
 from rdstitch.io.opening import TIFF_MAGIC, decoding
 from rdstitch.stage.grid import TileGrid
 from rdstitch.system.file_access import canonical_name, canonical_text, open_regular, read_text
 
-_NAMES = ("name", "file", "filename", "image")
+_COLUMNS = {"name": "name file filename image", "x": "x xpx", "y": "y ypx", "x_um": "xum", "y_um": "yum"}
 _METADATA_FILE = "metadata.txt"
 _HOW = (
     "say where they are: --grid 'r{row}c{col}' --overlap PERCENT for names, or --positions FILE with name,x,y; "
@@ -61,24 +60,10 @@ def grid_from_table(
     names: Sequence[str], file: str | Path, size: tuple[int, int], pixel_size: float | None
 ) -> TileGrid:
     """Places by a CSV file with the columns ``name``, ``x`` and ``y``, pixels, or ``x_um`` and ``y_um``."""
-    lines = read_text(Path(file)).splitlines()
-    header = [cell.strip().lower() for cell in next(csv.reader(lines[:1]), [])]
-    name = next((column for column in _NAMES if column in header), None)
-    pair = next((p for p in (("x", "y"), ("x_px", "y_px"), ("x_um", "y_um")) if set(p) <= set(header)), None)
-    if name is None or pair is None:
-        raise InputError(f"{file}: the first line must name the columns name, x, y (pixels) or name, x_um, y_um")
-    table = {}
-    for number, row in enumerate(csv.DictReader(lines, fieldnames=header), start=1):
-        if number == 1:
-            continue
-        try:
-            x, y = (float(row[column]) for column in pair)
-            if not (math.isfinite(x) and math.isfinite(y)):
-                raise ValueError
-        except (TypeError, ValueError):
-            raise InputError(f"{file}: line {number} has no numbers for {pair[0]} and {pair[1]}") from None
-        unit = 1.0 if pair[0].endswith("um") else None
-        table[canonical_text(Path(str(row[name]).strip()).name)] = StagePosition(x, y, unit)
+    rows = by_image(csv_rows(read_text(file), str(file), _COLUMNS, ("name,x,y", "name,x_um,y_um")))
+    pixels = any("x" in row.values for row in rows.values())
+    x, y, unit = ("x", "y", None) if pixels else ("x_um", "y_um", 1.0)
+    table = {name: StagePosition(row.needed(x), row.needed(y), unit) for name, row in rows.items()}
     missing = [item for item in names if item not in table]
     if missing:
         raise InputError(f"{file}: has no line for {missing[0]}; add one with its place")

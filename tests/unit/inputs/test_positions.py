@@ -1,6 +1,7 @@
 """Positions of images: of EXIF, and of files in all their forms."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +115,7 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "names no columns like name,lat,lon"),
+        ("", "names no columns like name,latitude,longitude or name,x,y"),
         ("name,lat,lon\nz.jpg,1,2\n", "has no position of a.jpg"),
         ("name,lat,lon\na.jpg,1,2\na.jpg,1,2\n", "line 3: a.jpg is here twice"),
         ("name,lat,lon\na.jpg,91,2\n", "line 2: expected latitude and longitude in degrees, not 91 and 2"),
@@ -149,6 +150,21 @@ def test_control_points(tmp_path: Path) -> None:
     ]
     np.testing.assert_allclose((one[0].place.latitude, one[0].place.longitude), (-33.9, 18.5), atol=1e-7)
     assert three[0].name == "268900 6246200"
+    sources = [replace(source, path=Path(f"DJI {source.name}")) for source in _sources()]
+    file.write_text("WGS84 UTM 34S\n268832 6246117 12 1 2 DJI a.jpg the post\n268832 6246117 12\t3\t4\tDJI b.jpg\n")
+    one, two, _ = (source.control for source in with_ground_control(sources, file))
+    assert [(c.name, c.pixel) for c in (*one, *two)] == [("the post", (1.0, 2.0)), ("268832 6246117", (3.0, 4.0))]
+
+
+def test_projected_numbers_in_other_notations_and_zero_longitude(tmp_path: Path) -> None:
+    """What was 580.015 or missing in silence."""
+    place = _read(tmp_path, 'name,x,y\na.jpg,"268,832.2996","6,246,117.7881"\n', 32734)[0]
+    assert (place.latitude, place.longitude) == pytest.approx((-33.9, 18.5), abs=1e-7)
+    assert _read(tmp_path, '[{"SourceFile": "a.jpg", "GPSLatitude": 51.5, "GPSLongitude": 0}]')[0] == GpsPosition(
+        51.5, 0
+    )
+    with pytest.raises(InputError, match=r"line 2: has 5 fields"):
+        _read(tmp_path, "name,lat,lon\na.jpg,48,8582,2,2945\n")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,222 @@
+"""Tables that users have: CSV, lists of fields between blanks, and records of JSON, as rows with named columns.
+
+A caller says which columns it knows and what else they are called, and which of them a table must have::
+
+    COLUMNS = {"name": "name file image", "x": "x easting", "y": "y northing"}
+    for row in csv_rows(text, file, COLUMNS, ("name,x,y",), units=("m",)):
+        row.image, row.number("x"), row.number("y")
+
+Headings count without regard to case, blanks, underscores and a group (``EXIF:``). A unit in brackets belongs to the
+heading where the caller knows it so (``x (um)`` is ``xum``); else it must be one of ``units``. The delimiter is the
+comma, semicolon or tab that is in the heading most often. Lines that begin with ``#`` say nothing, except that the
+heading may stand in one. Numbers are read in either notation (``580,015.975``, ``580.015,975``, ``580'015.975``); what
+could be two numbers is one of them where the rest of the table shows the decimal mark, and refused elsewhere.
+
+Every complaint names the file and the line.
+"""
+
+import csv
+import io
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import Any
+
+from rdstitch.errors import InputError
+from rdstitch.system.file_access import canonical_text
+from rdstitch.system.records import parse_json
+
+_DELIMITERS = ",;\t"
+_HEADING = re.compile(r"(?:.*:)?([^\[(]*)(?:[\[(]([^\])]*)[\])]?.*)?", re.DOTALL)
+_EMPTY = ("", "-", "nan")
+# A number by its decimal mark; the other mark may stand between groups of three digits.
+_NOTATIONS = {
+    mark: re.compile(rf"(?=[-+]?[.,]?\d)[-+]?(\d+|[1-9]\d{{0,2}}(\{other}\d{{3}})+)?(\{mark}\d*)?([eE][-+]?\d+)?")
+    for mark, other in (".,", ",.")
+}
+_GROUPED = re.compile(r"(?<=\d)[\s'’](?=\d{3}(?!\d))")
+_NUMERAL = re.compile(r"[-+]?[.,]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+)?")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a table."""
+
+    where: str  # the file and the line, for messages
+    values: Mapping[str, str]  # by the caller's columns; empty ones are not in it
+    decimal: str = ""  # the table's decimal mark, "." or ","; empty where it does not show that
+
+    @property
+    def image(self) -> str:
+        """The name of the image's file, without its folder, whatever system wrote it; see :func:`image_name`."""
+        if not (name := image_name(self.values.get("name", ""))):
+            raise InputError(f"{self.where}: has no name")
+        return name
+
+    def number(self, column: str) -> float | None:
+        """The finite number in a column; None where it is empty."""
+        text = self.values.get(column, "")
+        if text.lower() in _EMPTY:
+            return None
+        if (value := self._parsed(_GROUPED.sub("", text))) is None:
+            raise InputError(f"{self.where}: expected a number for {column}, not '{text}'")
+        return value
+
+    def needed(self, column: str) -> float:
+        """The finite number in a column, which must not be empty."""
+        if (value := self.number(column)) is None:
+            raise InputError(f"{self.where}: has no number for {column}")
+        return value
+
+    def numbers_within(self, column: str) -> list[float]:
+        """All numbers in a text like ``48 deg 51' 29.60" N``."""
+        values = (self._parsed(part) for part in _NUMERAL.findall(self.values.get(column, "")))
+        return [value for value in values if value is not None]
+
+    def _parsed(self, text: str) -> float | None:
+        readings = _readings(text)
+        if "," in text and len(set(readings.values())) > 1 and not self.decimal:
+            raise InputError(f"{self.where}: '{text}' could be two numbers; write it without a comma")
+        value = readings.get(self.decimal or ".", next(iter(readings.values()), None))
+        return value if value is not None and abs(value) < float("inf") else None
+
+
+def image_name(text: str) -> str:
+    """A file's name without its folders, those of Windows too, spelled as the names of images are."""
+    return canonical_text(re.split(r"[\\/]", text.strip())[-1])
+
+
+def by_image(rows: Iterable[Row]) -> dict[str, Row]:
+    """The rows by the names of their images, each of which may be there once."""
+    table: dict[str, Row] = {}
+    for row in rows:
+        if row.image in table:
+            raise InputError(f"{row.where}: {row.image} is here twice; remove one")
+        table[row.image] = row
+    return table
+
+
+def csv_rows(
+    text: str, file: str, columns: Mapping[str, str], wanted: Sequence[str], units: Sequence[str] = ()
+) -> list[Row]:
+    """The rows of a CSV file with a heading.
+
+    Parameters
+    ----------
+    text, file
+        The content, and the name for messages.
+    columns
+        What the caller knows: of each column all headings that mean it, between blanks. Others are ignored; of several
+        with one meaning the last counts that is not empty.
+    wanted
+        The columns that there must be, such as ``"name,x,y"``, and alternatives to them.
+    units
+        What may stand in brackets behind a heading and changes nothing.
+    """
+    if "\0" in text:
+        raise InputError(f"{file}: is no UTF-8 text; save it as CSV in UTF-8")
+    known = _finder(file, columns, units)
+    lines = list(io.StringIO(text, newline=None))
+    start = next((n for n, line in enumerate(lines) if _is_heading(line, known)), 0)
+    heading = lines[start].lstrip("# ") if lines else ""
+    delimiter = max(_DELIMITERS, key=heading.count)
+    # Comments become empty lines, so that the others keep their numbers.
+    rest = ("" if line.startswith("#") else line for line in lines[start + 1 :])
+    reader = csv.reader([heading, *rest], delimiter=delimiter, skipinitialspace=True, strict=True)
+    try:
+        headings = next(reader, [])
+        meanings = [known(heading) for heading in headings]
+        if not any(set(names.split(",")) <= set(meanings) for names in wanted):
+            raise InputError(f"{file}: its first line names no columns like {' or '.join(wanted)}")
+        rows = []
+        for fields in reader:
+            where = f"{file}: line {reader.line_num + start}"
+            if any(field.strip() for field in fields[len(headings) :]):
+                raise InputError(f"{where}: has {len(fields)} fields, but there are {len(headings)} columns")
+            if any(field.strip() for field in fields):
+                rows.append((where, zip(meanings, fields, strict=False)))
+    except csv.Error as error:
+        raise InputError(f"{file}: line {reader.line_num + start}: is not CSV: {error}") from error
+    return _rows(rows)
+
+
+def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> list[Row]:
+    """The objects of a JSON list, as ``exiftool -json`` writes them; ``wanted`` describes them where there are none."""
+    content = parse_json(text, file)
+    if not isinstance(content, list) or not all(isinstance(item, dict) for item in content):
+        raise InputError(f"{file}: expected {wanted}")
+    known = _finder(file, columns, ())
+    return _rows(
+        (f"{file}: [{number}]", ((known(key), value) for key, value in item.items()))
+        for number, item in enumerate(content)
+    )
+
+
+def listed_rows(lines: Iterable[str], file: str, columns: Sequence[str], first_line: int = 1) -> list[Row]:
+    """Lines of a name, which may hold blanks, and numbers between blanks; those that begin with ``#`` are ignored."""
+    rows = []
+    for number, line in enumerate(lines, start=first_line):
+        fields = line.split()
+        if fields and not fields[0].startswith("#"):
+            count = len(list(takewhile(_readings, reversed(fields[1:]))))
+            name = line.strip().rsplit(maxsplit=count)[0]
+            rows.append((f"{file}: line {number}", zip(columns, (name, *fields[len(fields) - count :]), strict=False)))
+    return _rows(rows)
+
+
+def _rows(found: Iterable[tuple[str, Iterable[tuple[str | None, Any]]]]) -> list[Row]:
+    """Rows with the decimal mark that their unambiguous numbers share."""
+    rows = []
+    for where, pairs in found:
+        texts = ((column, "" if value is None else str(value).strip()) for column, value in pairs)
+        rows.append((where, {column: value for column, value in texts if column and value}))
+    numerals = {
+        numeral
+        for _, values in rows
+        for column, text in values.items()
+        if column != "name"
+        for numeral in _NUMERAL.findall(text)
+    }
+    # Those that can be read in one way only.
+    readings = [_readings(text) for text in numerals]
+    marks = {mark for reading in readings if len(reading) == 1 for mark in reading}
+    decimal = marks.pop() if len(marks) == 1 else ""
+    return [Row(where, values, decimal) for where, values in rows]
+
+
+def _readings(text: str) -> dict[str, float]:
+    """What a numeral is, by the decimal mark."""
+    found = {}
+    for mark, notation in _NOTATIONS.items():
+        if notation.fullmatch(text):
+            found[mark] = float(text.replace("," if mark == "." else ".", "").replace(mark, "."))
+    return found
+
+
+def _finder(file: str, columns: Mapping[str, str], units: Sequence[str]) -> Callable[[str], str | None]:
+    """Which column a heading means."""
+    meaning = {alias: column for column, aliases in columns.items() for alias in aliases.split()}
+
+    def plain(text: str) -> str:
+        return "".join(letter for letter in text.lower() if letter.isalpha()).replace("µ", "u").replace("μ", "u")
+
+    def find(heading: str) -> str | None:
+        parts = _HEADING.fullmatch(str(heading))
+        assert parts is not None
+        word, unit = plain(parts[1]), plain(parts[2] or "")
+        if word + unit in meaning:
+            return meaning[word + unit]
+        if meaning.get(word, "name") != "name" and unit not in ("", *units):
+            known = f"; give it in {' or '.join(units)}" if units else ""
+            raise InputError(f"{file}: the column '{heading.strip()}' has a unit that is not known here{known}")
+        return meaning.get(word)
+
+    return find
+
+
+def _is_heading(line: str, known: Callable[[str], str | None]) -> bool:
+    """Check whether a line is the heading: the first one that is no comment, or a comment that names columns."""
+    if not line.startswith("#"):
+        return bool(line.strip())
+    return sum(known(field) is not None for field in re.split(f"[{_DELIMITERS}]", line.lstrip("# "))) > 1
