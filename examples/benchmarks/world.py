@@ -4,8 +4,10 @@ Every subfolder that holds images is one set; each is stitched by ``rdstitch mos
 status, images used, model, λ, the ratio of the areas that a pixel gets within the output (98 % over 2 %), the focal
 length, the share of the places along its seams that is broken and the longest break in pixels, lines of messages, and
 processor time; with ``--peer``, the ``stitch`` command of the package ``stitching``, its processor time beside it. The
-seams are those of the sidecar; ``stitching`` tells nobody where its seams run. A result is "good" where the status is 0, all images are used, |λ| ≤ 0.09, the ratio of areas
-at most 30, and no image folded: what a person sees at a glance. Look at the images in ``--output`` for the rest.
+seams are those of the sidecar; ``stitching``'s picture stands beside ours, and nobody is told where its seams run.
+
+A result is "good" where the status is 0, all images are used, |λ| ≤ 0.09, the ratio of areas at most 30, and no image
+folded: what a person sees at a glance. Look at the images in ``--output`` for the rest.
 """
 
 import json
@@ -59,7 +61,8 @@ class Row:
         return (
             f"{'good' if self.good else '-':4s} {self.name:24s} {self.status:3d} {self.used:3d}/{self.count:<3d} "
             f"{self.model:10s} {self.distortion:+7.3f} {self.stretch:8.1f}{'F' if self.folded else ' '} "
-            f"{self.focal:6.2f} {100 * self.broken:5.1f} {self.longest:5.0f} {len(self.messages):3d} {self.seconds:7.1f} {self.peer_seconds:7.1f}"
+            f"{self.focal:6.2f} {100 * self.broken:5.1f} {self.longest:5.0f} {len(self.messages):3d} "
+            f"{self.seconds:7.1f} {self.peer_seconds:7.1f}"
         )
 
 
@@ -134,9 +137,8 @@ def main(
     sets = sorted({file.parent for folder in folders for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES})
     output = output or Path(tempfile.mkdtemp())
     output.mkdir(parents=True, exist_ok=True)
-    print(
-        "     set                      status used  model           λ    areas   f/half  torn longest lines  cpu s  peer s"
-    )
+    columns = "areas   f/half  torn break lines  cpu s  peer s"
+    print(f"     set                      status used  model           λ    {columns}")
     with ThreadPoolExecutor(jobs) as pool:
         rows = []
         for row in pool.map(lambda folder: stitch(folder, output, options.split(), peer), sets):
