@@ -1,8 +1,8 @@
 """Whether the seams hold: what a person sees where one image of the output ends and the next begins.
 
 Along every border of two images, windows of both are compared. A seam is broken where the two differ at the border
-itself, and either both fit clearly better with one of them moved, or both have edges there that do not match at all.
-What differs beside the border does not count: a seam that goes around a moving object holds.
+itself, and either fit clearly better with one of them moved, or lines of one do not go on in the other. What differs
+beside the border does not count: a seam that goes around a moving object holds.
 """
 
 import math
@@ -27,6 +27,8 @@ _BORDER = 2  # pixels on either side of a seam at which a difference shows
 _CONTRAST = 6.0 / 255.0
 _ALIKE, _GAIN, _MOVED = 0.75, 0.2, 3.0  # correlation of a moved window, its lead, and by how much it is moved
 _UNLIKE = 0.4  # correlation below which edges on both sides are not the same
+# Coherence of edges (0: all directions, 1: one) from which on a person sees them end: leaves and gravel hide a seam.
+_DIRECTED = 0.4
 _MAX_SHARE, _MIN_BROKEN = 0.05, 3  # of the places that may be broken before a person sees it
 _MAX_LENGTH = 0.045  # of a break that a person does not see, diagonals of an image
 _SURELY_ALIKE = 0.9  # correlation of windows that need not be moved
@@ -182,7 +184,8 @@ def _compared(
         elif differ[k] > contrast and alike[k] < _SURELY_ALIKE:
             best, shift = _best_shift(first, second, whole[k], int(reaches[k]))
             moved = shift > _MOVED and best > _ALIKE and best - alike[k] > _GAIN
-            unlike = alike[k] < _UNLIKE and max(_edges(windows1[k]), _edges(windows2[k])) > contrast
+            edges, directions = zip(_edges(windows1[k]), _edges(windows2[k]), strict=True)
+            unlike = alike[k] < _UNLIKE and max(edges) > contrast and max(directions) > _DIRECTED
             broken = bool(moved or unlike)
             shift = shift if moved else math.nan
         result.append((at[k], broken, shift if broken else 0.0))
@@ -259,10 +262,11 @@ def _best_shift(first: SeamTile, second: SeamTile, at: IntArray, reach: int) -> 
     return best, float(np.hypot(*there)) if np.hypot(*(there + back)) <= 2 else math.nan
 
 
-def _edges(window: Float32Array) -> float:
-    """The strong edges of a window, grey levels a pixel."""
+def _edges(window: Float32Array) -> tuple[float, float]:
+    """The strong edges of a window, grey levels a pixel, and how much they have one direction, [0, 1]."""
     x, y = (cv2.Sobel(window, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
-    return float(np.quantile(np.hypot(x, y), 0.9))
+    xx, yy, xy = (float((u * v).sum()) for u, v in ((x, x), (y, y), (x, y)))
+    return float(np.quantile(np.hypot(x, y), 0.9)), math.hypot(xx - yy, 2.0 * xy) / max(xx + yy, 1e-9)
 
 
 def _breaks(
