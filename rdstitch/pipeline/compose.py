@@ -186,25 +186,18 @@ def compose_images(
 
 
 def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
-    """How many seams hold, a detail; and one warning where a person sees that they are broken."""
-    if not len(seams.places):
-        return []
-    count = int(seams.broken.sum())
-    holding = f"seams hold at {len(seams.places) - count} of {len(seams.places)} places"
+    """Where seams are broken: a warning where a person sees it, else a detail."""
     if not seams.breaks:
-        return [Message(holding, severity="detail")]
+        return []
     worst = list({one.images: one for one in reversed(seams.breaks)}.values())[::-1][:MAX_NAMED]
     told = []
     for one in worst:
         (x, y), (first, second) = one.position, names_of(paths[k] for k in one.images)
         told.append(f"a break of {one.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}")
     more = f", and {rest} more" if (rest := len(seams.breaks) - len(worst)) else ""
-    breaks = f"{'; '.join(told)}{more}"
-    if not seams.seen:
-        return [Message(f"{holding}; {breaks}", severity="detail")]
+    text = f"{'; '.join(told)}{more}: something moved, or is nearer than the rest; leave one of the two out, or mask it"
     images = tuple(dict.fromkeys(paths[k] for one in worst for k in one.images))
-    text = f"{breaks}: something moved, or is nearer than the rest; leave one of the two images out, or mask it"
-    return [Message(holding, severity="detail"), Message(text, images, code="seam-break")]
+    return [Message(text, images, "warning" if seams.seen else "detail", "seam-break")]
 
 
 def _planned(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> CompositePlan:
