@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection
 from rdstitch.system.late_imports import csgraph, sparse
 
 DIAGONAL = 1000.0
@@ -27,6 +27,8 @@ _BORDER = 2  # pixels on either side of a seam at which a difference shows
 _CONTRAST = 6.0 / 255.0
 _ALIKE, _GAIN, _MOVED = 0.75, 0.2, 3.0  # correlation of a moved window, its lead, and by how much it is moved
 _UNLIKE = 0.4  # correlation below which edges on both sides are not the same
+_COARSER, _CELL, _MIN_CELLS = 3, 13, 8  # overlaps are compared so many times smaller, in cells; fewer say nothing
+_MIN_ALIKE = 0.5  # share of the overlaps that what fills less than half of the images cannot reach
 # Coherence of edges (0: all directions, 1: one) from which on a person sees them end: leaves and gravel hide a seam.
 _DIRECTED = 0.4
 _MAX_SHARE, _MIN_BROKEN = 0.05, 3  # of the places that may be broken before a person sees it
@@ -62,6 +64,12 @@ class SeamQuality:
     broken: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (N,)
     breaks: tuple[SeamBreak, ...] = ()  # the longest first
     spacing: float = math.inf  # of the places, pixels of the output
+    alike: float = math.nan  # share of the overlaps that looks alike, [0, 1]; NaN where there is nothing to compare
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether most of what the images share does not look alike: it may be something else that holds them."""
+        return self.alike < _MIN_ALIKE
 
     @property
     def share(self) -> float:
@@ -129,6 +137,40 @@ def measure_seams(
     size = np.array([row[3] for row in found])
     breaks = _breaks(images, places, broken, size, unit)
     return SeamQuality((places + 0.5) * unit - 0.5, broken, breaks, _STEP * unit)
+
+
+def share_alike(tiles: Sequence[SeamTile | None], pairs: IntArray, full: float = 255.0) -> float:
+    """Share of the overlaps of pairs (P, 2) that looks alike in place, a few pixels more or less; NaN without any."""
+    small = [None if tile is None else _smaller(tile) for tile in tiles]
+    cells = alike = 0
+    for i, j in pairs.tolist():
+        first, second = small[i], small[j]
+        if first is None or second is None or (box := intersection(first.box, second.box)) is None:
+            continue
+        parts = [(cut(tile.grey, tile.box, box), cut(tile.inside, tile.box, box)) for tile in (first, second)]
+        rows, columns = (n // _CELL for n in parts[0][0].shape)
+
+        def in_cells(values: NDArray[Any], rows: int = rows, columns: int = columns) -> NDArray[Any]:
+            whole = values[: rows * _CELL, : columns * _CELL].reshape(rows, _CELL, columns, _CELL)
+            return whole.swapaxes(1, 2).reshape(-1, _CELL, _CELL)
+
+        (grey1, inside1), (grey2, inside2) = ([in_cells(values) for values in part] for part in parts)
+        known = (inside1 & inside2).all(axis=(1, 2))
+        known &= np.minimum(grey1.std(axis=(1, 2)), grey2.std(axis=(1, 2))) > _CONTRAST * full
+        cells += int(known.sum())
+        alike += int((_correlation(grey1[known], grey2[known]) > _UNLIKE).sum())
+    return alike / cells if cells >= _MIN_CELLS else math.nan
+
+
+def _smaller(tile: SeamTile) -> SeamTile:
+    """A tile with larger pixels, which begin where they do on the whole canvas."""
+    x, y = (-start % _COARSER for start in tile.box[:2])
+    rows, columns = (n // _COARSER for n in (tile.grey.shape[0] - y, tile.grey.shape[1] - x))
+    part = np.s_[y : y + rows * _COARSER, x : x + columns * _COARSER]
+    left, top = (tile.box[0] + x) // _COARSER, (tile.box[1] + y) // _COARSER
+    shape = rows, _COARSER, columns, _COARSER
+    grey = tile.grey[part].reshape(shape).mean(axis=(1, 3))
+    return SeamTile((left, top, left + columns, top + rows), grey, tile.inside[part].reshape(shape).all(axis=(1, 3)))
 
 
 def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArray, FloatArray]:

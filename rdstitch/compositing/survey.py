@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection, overlapping_pairs
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, measure_seams
+from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, measure_seams, share_alike
 from rdstitch.compositing.source_images import ImageReader, LoadedImage, PlacedImage
 from rdstitch.compositing.warp import Warp, locate, plan_warps, sample, sample_opacity
 from rdstitch.io.reduction import mean_of_channels
@@ -66,7 +66,8 @@ class Survey:
             low, high = np.mean([np.quantile(t.pixels[t.inside], [0.005, 0.995]) for t in shown], axis=0)
             full = max(float(high - low), 1e-12)
         seen = [None if tile is None else tile.seen for tile in self.tiles]
-        return measure_seams(seen, labels, self.enlarged, self.factor / self.enlarged, full)
+        quality = measure_seams(seen, labels, self.enlarged, self.factor / self.enlarged, full)
+        return replace(quality, alike=share_alike(seen, self.pairs(), full))
 
 
 def survey_factor(canvas: Canvas) -> int:

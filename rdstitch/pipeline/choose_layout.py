@@ -51,8 +51,9 @@ class LaidOut:
 
     @property
     def faults(self) -> int:
-        """How much of it a person sees at a glance: broken seams, and places that are stretched."""
-        return int(self.layout.seams.seen) + int(_is_stretched(self.layout))
+        """How much speaks against it: broken seams, places that are stretched, and overlaps that do not look alike."""
+        seams = self.layout.seams
+        return int(seams.seen) + int(seams.contradicted) + int(_is_stretched(self.layout))
 
     @property
     def clipped(self) -> int:

@@ -186,7 +186,13 @@ def compose_images(
 
 
 def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
-    """Where seams are broken: a warning where a person sees it, else a detail."""
+    """Where seams are broken, a warning where a person sees it, else a detail; and whether overlaps are unlike."""
+    if seams.contradicted:
+        text = (
+            f"only {seams.alike:.0%} of what the images share looks alike: something that fills a part of them (a "
+            "vehicle, the camera's own mount) may be what was put together; a mask keeps it out"
+        )
+        return [Message(text, code="rival-motion")]
     if not seams.breaks:
         return []
     worst = list({one.images: one for one in reversed(seams.breaks)}.values())[::-1][:MAX_NAMED]
