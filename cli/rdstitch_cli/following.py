@@ -54,7 +54,7 @@ def followed(
         raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
     preview = output.with_suffix(".preview.jpg") if refresh else None
     # Before hours of frames, not after them.
-    planned = [output] if refresh is None else image_files(check_suffix(output), [])
+    planned = [output] if refresh is None else image_files(check_suffix(output))
     if stitch.save_camera is not None:
         planned.append(check_suffix(stitch.save_camera, CAMERA_SUFFIXES))
     planned += [file for file in (preview, plot) if file is not None]

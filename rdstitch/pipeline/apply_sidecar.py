@@ -19,7 +19,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.opening import check_readable
-from rdstitch.pipeline.compose import compose_images, image_files, plainly_viewed, write_page
+from rdstitch.pipeline.compose import check_world_files, compose_images, image_files, plainly_viewed, write_page
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.straighten import turned_anew
@@ -235,6 +235,8 @@ def apply(
         raise InputError(doubts[0].text)
     given = as_inputs(images, channel_order)
     with found_images(given, output=output, every=every, topic=topic) as listed, Outputs(overwrite) as outputs:
+        if output is not None:
+            check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
         chosen, matched = _match(saved, listed.frames, match)
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
@@ -245,7 +247,7 @@ def apply(
             used = dict(zip(used, corrected, strict=True))
             doubts += said
         if output is not None:
-            check_outputs(image_files(check_suffix(output), list(used.values())), overwrite, [*listed.files, sidecar])
+            check_world_files([output], list(used.values()), overwrite)
         placed, said = turned_anew(_placed(saved, used), options, saved.composite)
         doubts += said
         composed = compose_images(

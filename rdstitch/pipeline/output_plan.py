@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 
 from rdstitch.errors import ArgumentError
-from rdstitch.inputs.source import Source
 from rdstitch.pipeline.compose import image_files
 from rdstitch.pipeline.result_files import (
     PosesFrame,
@@ -108,13 +107,13 @@ def check_run(
     options: StitchOptions,
     beside: FilesBeside,
     inputs: Iterable[str | Path],
-    sources: Sequence[Source],
+    names: Iterable[str],
 ) -> None:
-    """Find out before long work whether everything can be written, over nothing that is read."""
-    files = [file for image in images for file in image_files(check_suffix(image), sources)]
+    """Find out before long work whether all that images of these names become can be written, over nothing read."""
+    files = [file for image in images for file in image_files(check_suffix(image))]
     if options.save_camera is not None:
         from rdstitch.camera_files import CAMERA_SUFFIXES
 
         files.append(check_suffix(options.save_camera, CAMERA_SUFFIXES))
-    files += beside.files(source.name for source in sources)
+    files += beside.files(names)
     check_outputs(files, options.overwrite, [*inputs, *options.files])

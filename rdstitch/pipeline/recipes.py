@@ -21,7 +21,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.local_alignment import LocalAlignment
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.aligner import Purpose
-from rdstitch.pipeline.compose import blocks_on, compose_images, viewed_images, write_page
+from rdstitch.pipeline.compose import blocks_on, check_world_files, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside, check_run
 from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
@@ -180,8 +180,9 @@ def mosaic_blocks(
         frames = selected(listed.frames, options.exclude, options.include_only)
         names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
         further = names[1:]
+        found = listed
         while len(frames) > 1 or not results:
-            found, name = replace(listed, frames=frames), names[len(results)]
+            name = names[len(results)]
             try:
                 with outputs.together():
                     result = _stitch_found(found, name, options, progress, beside, outputs, further=further)
@@ -200,6 +201,7 @@ def mosaic_blocks(
             used = [source.frame or Frame(source.path) for source, used in pairs if used]
             done = {(frame.path, frame.number) for frame in used}
             frames = [frame for frame in frames if (frame.path, frame.number) not in done]
+            found = replace(listed, frames=frames)
             # These are of the first block, or of its reference image.
             options, beside, further = _for_further_blocks(options), NOTHING_BESIDE, []
     return (_without_blocks(results[0], results[1:], [*listed.messages, *refused]), *map(_without_blocks, results[1:]))
@@ -261,8 +263,12 @@ def _stitch_found(
     further: Sequence[Path] = (),
 ) -> StitchResult:
     """The same of images that were found; ``further`` are images that may follow."""
-    sources, unread = read_inputs(in_lasting_order(listed.frames), options, skip_bad=not pano)
-    check_run([*([] if output is None else [output]), *further], options, beside, listed.files, sources)
+    images = [] if output is None else [output, *further]
+    frames = in_lasting_order(listed.frames)
+    names = [frame.name for frame in selected(frames, options.exclude, options.include_only)]
+    check_run(images, options, beside, listed.files, names)
+    sources, unread = read_inputs(frames, options, skip_bad=not pano)
+    check_world_files(images, sources, options.overwrite)
     check_map(sources, options.composite)
     with options.executor(len(sources)) as executor:
         known = [*unread, *listed.messages]
@@ -302,8 +308,8 @@ def calibrate(
     """
     options = options or StitchOptions()
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
+        check_run([], options, beside, listed.files, ())
         sources, unread = read_inputs(listed.frames, options, skip_bad=True)
-        check_run([], options, beside, listed.files, sources)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages]
             result = _finished(_accepted(sources, known, options, executor, progress, "calibrate", beside))

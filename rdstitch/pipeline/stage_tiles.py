@@ -23,7 +23,7 @@ from rdstitch.io.reduction import mean_of_channels
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.pipeline.compose import image_files
+from rdstitch.pipeline.compose import check_world_files, image_files
 from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
@@ -119,12 +119,13 @@ def _registered(
     beside: FilesBeside,
 ) -> tuple[Registration, TileRegistration]:
     """The places of all tiles, once it is clear that everything can be written."""
+    _check_outputs(output, positions_file, options, beside, listed)
     guard = InputGuard(options.strict)
     limit = options.composite.max_memory
     sources, unread = read_sources(listed.frames, skip_bad=not options.strict, guard=guard, max_memory=limit)
     if len(sources) < 2:
         raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
-    _check_outputs(output, positions_file, options, beside, listed.files, sources)
+    check_world_files([] if output is None else [output], sources, options.overwrite)
     check_size(sources)
     sources, illumination = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
@@ -156,15 +157,14 @@ def _check_outputs(
     positions_file: str | Path | None,
     options: TileOptions,
     beside: FilesBeside,
-    inputs: Sequence[str | Path],
-    sources: Sequence[Source],
+    listed: FoundImages,
 ) -> None:
     """Find out before long work whether everything can be written."""
     named = [options.positions, None if options.flat_field in ("auto", "off") else options.flat_field]
-    written = [] if output is None else image_files(check_suffix(output), sources)
+    written = [] if output is None else image_files(check_suffix(output))
     written += [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
-    written += beside.files(source.name for source in sources)
-    check_outputs(written, options.overwrite, [*inputs, *(file for file in named if file is not None)])
+    written += beside.files(frame.name for frame in listed.frames)
+    check_outputs(written, options.overwrite, [*listed.files, *(file for file in named if file is not None)])
 
 
 def _plane(sources: Sequence[Source], channel: int | None, index: int) -> NDArray[Any]:
