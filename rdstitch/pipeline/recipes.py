@@ -15,7 +15,7 @@ from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of,
 from rdstitch.geometry.exif_orientation import quarter_turn
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
-from rdstitch.inputs.measurements import timestamps_of
+from rdstitch.inputs.measurements import timestamps_of, with_times
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
 from rdstitch.local_alignment import LocalAlignment
@@ -25,7 +25,7 @@ from rdstitch.pipeline.compose import blocks_on, check_world_files, compose_imag
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside, check_run
 from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
-from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs
+from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag
 from rdstitch.pipeline.register import register, with_frontal_reference
 from rdstitch.pipeline.straighten import turned
 from rdstitch.pipeline.whole_pixels import on_whole_pixels
@@ -170,6 +170,7 @@ def mosaic_blocks(
     results: list[StitchResult] = []
     refused: list[Message] = []
     given = as_inputs(inputs, options.channel_order)
+    options, notes = with_camera_in_bag(given, options)
     with ExitStack() as stack:
         listed = stack.enter_context(found_images(given, output=output, every=every, topic=options.topic))
         if options.cache is None:
@@ -177,6 +178,10 @@ def mosaic_blocks(
             options = replace(options, cache=stack.enter_context(TemporaryFolder()))
         # All are published together.
         outputs = stack.enter_context(Outputs(options.overwrite))
+        listed = replace(
+            listed, frames=list(with_times(listed.frames, options.timestamps)), notes=(*listed.notes, *notes)
+        )
+        options = replace(options, timestamps=None)
         frames = selected(listed.frames, options.exclude, options.include_only)
         names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
         further = names[1:]
@@ -244,10 +249,12 @@ def _stitch(
 ) -> StitchResult:
     """The stages of :func:`mosaic`, and, where every image must be readable and one gives the plane, :func:`pano`."""
     given = as_inputs(inputs, options.channel_order)
+    options, notes = with_camera_in_bag(given, options)
     with (
         found_images(given, output=output, every=every, topic=options.topic) as listed,
         Outputs(options.overwrite) as outputs,
     ):
+        listed = replace(listed, notes=(*listed.notes, *notes))
         return _stitch_found(listed, output, options, progress, beside, outputs, pano=pano)
 
 
@@ -264,7 +271,7 @@ def _stitch_found(
 ) -> StitchResult:
     """The same of images that were found; ``further`` are images that may follow."""
     images = [] if output is None else [output, *further]
-    frames = in_lasting_order(listed.frames)
+    frames = in_lasting_order(with_times(listed.frames, options.timestamps))
     names = [frame.name for frame in selected(frames, options.exclude, options.include_only)]
     check_run(images, options, beside, listed.files, names)
     sources, unread = read_inputs(frames, options, skip_bad=not pano)
@@ -309,7 +316,7 @@ def calibrate(
     options = options or StitchOptions()
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
         check_run([], options, beside, listed.files, ())
-        sources, unread = read_inputs(listed.frames, options, skip_bad=True)
+        sources, unread = read_inputs(with_times(listed.frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages]
             result = _finished(_accepted(sources, known, options, executor, progress, "calibrate", beside))
@@ -343,8 +350,7 @@ def trajectory(
     layout : str
         "csv", "tum" or "kitti"; see :mod:`rdstitch.export.trajectory_files`.
     timestamps : path, optional
-        File of the time stamps of the images; see :func:`rdstitch.inputs.measurements.timestamps_of`. Without it,
-        they are those of the video, the bag, or EXIF.
+        As in ``options``.
     plot : path, optional
         SVG file to draw the path to.
     height : float
@@ -359,20 +365,25 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = replace(options or StitchOptions(), pose_covariance=True)
-    with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
+    options = options if timestamps is None else replace(options, timestamps=timestamps)
+    given = as_inputs(inputs, options.channel_order)
+    options, notes = with_camera_in_bag(given, options)
+    with found_images(given, every=every, topic=options.topic) as listed:
         files = [Path(file) for file in (output, plot) if file is not None]
-        read = [*listed.files, *options.files, *([] if timestamps is None else [timestamps])]
-        check_outputs(files, options.overwrite, read)
-        sources, unread = read_inputs(listed.frames, options, skip_bad=True)
-        times = timestamps_of(sources, timestamps)
+        check_outputs(files, options.overwrite, [*listed.files, *options.files])
+        # Numbered as they were named: what is left out leaves a gap.
+        frames = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
+        sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
-            known = [*unread, *listed.messages]
+            known = [*unread, *listed.messages, *notes]
             registration = _accepted(sources, known, options, executor, progress, "trajectory")
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])
     path = Trajectory.from_alignment(turned_alignment(registration.alignment, back, None), height)
-    path = path.labelled([s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], times)
+    path = path.labelled(
+        [s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], timestamps_of(sources)
+    )
     if layout == "tum" and not has_times(path):
         registration = registration.with_messages([_NO_TIMES])
     with Outputs(options.overwrite) as outputs:
