@@ -152,7 +152,9 @@ def _decided(task: _Task, progress: ShareProgress) -> Decisions:
         if options.blend == "feather":
             seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
     box, note = whole, ""
-    if options.crop == "auto":
+    if canvas.cropped_to is not None and options.crop == "auto":
+        box = canvas.cropped_to
+    elif options.crop == "auto":
         find = crop_box if task.turn is None else partial(crop_rows, whole=task.turn)
         cropped_box, note = find(covered_pixels(survey), survey.factor, canvas.size)
         box = cropped_box or box

@@ -170,7 +170,8 @@ def _smaller(tile: SeamTile) -> SeamTile:
     left, top = (tile.box[0] + x) // _COARSER, (tile.box[1] + y) // _COARSER
     shape = rows, _COARSER, columns, _COARSER
     grey = tile.grey[part].reshape(shape).mean(axis=(1, 3))
-    return SeamTile((left, top, left + columns, top + rows), grey, tile.inside[part].reshape(shape).all(axis=(1, 3)))
+    inside: BoolArray = np.asarray(tile.inside[part].reshape(shape).all(axis=(1, 3)))
+    return SeamTile((left, top, left + columns, top + rows), grey, inside)
 
 
 def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArray, FloatArray]:
