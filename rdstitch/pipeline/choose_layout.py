@@ -50,10 +50,10 @@ class LaidOut:
     messages: tuple[Message, ...] = ()
 
     @property
-    def faults(self) -> int:
-        """How much speaks against it: broken seams, places that are stretched, and overlaps that do not look alike."""
+    def faults(self) -> tuple[bool, int]:
+        """What speaks against it: overlaps that do not look alike, and how many of broken seams and stretched places."""
         seams = self.layout.seams
-        return int(seams.seen) + int(seams.contradicted) + int(_is_stretched(self.layout))
+        return seams.contradicted, int(seams.seen) + int(_is_stretched(self.layout))
 
     @property
     def clipped(self) -> int:
@@ -98,7 +98,7 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         tried.append(laid(registration))
     except LimitError as error:
         failed = error
-    if options.dry_run or (tried and not tried[0].faults):
+    if options.dry_run or (tried and not any(tried[0].faults)):
         return _first(tried, failed)
     if tried and tried[0].local.fields and options.local_alignment == "auto":
         tried.append(laid(registration, no_local_alignment("seams hold better without it")))
