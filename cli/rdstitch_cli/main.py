@@ -1,6 +1,5 @@
 """The command group, and the edge where errors become one line and an exit status."""
 
-import ctypes
 import errno
 import gc
 import logging
@@ -18,6 +17,7 @@ import click
 from click.shell_completion import shell_complete
 
 from rdstitch.errors import OutputError, RdstitchError
+from rdstitch.system.process_memory import take_over_memory
 from rdstitch_cli.commands.apply import apply
 from rdstitch_cli.commands.calibrate import calibrate
 from rdstitch_cli.commands.doctor import doctor
@@ -39,7 +39,6 @@ Examples:
 
 _UNEXPECTED, _USAGE, _INTERRUPTED, _BROKEN_PIPE = 1, 2, 130, 141
 _TERMINATION_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
-_M_ARENA_MAX = -8
 _OPENCV_NO_MEMORY = -4  # cv2.Error.StsNoMem
 _OUT_OF_MEMORY = "out of memory; try smaller images or a smaller --scale"
 _DECODERS = ("PIL", "tifffile")
@@ -87,12 +86,11 @@ def main() -> None:
     """Run the command line and leave with its exit status."""
     _open_standard_streams()
     write_whatever_the_encoding()
-    # Images and pairs are worked on side by side; threads within each matrix product would only be in the way.
-    # NumPy reads this when it is loaded, which is later.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Large arrays are freed by one stage's threads and wanted by the next one's; their own pools would keep them.
-    with suppress(AttributeError, OSError, TypeError):
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
+    # Images and pairs are worked on side by side; threads within each matrix product or filter would only be in the
+    # way. NumPy and OpenCV read this when they are loaded, which is later.
+    for name in ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+        os.environ.setdefault(name, "1")
+    take_over_memory()
     # Decoders warn and log of odd files; this process is ours, and what matters ends as an error.
     for name in _DECODERS:
         warnings.filterwarnings("ignore", module=rf"{name}\b")

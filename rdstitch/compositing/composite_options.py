@@ -22,9 +22,9 @@ class CompositeOptions(UprightOptions):
     Attributes
     ----------
     exposure : str
-        Gain compensation. "balanced" makes images agree where they overlap, keeps every region near the brightness of
-        its own images, and clips nothing; "gain" makes the whole comparable, with one factor per image and channel
-        and one vignetting for all; "blocks" adds a smooth field per image to that; "none" is for people who measure.
+        Gain compensation. "gain" makes the whole comparable, with one factor per image and channel and one vignetting
+        for all; "blocks" adds a smooth field per image where one is asked for; "balanced" does the same, but keeps
+        regions near the brightness of their own images where they would be burnt out; "none" is for people who measure.
     seam : str
         Where one image ends and the next begins: "graphcut" goes round what differs between them (parallax,
         people), "voronoi" where their borders are equally far, "none" leaves it to the blending.
@@ -54,7 +54,10 @@ class CompositeOptions(UprightOptions):
     gsd : float, optional
         Metres on the map that a pixel takes, instead of ``scale``; the output must be georeferenced.
     epsg : int, optional
-        Code of the map's coordinate system; None: UTM on WGS 84. Others need the extra ``crs``.
+        Code of the map's coordinate system; None: UTM (UPS near the poles) on WGS 84. Others need the extra ``crs``.
+    georeference : str
+        "auto" places the output where positions or control points agree with the images, "force" also where these
+        contradict them, "off" never.
     max_memory : int, optional
         Bytes that the compositor may hold in images and tiles; None: a quarter of the memory that is
         available, at least 400 MB, or more where the canvas needs it.
@@ -89,6 +92,7 @@ class CompositeOptions(UprightOptions):
     north_up: bool = True
     gsd: float | None = None
     epsg: int | None = None
+    georeference: Literal["auto", "force", "off"] = "auto"
     max_memory: int | None = None
     interpolation: Interpolation = "cubic"
     background: int = 0

@@ -70,11 +70,6 @@ class ImageCache:
             # Who requests an image that cannot be read gets the error.
             self._ahead.submit(self._read_ahead, index)
 
-    def settle(self) -> None:
-        """Wait for all that is read ahead."""
-        if self._ahead is not None:
-            self._ahead.submit(int).result()
-
     def close(self) -> None:
         """Read nothing ahead any more, and forget what is on disk."""
         if self._ahead is not None:

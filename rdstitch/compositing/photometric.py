@@ -25,6 +25,8 @@ from rdstitch.local_alignment.field import nodes_around
 
 # The correction is smooth: it is computed at this spacing, canvas pixels, and interpolated.
 _LATTICE = LATTICE_STEPS[0]
+# From here on, as a share of the full range, brightened samples are compressed instead of clipped.
+KNEE = 0.75
 _ROWS = 128  # that are corrected at a time
 DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
 
@@ -40,9 +42,9 @@ class Exposure:
     # (N, B, B, C), or: smooth remainder on a grid over each image (rows, columns), log of what the image is brighter by
     # there
     fields: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
-    # share of the full range from which brightened samples are compressed, so that full scale stays full scale and
-    # nothing else gets there; 1: they are clipped
-    knee: float = 1.0
+    # brightest corrected sample, share of the full range: what is brightened is compressed, so that nothing up to there
+    # becomes full scale but full scale itself; 1: it is clipped
+    white: float = 1.0
     # rms_before, rms_after: robust difference between overlapping images, share of the full range
     rms_before: float = 0.0
     rms_after: float = 0.0
@@ -87,7 +89,7 @@ class Exposure:
     def _apply(self, pixels: NDArray[Any], factors: list[Any], rates: list[Any]) -> NDArray[Any]:
         """``q (v + b) - b``, compressed above the knee; one array for all channels, or one plane a channel."""
         full = np.float32(full_scale(pixels.dtype))
-        offset, knee = np.float32(self.offset) * full, np.float32(self.knee) * full
+        offset, knee = np.float32(self.offset) * full, np.float32(KNEE) * full
         depth = DEPTHS[pixels.dtype.name]
         done = np.empty_like(pixels)
         flat = done.reshape(len(done), -1)
@@ -101,7 +103,7 @@ class Exposure:
             rows = slice(top, top + _ROWS)
             values: Any = pixels[rows] + offset
             values *= part(factors, rows)
-            if self.knee >= 1.0 or not rates:
+            if self.white <= 1.0 or not rates:
                 # Rounded and clipped to the type; the type stubs lack scalars.
                 cv2.subtract(values.reshape(len(values), -1), float(offset), flat[rows], dtype=depth)  # type: ignore[call-overload]
                 continue
@@ -118,11 +120,8 @@ class Exposure:
 
         ``w`` above the knee becomes ``w / (1 + c w)``; 0 where the gain does not brighten.
         """
-        if self.knee >= 1.0:
-            return np.zeros_like(gain)
-        white = np.maximum(gain * np.float32(1.0 + self.offset) - np.float32(self.offset), np.float32(1.0))
-        rate = (white - 1) / (np.float32(1.0 - self.knee) * (white - np.float32(self.knee)))
-        return np.asarray(rate, dtype=np.float32)
+        white = np.clip(gain * np.float32(1.0 + self.offset) - np.float32(self.offset), 1.0, np.float32(self.white))
+        return np.asarray((white - 1) / (np.float32(1.0 - KNEE) * (white - np.float32(KNEE))), dtype=np.float32)
 
     def _smooth_nodes(self, index: int, geometry: Geometry) -> Float32Array:
         """What vignetting and field are made up for by, at nodes around a box (m, n, 1 or C)."""

@@ -21,7 +21,6 @@ from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.render import Renderer
 from rdstitch.io.encoding import STRIP_ROWS
 from rdstitch.system.cache import Cache, Stored
-from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.progress import ShareProgress, unheard
 
 OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
@@ -67,12 +66,8 @@ class TiledOutput:
         if self.workers == 1:
             yield from self._strips(map, progress)
             return
-        with one_opencv_thread(), ThreadPoolExecutor(self.workers) as pool:
-            try:
-                yield from self._strips(pool.map, progress)
-            finally:
-                # OpenCV divides by its number of threads: it must not change while an image is smoothed.
-                self.renderer.images.settle()
+        with ThreadPoolExecutor(self.workers) as pool:
+            yield from self._strips(pool.map, progress)
 
     def _strips(self, run: Callable[..., Iterator[Any]], progress: ShareProgress) -> Iterator[OutputStrip]:
         """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
@@ -122,8 +117,7 @@ class Block:
 
     def compute(self, store: Cache) -> list[Stored[OutputStrip]]:
         """Its strips from top to bottom, in the store, which must be this run's own."""
-        with one_opencv_thread():
-            return [self._kept(store, number, strip) for number, strip in enumerate(self.tiles.strips())]
+        return [self._kept(store, number, strip) for number, strip in enumerate(self.tiles.strips())]
 
     def _kept(self, store: Cache, number: int, strip: OutputStrip) -> Stored[OutputStrip]:
         return store.stored("blocks", (self.tiles.box, number), lambda: strip)

@@ -18,14 +18,16 @@ from types import TracebackType
 from typing import IO, Any, ParamSpec, TypeVar
 
 from rdstitch.errors import LimitError
-from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.process_memory import return_freed_memory
+from rdstitch.system.process_memory import take_over_memory
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
 _PROGRAM = "from rdstitch.executors.processes import work; work()"
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+_ONE_THREAD = (
+    *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"),
+    "OPENCV_FOR_THREADS_NUM",
+)
 _ATTEMPTS = 2  # at a task whose worker died
 
 
@@ -122,13 +124,12 @@ def work() -> None:
     results = os.fdopen(os.dup(1), "wb")
     # What a library prints must not come among the results.
     os.dup2(2, 1)
-    return_freed_memory()
+    take_over_memory()
     tasks: SimpleQueue[Any] = SimpleQueue()
     threading.Thread(target=_receive, args=(os.fdopen(os.dup(0), "rb"), tasks), daemon=True).start()
-    with one_opencv_thread():
-        while True:
-            results.write(_answer(tasks.get()))
-            results.flush()
+    while True:
+        results.write(_answer(tasks.get()))
+        results.flush()
 
 
 def _receive(stream: IO[bytes], tasks: "SimpleQueue[Any]") -> None:

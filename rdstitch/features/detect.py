@@ -13,7 +13,6 @@ from rdstitch.features.learned import AlikedDetection
 from rdstitch.features.opencv import LARGE, OpenCVDetection, SiftTilesDetection
 from rdstitch.features.prepared_image import CLIP_LIMIT, Mask, PixelArray, PreparedImage, View, prepare
 from rdstitch.features.surf.descriptor import SurfDetection
-from rdstitch.system.opencv_state import one_opencv_thread
 
 _MIN_KEYPOINT_SHARE = 0.5  # of the keypoints wanted: where a reduced image shows fewer, a larger one is used
 _SPREAD_CELL = 0.05  # side of a cell over which keypoints are spread, diagonals of the image
@@ -90,23 +89,17 @@ def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask 
         Points in pixels of ``image``, strongest first; none for a blank image. The same for the same image,
         whatever the number of threads.
     """
-    return _detect(lambda _: View(image, mask), options or FeatureOptions())
+    return detect_view(lambda _: View(image, mask), options or FeatureOptions())
 
 
 def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
-    """As :func:`detect`, in one thread, for an image that is loaded as large as it is needed.
+    """As :func:`detect`, for an image that is loaded as large as it is needed.
 
     Parameters
     ----------
     source : callable
         See :data:`ViewLoader`.
     """
-    with one_opencv_thread():
-        return _detect(source, options)
-
-
-def _detect(source: ViewLoader, options: FeatureOptions) -> Features:
-    """The same for an image that is loaded as large as it is needed."""
     most, megapixels = options.limits
     image, detection, usable = _look(source, options, megapixels)
     shown, few = len(usable), len(usable) < _MIN_KEYPOINT_SHARE * most

@@ -1,6 +1,5 @@
 """Recomposing from a saved registration: other bands of the same flight, other sizes, other compositing options."""
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -40,6 +39,7 @@ from rdstitch.sidecar.write import (
     versions,
 )
 from rdstitch.system.file_access import canonical_name, canonical_text
+from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_output, json_bytes
 from rdstitch.system.progress import Progress, silent
 
@@ -159,6 +159,7 @@ MatchBy = Literal["auto", "name", "order"]
 _MATCHES = ("auto", "name", "order")
 
 
+@one_opencv_thread()
 def apply(
     sidecar: str | Path,
     images: Images,
@@ -336,13 +337,26 @@ def _match(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) ->
 
 
 def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[Path], str]) -> list[Frame | None]:
-    given = [canonical_name(key(frame.path)) for frame in frames]
-    files, counts = dict(zip(given, frames, strict=True)), Counter(given)
-    names = [None if p.to_plane is None else canonical_text(key(Path(p.name))) for p in saved.images]
-    for name, count in Counter(names).items():
-        if name is not None and name in files and (count > 1 or counts[name] > 1):
-            raise InputError(f"{saved.path}: several images are called {name}; give all in the old order and say so")
-    return [None if name is None else files.get(name) for name in names]
+    given: dict[str, list[Frame]] = {}
+    for frame in frames:
+        given.setdefault(canonical_name(key(frame.path)), []).append(frame)
+    chosen: list[Frame | None] = []
+    for image in saved.images:
+        *folders, name = Path(canonical_text(image.name)).parts or ("",)
+        alike = [] if image.to_plane is None else given.get(key(Path(name)), [])
+        if folders:
+            alike = [frame for frame in alike if _folders(frame)[-len(folders) :] == folders]
+        if len(alike) > 1 or (alike and alike[0] in chosen):
+            raise InputError(
+                f"{saved.path}: several images are called {name}; give as many images as it has, in its order, with "
+                "--match order"
+            )
+        chosen.append(alike[0] if alike else None)
+    return chosen
+
+
+def _folders(frame: Frame) -> list[str]:
+    return [canonical_name(part) for part in frame.path.absolute().parent.parts]
 
 
 def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Frame]:

@@ -13,6 +13,7 @@ from rdstitch.inputs.frame import in_order
 from rdstitch.pipeline.apply_sidecar import Recomposition
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.stitch_result import StitchResult
+from rdstitch.system.opencv_state import one_opencv_thread
 
 
 class Composer:
@@ -50,6 +51,7 @@ class Composer:
     3
     """
 
+    @one_opencv_thread()
     def __init__(self, result: StitchResult | Recomposition, interpolation: Interpolation = "linear") -> None:
         placed, options = placed_by(result)
         images, options = placed.images(result.canvas.near), replace(options, interpolation=interpolation)
@@ -57,6 +59,7 @@ class Composer:
         self._tables, self._order = CompositeTables.of(images, result.canvas, options), result.image_order
         self.alpha = self._tables.alpha
 
+    @one_opencv_thread()
     def compose(self, images: Iterable[NDArray[Any]]) -> NDArray[Any]:
         """Put one set of images together, (H, W) or (H, W, C).
 

@@ -20,6 +20,7 @@ from rdstitch.pipeline.recipes import mosaic
 from rdstitch.results.messages import Message, bytes_in_words, seconds_in_words, shortened, told_once
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.verdict import RefusedError
 
@@ -105,6 +106,7 @@ class Examination:
         return "".join(f"{name + ':':<12}{text}\n" for name, text in lines)
 
 
+@one_opencv_thread()
 def examine(
     inputs: Images,
     *,

@@ -43,12 +43,14 @@ from rdstitch.stage.register_tiles import (
     search_radius,
 )
 from rdstitch.stage.tile_options import TileOptions
+from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_distinct, check_output, text_bytes
 from rdstitch.system.progress import Progress, silent
 
 _COMPARED = 32  # overlaps by which a flat field is judged
 
 
+@one_opencv_thread()
 def tiles(
     inputs: Images,
     output: str | Path | None = None,
@@ -93,6 +95,7 @@ def tiles(
             return compose_registration(registration, local, executor, output, stitch, progress, beside, outputs)
 
 
+@one_opencv_thread()
 def place_tiles(
     inputs: Images,
     positions_file: str | Path | None = None,

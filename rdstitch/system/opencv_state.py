@@ -1,60 +1,52 @@
 """State that OpenCV keeps for the whole process, changed for a while and left as it was found, whatever threads do."""
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from threading import Lock
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import cv2
 
 _SILENT = 0  # the log level of that name
-
-
-class _SharedSetting:
-    """A number of the process that blocks of code hold at another value: the last block to end restores it."""
-
-    def __init__(self, read: Callable[[], int], write: Callable[[int], object], held: int) -> None:
-        self._read, self._write, self._held = read, write, held
-        self._lock, self._blocks, self._before = Lock(), 0, 0
-
-    @contextmanager
-    def hold(self) -> Iterator[None]:
-        with self._lock:
-            if self._blocks == 0:
-                self._before = self._read()
-                self._set(self._held)
-            self._blocks += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._blocks -= 1
-                if self._blocks == 0:
-                    self._set(self._before)
-
-    def _set(self, value: int) -> None:
-        if self._before != self._held:
-            self._write(value)
-
-
-def _opencv_threads() -> int:
-    """0 for those of the caller alone: OpenCV says 1, but to set 1 would end its threads."""
-    count = cv2.getNumThreads()
-    return count if count > 1 else 0
-
-
-# 0 rather than 1: a forked process would wait for ever for the end of threads that its parent alone has.
-_threads = _SharedSetting(_opencv_threads, cv2.setNumThreads, 0)
 # OpenCV 4 has the same functions at its top level; its stubs know neither.
 _logging: Any = getattr(cv2.utils, "logging", cv2)
-_log_level = _SharedSetting(_logging.getLogLevel, _logging.setLogLevel, _SILENT)
+_lock = threading.Lock()
+_silenced: list[int] = []  # the log level before each of the blocks that hold it
 
 
-def one_opencv_thread() -> AbstractContextManager[None]:
-    """Keep OpenCV from starting threads of its own while we run several: they would wait for each other."""
-    return _threads.hold()
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """Keep OpenCV from starting threads of its own while a recipe runs several: they would wait for each other.
+
+    It is switched only where no other thread is there, which may be inside OpenCV: many of its functions divide by the
+    number of its threads, and end the process if that changes meanwhile. So it is held around a whole recipe.
+    """
+    # 0 rather than 1: a forked process would wait for ever for the end of threads that its parent alone has.
+    before = cv2.getNumThreads()
+    switched = before > 1 and _is_alone()
+    if switched:
+        cv2.setNumThreads(0)
+    try:
+        yield
+    finally:
+        if switched and _is_alone():
+            cv2.setNumThreads(before)
 
 
-def silent_opencv() -> AbstractContextManager[None]:
+def _is_alone() -> bool:
+    return threading.active_count() == 1
+
+
+@contextmanager
+def silent_opencv() -> Iterator[None]:
     """Keep OpenCV from logging what an exception or a return value says already."""
-    return _log_level.hold()
+    with _lock:
+        _silenced.append(_silenced[0] if _silenced else _logging.getLogLevel())
+        _logging.setLogLevel(_SILENT)
+    try:
+        yield
+    finally:
+        with _lock:
+            before = _silenced.pop()
+            if not _silenced:
+                _logging.setLogLevel(before)

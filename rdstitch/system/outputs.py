@@ -107,6 +107,11 @@ def _identity(file: Path) -> tuple[int, int] | None:
     return None
 
 
+def file_name(name: str) -> str:
+    """The name of a file that is written for an image, which may be called by its folders too."""
+    return name.replace("/", "_")
+
+
 def write_bytes_atomic(path: str | Path, data: bytes, overwrite: bool = True) -> None:
     """Write a file, whole or not at all."""
     with Outputs(overwrite) as outputs:

@@ -1,39 +1,56 @@
 """Memory of this process: how what earlier stages have freed goes back to the system, or is kept for the next."""
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from threading import Condition
 
-_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of mallopt
+_MMAP_THRESHOLD, _TRIM_THRESHOLD, _ARENA_MAX = -3, -1, -8  # of mallopt
 _LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again and again; less than an image
 _SCRATCH = 280 * 10**6  # bytes that the threads of this process may take at once for what they give back soon
 
 
-def return_freed_memory() -> None:
-    """Return what is freed, now and from now on, to the system, where the C library would keep it (glibc).
+_mallopt: list[Callable[[int, int], object]] = []  # of the C library, in a process of our own
 
-    What the threads of one stage have freed is of little use to those of the next, and would count twice. From the
-    first call on, large arrays go back as soon as they are freed; otherwise the library would soon put them onto its
-    heaps, where small ones between them keep what is freed. What is free at the end of a heap goes back once it is
-    twice as much, as the library has it while it chooses itself: its first threshold would have every array of a few
-    hundred kilobytes come from the system anew, page by page.
+
+def take_over_memory() -> None:
+    """Choose what the C library (glibc) keeps of what is freed, in a process that is ours: a command, or a worker.
+
+    Its choice cannot be given back, so that a host's process keeps its own. Large arrays go back as soon as they are
+    freed; otherwise the library would soon put them onto its heaps, where small ones between them keep what is freed.
+    What is free at the end of a heap goes back once it is twice as much, as the library has it while it chooses itself:
+    its first threshold would have every array of a few hundred kilobytes come from the system anew, page by page. What
+    one stage's threads have freed is wanted by the next one's: heaps of their own would keep it.
     """
     with suppress(AttributeError, OSError, TypeError):
-        library = ctypes.CDLL(None)
-        library.mallopt(_MMAP_THRESHOLD, _LARGE)
-        library.mallopt(_TRIM_THRESHOLD, 2 * _LARGE)
-        library.malloc_trim(0)
+        _mallopt[:] = [ctypes.CDLL(None).mallopt]
+    _choose(_ARENA_MAX, 1)
+    _choose(_MMAP_THRESHOLD, _LARGE)
+    _choose(_TRIM_THRESHOLD, 2 * _LARGE)
+
+
+def return_freed_memory() -> None:
+    """Return what is freed to the system; in a process of our own from now on too.
+
+    What the threads of one stage have freed is of little use to those of the next, and would count twice.
+    """
+    _choose(_TRIM_THRESHOLD, 2 * _LARGE)
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def reuse_freed_memory() -> None:
-    """Keep what is freed until :func:`return_freed_memory` is called next (glibc).
+    """Keep what is freed, in a process of our own, until :func:`return_freed_memory` is called next.
 
     For a stage that takes as much for one image after the other as :func:`scratch_memory` allows, such as the
     pyramids of SIFT: the system would clear every page of it anew.
     """
-    with suppress(AttributeError, OSError, TypeError):
-        ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, _SCRATCH)
+    _choose(_TRIM_THRESHOLD, _SCRATCH)
+
+
+def _choose(parameter: int, value: int) -> None:
+    for mallopt in _mallopt:
+        mallopt(parameter, value)
 
 
 class _Scratch:

@@ -91,11 +91,11 @@ def viewer_page(
         data["seams"] = "data:image/png;base64," + base64.b64encode(shown).decode("ascii")
         data["seamsBox"] = box
     title = escape(output.name)
-    # Inside a script, "</" would end it.
-    text = json.dumps(data, ensure_ascii=True).replace("</", "<\\/")
+    # Inside a script, "</script" would end it, and "<!--<script" hide its end.
+    text = json.dumps(data, ensure_ascii=True).replace("<", "\\u003c")
     boxes = "".join(
-        f'<label><input type="checkbox" id="show-{name}"{checked}> {name}</label>'
-        for name, checked in (("outlines", " checked"), ("names", " checked"), ("seams", ""))
+        f'<label><input type="checkbox" id="show-{name}"> {name}</label>'
+        for name in ("outlines", "names", "seams")
         if name != "seams" or seams is not None
     )
     return (

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from rdstitch.compositing.seam_finder import SeamMap
-from rdstitch.viewer import seam_image
+from rdstitch.report import svg
+from rdstitch.viewer import ViewedImage, seam_image, viewer_page
 from tests.cli.running import CACHED, Run
 
 _ROOT = Path(__file__).parents[2]
@@ -52,6 +53,16 @@ def test_the_page_knows_the_images_and_needs_no_network(
 
     rdstitch("apply", tmp_path / "x.dzi.json", "--images", frames[0].parent, "-o", tmp_path / "y.dzi")
     assert len(_data(tmp_path / "y.html")["images"]) == 3
+
+
+@pytest.mark.parametrize("name", ["<!--<script>.jpg", "</script>.jpg", "]]>&amp;.jpg"])
+def test_a_name_ends_no_script_and_hides_no_end(name: str, tmp_path: Path) -> None:
+    outline = np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]])
+    text = viewer_page("x.dzi", (10, 10), [ViewedImage(name, [outline], (("pairs", name),))])
+    (tmp_path / "x.html").write_text(text, encoding="utf-8")
+    assert _data(tmp_path / "x.html")["images"][0]["name"] == name
+    assert "<" not in text.partition('id="data">')[2].partition("</script>\n<script>")[0]
+    assert "<script>.jpg" not in svg.element("b", name)  # of a report
 
 
 def test_in_a_browser(page: Path, tmp_path: Path) -> None:

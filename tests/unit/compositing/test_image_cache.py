@@ -115,19 +115,24 @@ def _until(told: Callable[[], bool]) -> None:
         sleep(0.001)
 
 
+def wait_for_all_read_ahead(cache: ImageCache) -> None:
+    assert cache._ahead is not None
+    cache._ahead.submit(int).result()
+
+
 def test_images_are_read_ahead_where_there_is_room() -> None:
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=45_000, ahead=True)
     cache.expect({0, 1, 2})
     cache.prefetch([3, 1, 0, 2, 1])
-    cache.settle()
+    wait_for_all_read_ahead(cache)
     assert decoded_images.reads == {0: 1, 1: 1}
     np.testing.assert_array_equal(cache.get(0).pixels, decoded_images.frames[0])
     np.testing.assert_array_equal(cache.get(1).pixels, decoded_images.frames[1])
     assert decoded_images.reads == {0: 1, 1: 1}
     cache.expect({1, 2})
     cache.prefetch([2])
-    cache.settle()
+    wait_for_all_read_ahead(cache)
     assert decoded_images.reads[2] == 1
     np.testing.assert_array_equal(cache.get(2).pixels, decoded_images.frames[2])
     assert decoded_images.reads == {0: 1, 1: 1, 2: 1}

@@ -1,7 +1,8 @@
 """Overlaps, the light that they tell, the seams in them, and pixels that stay with the camera."""
 
+from collections.abc import Sequence
 from functools import partial
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import cv2
@@ -22,6 +23,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import ground
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import as_image, place_images, render
+from tests.sampled import sampled
 
 
 @pytest.mark.parametrize("shape", [(300, 80), (80, 300)])
@@ -63,7 +65,7 @@ def test_what_is_compared_is_linear_in_the_number_of_images() -> None:
     cells = compare_overlaps(survey)
     assert cells.overlap.nnz == 2 * (count - 1)
     exposure = gain_compensation.estimate_exposure(survey, images)
-    means = np.exp(exposure.log_gain + exposure.fields.mean(axis=(1, 2))).mean(axis=1)
+    means = exposure.log_gain.mean(axis=1)
     assert (means[1::2] > means[::2]).all()
 
 
@@ -110,12 +112,12 @@ def test_nothing_but_full_scale_becomes_full_scale(fields: FloatArray) -> None:
     ramp = np.sort(np.clip(ramp, 0, 65535), axis=0)
     ramp[-1] = 65535
     gains = np.array([[0.0] * 3, [-0.3, -0.1, 0.4]])
-    compressed, clipped = (Exposure(OFFSET, gains, fields=fields, knee=k).correct(1, GEOMETRY, ramp) for k in (0.7, 1))
+    compressed, clipped = (Exposure(OFFSET, gains, fields=fields, white=w).correct(1, GEOMETRY, ramp) for w in (9, 1))
     assert (np.diff(compressed.astype(int), axis=0) > 0).all()
     assert (compressed[-1, :, :2] == 65535).all()
     assert (compressed[:-1, :, :2] < 65535).all()
     assert (clipped[:-1, :, 0] == 65535).any()
-    below = clipped < 0.69 * 65535
+    below = clipped < 0.74 * 65535
     assert np.abs(compressed[below].astype(int) - clipped[below]).max() <= 1
     np.testing.assert_array_equal(compressed[..., 2], clipped[..., 2])
 
@@ -251,3 +253,79 @@ def test_the_white_margins_of_a_page_with_a_header_that_stays_are_kept() -> None
 
 def test_a_camera_that_hardly_moves_masks_nothing() -> None:
     assert static_pixels([_images()[0]] * 5) is None
+
+
+# White paper with text and photographs, and where crops of it lie: x, y, brightness.
+PAPER = (320, 240)
+_FOUR = ((0, 0), (230, 6), (460, 0), (690, 4))
+
+
+def _poster(paper: int, seed: int) -> NDArray[np.uint8]:
+    rng, sheet = np.random.default_rng(seed), np.full((260, 1020, 3), paper, np.uint8)
+    for x in range(40, 900, 190):
+        photo = ground((110, 80), seed + x).region(0, 0, 110, 80)
+        sheet[130:210, x : x + 110] = (255 * photo).astype(np.uint8)
+    for _ in range(220):
+        at = int(rng.integers(0, 980)), int(rng.integers(10, 255))
+        cv2.putText(
+            sheet, "".join(rng.choice(list("abcdefgh"), 3)), at, cv2.FONT_HERSHEY_SIMPLEX, 0.35, (30, 30, 30), 1
+        )
+    return sheet
+
+
+def _crops(
+    sheet: NDArray[np.uint8], places: Sequence[tuple[int, int]], light: Sequence[float]
+) -> list[NDArray[np.uint8]]:
+    """Photographs of the sheet, each of another brightness, with noise."""
+    rng, frames = np.random.default_rng(5), []
+    for (x, y), factor in zip(places, light, strict=True):
+        part = sheet[y : y + PAPER[1], x : x + PAPER[0]] * factor
+        noise = rng.normal(0.0, 0.7, part.shape) * (part < 254.5)
+        frames.append(np.clip(np.rint(part + noise), 0, 255).astype(np.uint8))
+    return frames
+
+
+def _laid(frames: Sequence[NDArray[np.uint8]], places: Sequence[tuple[int, int]]) -> NDArray[np.uint8]:
+    lens = Camera(PAPER, distortion=0.0)
+    homographies = np.tile(np.eye(3), (len(places), 1, 1))
+    homographies[:, :2, 2] = np.array(places) / lens.scale
+    cameras = [lens] * len(places)
+    images = place_images([partial(as_image, frame) for frame in frames], cameras, homographies)
+    return np.asarray(compose(images, plan_canvas(cameras, homographies), CompositeOptions(blend="none")).pixels)
+
+
+def _paper_in(sheet: NDArray[np.uint8], paper: int, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Where there is nothing but paper, not even near by."""
+    other = (sheet != paper).any(axis=2).astype(np.uint8)
+    return np.asarray(cv2.dilate(other, np.ones((7, 7), np.uint8)) == 0)[: shape[0], : shape[1]]
+
+
+BLOCKS = [(200, 120, 20), (60, 60, 60), (250, 220, 170)]
+CORNERS = [(0, 20), (60, 0), (200, 90)]
+
+
+@pytest.mark.parametrize(("corner", "block", "paper"), sampled(list(product(CORNERS, BLOCKS, [255, 240])), 5))
+def test_a_coloured_block_in_one_of_two_images_tints_no_paper(
+    corner: tuple[int, int], block: tuple[int, int, int], paper: int
+) -> None:
+    """A block over up to half of what two equally bright images share, in either."""
+    sheet, places = _poster(paper, 3), ((0, 0), (150, 0))
+    frames, (x, y) = _crops(sheet, places, (1.0, 1.0)), corner
+    shown, left = (frames[1], x - 150) if x > 150 else (frames[0], x + 150)
+    shown[y : y + 150, left : left + 110] = block
+    found = _laid(frames, places).astype(int)
+    clean = _paper_in(sheet, paper, found.shape) & (np.abs(found - block).max(axis=2) > 30)
+    assert np.abs(found - paper)[clean].max() <= 4
+
+
+SHADES = [(1, 0.88, 1, 1), (1, 1, 0.85, 1), (0.85, 0.85, 1, 1), (1, 0.94, 0.88, 0.82)]
+
+
+@pytest.mark.parametrize(("light", "paper"), sampled(list(product(SHADES, [240, 225])), 3))
+def test_a_sheet_of_which_one_shot_is_darker_is_as_white_everywhere(light: tuple[float, ...], paper: int) -> None:
+    sheet = _poster(paper, 4)
+    found = _laid(_crops(sheet, _FOUR, light), _FOUR)
+    clean = _paper_in(sheet, paper, found.shape)
+    # Noise apart.
+    levels = [np.median(found[:, x : x + 24][clean[:, x : x + 24]]) for x in range(0, found.shape[1] - 24, 24)]
+    assert np.ptp(levels) <= 4

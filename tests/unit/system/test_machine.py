@@ -1,15 +1,19 @@
 """The machine: processors, memory, OpenCV's state, and what is imported when."""
 
+import ctypes
 import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Thread
 
+import numpy as np
 import pytest
 
+import rdstitch
 from rdstitch.system import machine, process_memory
 from rdstitch.system.machine import available_memory, processor_count
 from rdstitch.system.process_memory import scratch_memory
@@ -86,12 +90,13 @@ def test_where_the_system_says_nothing_there_is_a_guess(tmp_path: Path, monkeypa
 _LARGE_AND_SMALL = """
 from os import sysconf
 import numpy as np
-from rdstitch.system.process_memory import return_freed_memory
+from rdstitch.system.process_memory import return_freed_memory, take_over_memory
 
 def resident():
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) * sysconf("SC_PAGE_SIZE")
 
+take_over_memory()
 return_freed_memory()
 # After this the C library would put all up to this size onto its heap.
 np.ones(28_000_000, dtype=np.uint8)
@@ -114,7 +119,8 @@ def test_large_arrays_go_back_though_small_ones_were_made_between_them() -> None
 _AGAIN_AND_AGAIN = """
 import resource, sys
 import numpy as np
-from rdstitch.system.process_memory import return_freed_memory, reuse_freed_memory
+from rdstitch.system.process_memory import return_freed_memory, reuse_freed_memory, take_over_memory
+take_over_memory()
 return_freed_memory()
 if len(sys.argv) > 1:
     reuse_freed_memory()
@@ -137,6 +143,19 @@ def test_what_each_image_takes_is_reused_for_the_next() -> None:
     command = [sys.executable, "-c", _AGAIN_AND_AGAIN, "many"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert int(done.stdout) < 20_000  # pages; the arrays of a round have 9,800
+
+
+def test_the_c_library_of_a_host_keeps_its_own_choices(monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[str] = []
+
+    class Library:
+        def __getattr__(self, name: str) -> Callable[..., None]:
+            return lambda *_: called.append(name)
+
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: Library())
+    scene = np.random.default_rng(0).integers(0, 255, (60, 200), dtype=np.uint8).repeat(4, 0).repeat(2, 1)
+    rdstitch.pano([scene[:, :280], scene[:, 100:]], options=rdstitch.StitchOptions(distortion=0.0, force=True))
+    assert set(called) == {"malloc_trim"}
 
 
 def test_threads_share_the_memory_that_they_give_back(monkeypatch: pytest.MonkeyPatch) -> None:

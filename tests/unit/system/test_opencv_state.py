@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 from contextlib import suppress
 from typing import Any
 
@@ -17,7 +18,8 @@ LEVEL = (silent_opencv, LOGGING.getLogLevel, LOGGING.setLogLevel, 0)
 
 
 @pytest.mark.parametrize("state", [THREADS, LEVEL], ids=["threads", "log level"])
-def test_the_last_to_leave_gives_back_what_was(state: tuple[Any, ...]) -> None:
+def test_the_last_to_leave_gives_back_what_was(state: tuple[Any, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threading, "active_count", lambda: 1)  # the test runner has threads of its own
     changed, current, put, inside = state
     before = current()
     first, second = changed(), changed()
@@ -25,15 +27,48 @@ def test_the_last_to_leave_gives_back_what_was(state: tuple[Any, ...]) -> None:
         put(3)
         first.__enter__()
         second.__enter__()
-        first.__exit__(None, None, None)
-        assert current() == inside
         second.__exit__(None, None, None)
+        assert current() == inside
+        first.__exit__(None, None, None)
         assert current() == 3
         with suppress(ZeroDivisionError), changed():
             current(1 // 0)
         assert current() == 3
     finally:
         put(before)
+
+
+_BESIDE_THREADS_OF_A_HOST = """
+import threading
+import cv2
+import numpy as np
+import rdstitch
+
+switch, switched = cv2.setNumThreads, []
+switch(4)
+cv2.setNumThreads = lambda count: (switched.append(count), switch(count))
+scene = cv2.resize(np.random.default_rng(0).integers(0, 255, (30, 50), dtype=np.uint8), (150, 90))
+images = [scene[:, :100].copy(), scene[:, 50:].copy()]
+how = rdstitch.StitchOptions(distortion=0.0, focal=100.0, force=True, workers=2)
+done = threading.Event()
+
+def smooth():
+    while not done.is_set():
+        cv2.GaussianBlur(np.zeros((300, 400, 3), np.uint8), (9, 9), 0)
+
+threads = [threading.Thread(target=smooth) for _ in range(3)]
+[thread.start() for thread in threads]
+for _ in range(2):
+    rdstitch.pano(images, options=how)
+done.set()
+assert not switched
+"""
+
+
+def test_threads_of_the_host_go_on_inside_opencv() -> None:
+    # To switch OpenCV's threads would end the process: a division by their number.
+    done = subprocess.run([sys.executable, "-c", _BESIDE_THREADS_OF_A_HOST], timeout=120, check=False)
+    assert done.returncode == 0
 
 
 _IN_A_FORKED_CHILD = """
