@@ -40,7 +40,7 @@ class BlockMatches:
 
     @property
     def std(self) -> float:
-        """Standard deviation of their mean in the direction in which it is largest, pixels: along an edge it is large."""
+        """Standard deviation of their mean in the worst direction, pixels: along an edge it is large."""
         least = float(np.linalg.eigvalsh(self.information.sum(axis=0))[0]) if len(self) else 0.0
         return 1.0 / math.sqrt(least) if least > 0.0 else math.inf
 
