@@ -1,7 +1,7 @@
 """Tiles on a stage: from files whose places are roughly known to one image, or to a table of places."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
