@@ -1,13 +1,15 @@
 """What the user names as input: folders, files, patterns, lists, videos; in the end a list of frames."""
 
 import glob
+import hashlib
 import json
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import count
 from pathlib import Path
 
 from rdstitch.errors import InputError
@@ -132,7 +134,25 @@ def find_images(
             frames.append(frame)
     if outputs and not frames:
         raise InputError(f"{outputs[0].parent}: there are no images but those that rdstitch wrote")
-    return FoundImages(frames, outputs, tuple(containers), tuple(notes))
+    return FoundImages(_labelled(frames), outputs, tuple(containers), tuple(notes))
+
+
+def _labelled(frames: Sequence[Frame]) -> list[Frame]:
+    """The same; those of one file name are called by as many of their folders too as tell them from each other."""
+    places: dict[str, set[tuple[str, ...]]] = {}
+    for frame in frames:
+        places.setdefault(frame.path.name, set()).add(_entry(frame.path).parts)
+    depth = {
+        name: next(n for n in count(1) if len({parts[-n:] for parts in alike}) == len(alike))
+        for name, alike in places.items()
+        if len(alike) > 1
+    }
+    return [
+        replace(frame, label=canonical_name("/".join(_entry(frame.path).parts[-depth[frame.path.name] :])))
+        if frame.path.name in depth and not frame.label and frame.image is None
+        else frame
+        for frame in frames
+    ]
 
 
 def _entry(path: Path) -> Path:
@@ -202,13 +222,17 @@ class _Clip:
 
     def extract(self, every: int | None, topic: str | None, notes: list[Message]) -> list[Frame]:
         """Write the frames that are wanted; what was passed over is added to the notes."""
+        # Of its own: another one may have the same name, in another folder.
+        place = _entry(self.path)
+        folder = self.folder() / hashlib.sha256(os.fsencode(place)).hexdigest()[:8] / place.parent.name
+        folder.mkdir(parents=True, exist_ok=True)
         if is_bag(self.path):
-            images, wanted = extract_images(self.path, self.folder(), every, topic)
+            images, wanted = extract_images(self.path, folder, every, topic)
             notes += wanted.messages(self.path)
             return images
         wanted = wanted_frames(every, partial(grey_frames, self.path))
         notes += wanted.messages(self.path)
-        return [Frame(*frame) for frame in extract_frames(self.path, self.folder(), wanted.__contains__)]
+        return [Frame(*frame) for frame in extract_frames(self.path, folder, wanted.__contains__)]
 
     def among(self, images: int) -> Message:
         """Why it is not used beside images."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rdstitch.errors import ArgumentError
 from rdstitch.io.metadata import Metadata, metadata_of
 from rdstitch.io.read import DecodedImage, as_image, from_pillow
+from rdstitch.system.file_access import canonical_name
 
 ChannelOrder = Literal["bgr", "rgb"]
 """Order of the colour channels of arrays that come in and go out: OpenCV's, or everybody else's."""
@@ -27,6 +28,13 @@ class Frame:
     number: int | None = None  # its number in the video, bag or list of arrays that it comes from, from 0
     timestamp: float | None = None  # when it was taken, s, where its video or bag knows that
     image: DecodedImage | None = None  # the image itself where it is no file
+    # its name among images of which another one has the same file name: with folders, as many as tell them apart
+    label: str = ""
+
+    @property
+    def name(self) -> str:
+        """What it is called in messages, tables and files, the same in every locale."""
+        return self.label or canonical_name(self.path.name)
 
 
 Image = str | os.PathLike[str] | NDArray[Any] | PIL.Image.Image

@@ -33,7 +33,7 @@ def is_selected(frame: Frame, exclude: Sequence[str], include_only: Sequence[str
 
 
 def _fits(frame: Frame, pattern: str) -> bool:
-    names = canonical_name(frame.path.name), canonical_name(frame.path)
+    names = canonical_name(frame.path.name), frame.name, canonical_name(frame.path)
     pattern = canonical_name(pattern)
     return pattern in names or any(fnmatchcase(name, pattern) for name in names)
 

@@ -17,10 +17,9 @@ of a light sensor on it (``FlightPitchDegree``, ``DLS:Pitch``), is not the camer
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
-
-from PIL import Image
 
 _MAX_LENGTH = 2**20  # characters; drones write 2,000 to 20,000
 _MAX_NUMBER_LENGTH = 64  # characters of a number, and of the space around it
@@ -31,9 +30,9 @@ _PROPERTIES = {
 }
 
 
-def xmp_text(image: Image.Image) -> str:
-    """The XMP block as text, as far as it can be one of a camera; empty where there is none."""
-    block = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+def xmp_text(info: Mapping[Any, Any]) -> str:
+    """The XMP block in an image's info, as far as it can be one of a camera; empty where there is none."""
+    block = info.get("xmp") or info.get("XML:com.adobe.xmp") or b""
     return (block.decode("utf-8", "replace") if isinstance(block, bytes) else str(block))[:_MAX_LENGTH]
 
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 from xml.etree import ElementTree
 
 from PIL import ExifTags, Image
@@ -17,15 +17,18 @@ from rdstitch.geometry.exif_orientation import turned_size, turning_matrix
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
 from rdstitch.io.colour import ink_transform
 from rdstitch.io.opening import (
-    check_megapixels,
+    TIFF_MAGIC,
+    check_decoded_size,
     check_readable,
     decoding,
     has_late_metadata,
     is_raw,
     opened_image,
+    own_exif,
     raw_exif,
     raw_size,
 )
+from rdstitch.io.read_tiff import channel_count
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
 
@@ -48,29 +51,38 @@ _OF_WHOM = {
 }
 # What units of length count.
 _MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
+_XMP, _PROFILE, _RESOLUTION, _RESOLUTION_UNIT = 700, 34675, (282, 283), 296
+_INCHES = {2: 1.0, 3: 2.54}  # what pixels per unit are multiplied by
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
 
 
 @dataclass(frozen=True)
 class GpsPosition:
-    """Where the camera was: WGS 84 latitude and longitude, degrees; altitude, m above sea, or None."""
+    """Where the camera was: WGS 84 latitude and longitude, degrees; altitude, m above sea, or None.
+
+    ``std``: standard deviations of one horizontal coordinate and of the altitude, m, where the receiver says them.
+    """
 
     latitude: float
     longitude: float
     altitude: float | None = None
+    std: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
 class GroundControl:
     """A point whose place is known: its name, the place, and the pixel of an image that shows it.
 
-    ``epsg`` is the code of the coordinate system that the place was given in.
+    ``epsg`` is the code of the coordinate system that the place was given in, ``std`` the standard deviation of one of
+    its coordinates, m, where known; a ``check`` point is compared with the map, and takes no part in it.
     """
 
     name: str
     place: GpsPosition
     epsg: int
     pixel: tuple[float, float]
+    std: float | None = None
+    check: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,6 +95,7 @@ class Metadata:
     orientation: int = 1
     focal_px: float | None = None  # focal length, pixels, where the file tells it
     gps: GpsPosition | None = None
+    gps_problem: str = ""  # why the position in the file is not used; empty where it is, or where there is none
     attitude: Attitude | None = None
     make: str = ""  # make, model, serial: of the camera; empty where not known
     model: str = ""
@@ -126,34 +139,36 @@ def read_metadata(path: str | Path) -> Metadata:
     with decoding(file):
         if is_raw(file):
             return _raw_metadata(file)
-        try:
-            with opened_image(file) as image:
-                if image.format == "PNG" and not _EXIF_OF_PNG & image.info.keys() and not has_late_metadata(file):
-                    image.info["exif"] = b""  # so that Pillow does not decode the pixels in search of it
-                metadata = metadata_of(image)
-                return _with_ome(file, metadata) if image.format == "TIFF" else metadata
-        except SyntaxError:
-            # Pillow knows few sample layouts of TIFF (no 16-bit colour with alpha, no five bands).
-            with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
-                page = tiff.pages.first
-                size = page.imagewidth, page.imagelength
-                if min(size) < 1:
-                    raise ValueError("no pixels") from None
-                check_megapixels(file, size)
-                metadata = Metadata(size, bit_depth=page.bitspersample, channels=page.samplesperpixel)
-            return _with_ome(file, metadata)
+        with open_regular(file) as stream:
+            if stream.read(len(TIFF_MAGIC[0])) in TIFF_MAGIC:
+                stream.seek(0)
+                return _tiff_metadata(file, stream)
+        with opened_image(file) as image:
+            if image.format == "PNG" and not _EXIF_OF_PNG & image.info.keys() and not has_late_metadata(file):
+                image.info["exif"] = b""  # so that Pillow does not decode the pixels in search of it
+            return metadata_of(image)
 
 
-def _with_ome(file: Path, metadata: Metadata) -> Metadata:
-    """The same with what OME-XML says besides."""
-    with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
-        told = read_ome(tiff.ome_metadata)
-        pages = 1 if told is None or told.channels == 1 else len(tiff.pages)
-    if told is None:
-        return metadata
-    planes = 1 < told.channels <= pages
-    channels = told.channels if planes else metadata.channels
-    return replace(metadata, pixel_size=told.pixel_size, planes=planes, channels=channels)
+def _tiff_metadata(file: Path, stream: BinaryIO) -> Metadata:
+    """Metadata of the first page of a TIFF file, whatever its samples are, and of OME-XML."""
+    with tifffile.TiffFile(stream, name=str(file)) as tiff:
+        page, told = tiff.pages.first, read_ome(tiff.ome_metadata)
+        size, channels = (page.imagewidth, page.imagelength), channel_count(page)
+        if min(size) < 1:
+            raise ValueError("no pixels")
+        planes = told is not None and 1 < told.channels <= len(tiff.pages)
+        channels = told.channels if told is not None and planes else channels
+        check_decoded_size(file, size, channels, page.bitspersample)
+        tags = Image.Exif()
+        tags.bigtiff, tags.endian = tiff.is_bigtiff, tiff.byteorder
+        tags.load_from_fp(stream, page.offset)
+        exif = own_exif(tags)
+    exif[_ORIENTATION] = tags.get(_ORIENTATION, 1)
+    info = {"icc_profile": tags.get(_PROFILE), "xmp": tags.get(_XMP)}
+    if (per := _INCHES.get(tags.get(_RESOLUTION_UNIT, 2))) and tags.get(_RESOLUTION[0]):
+        info["dpi"] = tuple((finite(tags.get(tag)) or math.nan) * per for tag in _RESOLUTION)
+    metadata = _metadata(exif, info, size, page.bitspersample, channels)
+    return replace(metadata, pixel_size=None if told is None else told.pixel_size, planes=planes)
 
 
 def _raw_metadata(file: Path) -> Metadata:
@@ -171,18 +186,26 @@ def metadata_of(image: Image.Image) -> Metadata:
     """Metadata of an image that Pillow has opened."""
     # First, since looking for EXIF at the end of a PNG file decodes it, and Pillow then forgets.
     bit_depth = _bit_depth(image)
-    exif = image.getexif()
+    return _metadata(image.getexif(), image.info, image.size, bit_depth, _channels(image))
+
+
+def _metadata(
+    exif: Image.Exif, info: Mapping[Any, Any], size: tuple[int, int], bit_depth: int, channels: int
+) -> Metadata:
+    """Metadata by EXIF and by what Pillow calls the info of an image whose pixels are stored in a size."""
     orientation = _orientation(exif.get(_ORIENTATION))
     photo = exif.get_ifd(ExifTags.IFD.Exif)
-    xmp = xmp_text(image)
-    dpi = image.info.get("dpi")
-    profile, profile_lost = _colour_profile(image)
+    xmp = xmp_text(info)
+    gps, gps_problem = _gps(exif.get_ifd(ExifTags.IFD.GPSInfo), xmp)
+    dpi = info.get("dpi")
+    profile, profile_lost = _colour_profile(info.get("icc_profile"))
     return Metadata(
-        size=turned_size(image.size, orientation),
+        size=turned_size(size, orientation),
         bit_depth=bit_depth,
         orientation=orientation,
-        focal_px=_focal_px(photo, xmp, image.size),
-        gps=_gps(exif.get_ifd(ExifTags.IFD.GPSInfo)),
+        focal_px=_focal_px(photo, xmp, size),
+        gps=gps,
+        gps_problem=gps_problem,
         attitude=read_attitude(xmp),
         make=_text(exif.get(ExifTags.Base.Make)),
         model=_text(exif.get(ExifTags.Base.Model)),
@@ -190,10 +213,10 @@ def metadata_of(image: Image.Image) -> Metadata:
         dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(finite(d) for d in dpi) else None,
         exposure=_exposure(photo),
         timestamp=_timestamp(photo),
-        exif=_clean_exif(exif, image.width),
+        exif=_clean_exif(exif, size[0]),
         icc_profile=profile,
         profile_lost=profile_lost,
-        channels=_channels(image),
+        channels=channels,
     )
 
 
@@ -212,10 +235,6 @@ def _bit_depth(image: Image.Image) -> int:
     pieces = getattr(image, "tile", None)
     if image.format == "PNG" and pieces and "16" in str(pieces[0][3]):
         return 16
-    tags = getattr(image, "tag_v2", None)
-    if tags is not None:
-        bits = tags.get(258, (1,))
-        return int(bits[0] if isinstance(bits, tuple) else bits)
     return _BIT_DEPTHS.get(image.mode, 8)
 
 
@@ -227,9 +246,8 @@ def _orientation(value: Any) -> int:
     return 1 if number is None or number not in range(1, 9) else int(number)
 
 
-def _colour_profile(image: Image.Image) -> tuple[bytes, str]:
+def _colour_profile(profile: object) -> tuple[bytes, str]:
     """The colour profile, or why it is not kept."""
-    profile = image.info.get("icc_profile")
     if not isinstance(profile, bytes):
         return b"", ""
     if len(profile) > MAX_PROFILE:
@@ -284,17 +302,22 @@ def _timestamp(photo: Mapping[int, Any]) -> float | None:
     return None
 
 
-def _gps(tags: dict[int, Any]) -> GpsPosition | None:
-    """Position from the GPS block, or None where it is absent or impossible."""
-    latitude = _degrees(tags.get(ExifTags.GPS.GPSLatitude), _text(tags.get(ExifTags.GPS.GPSLatitudeRef)) == "S")
-    longitude = _degrees(tags.get(ExifTags.GPS.GPSLongitude), _text(tags.get(ExifTags.GPS.GPSLongitudeRef)) == "W")
+def _gps(tags: dict[int, Any], xmp: str) -> tuple[GpsPosition | None, str]:
+    """Position from the GPS block with accuracies of XMP, or None where it is absent or impossible, and why."""
+    sides = [_text(tags.get(tag)).upper()[:1] for tag in (ExifTags.GPS.GPSLatitudeRef, ExifTags.GPS.GPSLongitudeRef)]
+    latitude = _degrees(tags.get(ExifTags.GPS.GPSLatitude), sides[0] == "S")
+    longitude = _degrees(tags.get(ExifTags.GPS.GPSLongitude), sides[1] == "W")
     if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
-        return None
+        return None, ""
     if latitude == longitude == 0.0:  # what receivers write that have no fix
-        return None
+        return None, ""
+    if sides[0] not in ("N", "S") or sides[1] not in ("E", "W"):
+        return None, "its GPS position does not say whether north or south, east or west"
     altitude = finite(tags.get(ExifTags.GPS.GPSAltitude))
     below_sea = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
-    return GpsPosition(latitude, longitude, -altitude if altitude and below_sea else altitude)
+    along, across, up = (xmp_number(xmp, f"RtkStd{name}") for name in ("Lat", "Lon", "Hgt"))
+    std = None if not (along and across and up) else (math.hypot(along, across) / math.sqrt(2.0), up)
+    return GpsPosition(latitude, longitude, -altitude if altitude and below_sea else altitude, std), ""
 
 
 def _degrees(value: Any, negative: bool) -> float | None:

@@ -31,7 +31,6 @@ from PIL import (
     PngImagePlugin,
     PpmImagePlugin,
     TgaImagePlugin,
-    TiffImagePlugin,
     UnidentifiedImageError,
     WebPImagePlugin,
 )
@@ -39,6 +38,7 @@ from PIL import (
 from rdstitch.errors import InputError
 from rdstitch.system.file_access import is_url, open_regular, remote_status
 from rdstitch.system.late_imports import tifffile
+from rdstitch.system.machine import memory_size
 
 Factory = Callable[[IO[bytes], str], ImageFile.ImageFile]
 
@@ -79,7 +79,6 @@ PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _FORMATS: dict[bytes, Factory] = {
     b"\xff\xd8\xff": JpegImagePlugin.jpeg_factory,
     PNG_MAGIC: PngImagePlugin.PngImageFile,
-    **dict.fromkeys(TIFF_MAGIC, TiffImagePlugin.TiffImageFile),
     b"RIFF": WebPImagePlugin.WebPImageFile,
     b"BM": BmpImagePlugin.BmpImageFile,
     b"GIF8": GifImagePlugin.GifImageFile,
@@ -90,7 +89,9 @@ _FORMATS: dict[bytes, Factory] = {
 
 _MAX_MAGIC = max(map(len, _FORMATS))
 _NAMES = "JPEG, PNG, TIFF, WebP, AVIF, HEIC, BMP, TGA, GIF, JPEG 2000, PBM, PGM, PPM"
-_MAX_MEGAPIXELS = 178
+MAX_IMAGE_GB = "RDSTITCH_MAX_IMAGE_GB"
+"""The environment's name of what one decoded image may take at the most, 1e9 bytes."""
+_MIN_LIMIT, _MEMORY_FRACTION = 178e6 * 3, 1 / 8
 _PNG_METADATA = (b"eXIf", b"tEXt", b"zTXt", b"iTXt")
 
 
@@ -158,7 +159,7 @@ def decoding(path: Path) -> Iterator[None]:
 def opened_image(file: Path) -> Iterator[ImageFile.ImageFile]:
     """An image whose header has been read."""
     with open_regular(file) as stream, _factory(file, stream)(stream, str(file)) as image:
-        check_megapixels(file, image.size)
+        check_decoded_size(file, image.size)
         yield image
 
 
@@ -181,13 +182,18 @@ def has_late_metadata(file: Path) -> bool:
     return True
 
 
-def check_megapixels(file: Path, size: tuple[int, int]) -> None:
-    """Refuse what claims to be larger than any camera's image."""
-    megapixels = size[0] * size[1] / 1e6
-    if megapixels > _MAX_MEGAPIXELS:
+def check_decoded_size(file: Path, size: tuple[int, int], channels: int = 3, bits: int = 8) -> None:
+    """Refuse by its header what would fill the machine's memory, as only a damaged or malicious file does."""
+    need = size[0] * size[1] * channels * -(-bits // 8) / 1e9
+    told = os.environ.get(MAX_IMAGE_GB, "")
+    try:
+        limit = float(told) if told else max(_MIN_LIMIT, _MEMORY_FRACTION * memory_size()) / 1e9
+    except ValueError:
+        raise InputError(f"{MAX_IMAGE_GB}={told}: expected a number of gigabytes") from None
+    if not need <= limit:
         raise InputError(
-            f"{file}: {size[0]} x {size[1]} pixels are {megapixels:.0f} megapixels, more than {_MAX_MEGAPIXELS}; "
-            "cut it up or make it smaller first"
+            f"{file}: {size[0]} x {size[1]} pixels take {need:.1f} GB of memory, more than {limit:.1f}; cut "
+            f"it up or make it smaller first, or set {MAX_IMAGE_GB} to more than an eighth of the machine's memory"
         )
 
 
@@ -253,6 +259,11 @@ def raw_exif(path: Path) -> Image.Exif:
         exif.load_from_fp(stream)
     if not len(exif):
         exif = _exif_of_preview(path)
+    return own_exif(exif)
+
+
+def own_exif(exif: Image.Exif) -> Image.Exif:
+    """EXIF of a directory of TIFF, without what describes how the file is stored."""
     kept = Image.Exif()
     for tag in set(exif) & _KEPT_TAGS:
         kept[tag] = exif[tag]

@@ -16,9 +16,10 @@ from PIL import Image
 
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turned
-from rdstitch.io.colour import srgb_of_lab, without_inks
+from rdstitch.io.colour import without_inks
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata, read_ome
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image, read_raw
+from rdstitch.io.read_tiff import read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
@@ -28,10 +29,6 @@ _END_OF_IMAGE = b"\xff\xd9"
 _PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 _MIN_JPEG_SIDE = 8  # pixels a side; below, different reductions give images of the same size
 _OPAQUE = 255
-# A page of a TIFF file that masks the image, and how many pages are looked at for one.
-_MASK, _MASK_WITHIN = 4, 40
-
-_LAB, _PLAIN = (8, 9), (0, 1, 2)  # photometric interpretations: CIELAB, ICCLAB; white or black is 0, RGB
 
 _MAX_DECODED_REDUCTION = 8  # of the JPEG decoder
 _ROWS_AT_A_TIME = 128
@@ -230,47 +227,10 @@ def _split(samples: Pixels) -> tuple[Pixels, Pixels | None]:
 
 
 def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
-    """Samples and alpha of the first page, with any number of bands, or the mask on a page of its own."""
+    """Samples and alpha of the first page, or of the channels of a microscope."""
     with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
-        page = tiff.pages.first
-        if (planes := _channel_planes(tiff)) is not None:
-            return planes, None
-        kind = page.photometric
-        has_alpha = any(extra in (1, 2) for extra in page.extrasamples)
-        try:
-            samples = page.asarray() if kind in (*_PLAIN, *_LAB) else None
-        except ValueError as error:
-            if "imagecodecs" not in str(error):
-                raise
-            samples = None
-        axes = page.axes
-        size = (page.imagelength, page.imagewidth)
-        others = (other for other in tiff.pages[1:_MASK_WITHIN] if isinstance(other, tifffile.TiffPage))
-        masks = (other for other in others if other.subfiletype == _MASK and other.shape == size)
-        mask = next((other.asarray() for other in masks), None)
-    if samples is None and kind == tifffile.PHOTOMETRIC.SEPARATED:
-        with opened_image(file) as image:
-            return from_pillow(image)
-    if samples is None:
-        with open_regular(file) as stream:
-            return _split(_decode_with_opencv(stream.read()))
-    if axes.startswith("S"):
-        samples, axes = np.moveaxis(samples, 0, -1), axes[1:] + "S"
-    if axes not in ("YX", "YXS"):
-        raise ValueError(f"unexpected axes {axes}")
-    if kind == tifffile.PHOTOMETRIC.MINISWHITE:
-        samples = ~samples
-    if kind in _LAB:
-        if samples.dtype not in (np.uint8, np.uint16):
-            raise ValueError(f"CIELAB of type {samples.dtype}")
-        samples = samples.copy()
-        samples[..., :3] = srgb_of_lab(samples[..., :3], signed=kind == tifffile.PHOTOMETRIC.CIELAB)
-    if samples.dtype == np.bool_:
-        samples = samples.astype(np.uint8) * _OPAQUE
-    if axes == "YXS" and has_alpha:
-        samples, alpha = samples[..., :-1], samples[..., -1]
-        return (samples[..., 0] if samples.shape[2] == 1 else samples), alpha
-    return samples, mask
+        planes = _channel_planes(tiff)
+        return (planes, None) if planes is not None else read_page(tiff, tiff.pages.first)
 
 
 def _channel_planes(tiff: "tifffile.TiffFile") -> Pixels | None:

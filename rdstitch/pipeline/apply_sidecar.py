@@ -1,6 +1,5 @@
 """Recomposing from a saved registration: other bands of the same flight, other sizes, other compositing options."""
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rdstitch.compositing import CompositeOptions
-from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
+from rdstitch.errors import ArgumentError, InputError, PartialResultError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.inputs.find import found_images
@@ -20,7 +19,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.opening import check_readable
-from rdstitch.pipeline.compose import compose_images, plainly_viewed, write_page
+from rdstitch.pipeline.compose import check_world_files, compose_images, image_files, plainly_viewed, write_page
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.straighten import turned_anew
@@ -41,7 +40,7 @@ from rdstitch.sidecar.write import (
 )
 from rdstitch.system.file_access import canonical_name, canonical_text
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import Outputs, check_output, json_bytes
+from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
 from rdstitch.system.progress import Progress, silent
 
 
@@ -237,7 +236,7 @@ def apply(
     given = as_inputs(images, channel_order)
     with found_images(given, output=output, every=every, topic=topic) as listed, Outputs(overwrite) as outputs:
         if output is not None:
-            _check_outputs(Path(output), overwrite, listed.files, saved.path)
+            check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
         chosen, matched = _match(saved, listed.frames, match)
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
@@ -247,6 +246,8 @@ def apply(
             corrected, said = with_flat_field(list(used.values()), flat_field)
             used = dict(zip(used, corrected, strict=True))
             doubts += said
+        if output is not None:
+            check_world_files([output], list(used.values()), overwrite)
         placed, said = turned_anew(_placed(saved, used), options, saved.composite)
         doubts += said
         composed = compose_images(
@@ -255,7 +256,6 @@ def apply(
             options,
             StitchOptions(workers=workers).threads,
             progress,
-            overwrite=overwrite,
             outputs=outputs,
             dry_run=dry_run,
         )
@@ -313,15 +313,6 @@ def _used(
     return dict(zip(used, with_masks(list(used.values()), mask), strict=True))
 
 
-def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sidecar: Path) -> None:
-    """Find out before long work whether the image and its sidecar can be written."""
-    beside = Path(f"{output}.json")
-    if beside.exists() and beside.samefile(sidecar):
-        raise OutputError(f"{output}: its sidecar is the one that is applied; choose another name")
-    check_output(output, overwrite, inputs)
-    check_output(beside, overwrite, inputs, suffixes=())
-
-
 def _match(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) -> tuple[list[Frame | None], str]:
     """For each image of the registration the frame that takes its place, and by what it was found."""
     # Arrays have no names of their own.
@@ -337,13 +328,26 @@ def _match(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) ->
 
 
 def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[Path], str]) -> list[Frame | None]:
-    given = [canonical_name(key(frame.path)) for frame in frames]
-    files, counts = dict(zip(given, frames, strict=True)), Counter(given)
-    names = [None if p.to_plane is None else canonical_text(key(Path(p.name))) for p in saved.images]
-    for name, count in Counter(names).items():
-        if name is not None and name in files and (count > 1 or counts[name] > 1):
-            raise InputError(f"{saved.path}: several images are called {name}; give all in the old order and say so")
-    return [None if name is None else files.get(name) for name in names]
+    given: dict[str, list[Frame]] = {}
+    for frame in frames:
+        given.setdefault(canonical_name(key(frame.path)), []).append(frame)
+    chosen: list[Frame | None] = []
+    for image in saved.images:
+        *folders, name = Path(canonical_text(image.name)).parts or ("",)
+        alike = [] if image.to_plane is None else given.get(key(Path(name)), [])
+        if folders:
+            alike = [frame for frame in alike if _folders(frame)[-len(folders) :] == folders]
+        if len(alike) > 1 or (alike and alike[0] in chosen):
+            raise InputError(
+                f"{saved.path}: several images are called {name}; give as many images as it has, in its order, with "
+                "--match order"
+            )
+        chosen.append(alike[0] if alike else None)
+    return chosen
+
+
+def _folders(frame: Frame) -> list[str]:
+    return [canonical_name(part) for part in frame.path.absolute().parent.parts]
 
 
 def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Frame]:

@@ -1,7 +1,6 @@
 """Files that other programs read, made from a result: layers for retouching, a table of poses, a project of Hugin."""
 
 import math
-from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,16 +25,20 @@ from rdstitch.pipeline.apply_sidecar import Recomposition
 from rdstitch.pipeline.composer import placed_by
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import Outputs, check_outputs
+from rdstitch.system.outputs import Outputs, check_outputs, file_name
 
 
 def layer_files(names: list[str], folder: str | Path) -> list[Path]:
-    """The files of images of these names, two each: the layer, and its mask."""
-    stems = [Path(name).stem for name in names]
-    twice = [stem for stem, count in Counter(stems).items() if count > 1]
-    if twice:
-        raise OutputError(f"{folder}: several images are called {min(twice)}; layers need different names")
-    return [Path(folder) / f"{stem}{kind}.tif" for stem in stems for kind in ("", "_mask")]
+    """The files of images of these names, two each: the layer, and its mask.
+
+    They are called like the images without their suffixes, or with them, where two files would have one name.
+    """
+    whole = [file_name(name) for name in names]
+    for stems in ([Path(name).stem for name in whole], whole):
+        files = [Path(folder) / f"{stem}{kind}.tif" for stem in stems for kind in ("", "_mask")]
+        if len({str(file).casefold() for file in files}) == len(files):
+            return files
+    raise OutputError(f"{folder}: several images have one name, but layers need different ones; rename them")
 
 
 def make_folder(folder: str | Path) -> None:

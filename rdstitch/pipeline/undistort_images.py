@@ -22,7 +22,7 @@ from rdstitch.io.write import write_image
 from rdstitch.pipeline.result_files import make_folder
 from rdstitch.results.messages import Message, ignored
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import IMAGE_SUFFIXES, check_outputs
+from rdstitch.system.outputs import IMAGE_SUFFIXES, check_outputs, file_name
 from rdstitch.system.progress import Progress, silent
 
 Framing = Literal["same", "all", "valid"]
@@ -159,8 +159,8 @@ def _outputs(sources: Sequence[Source], folder: Path, image_format: ImageFormat 
 def _output_name(source: Source, image_format: ImageFormat | None) -> str:
     in_memory = source.frame is not None and source.frame.image is not None
     if image_format is None and not in_memory and source.path.suffix.lower() in IMAGE_SUFFIXES:
-        return source.path.name
-    stem = source.path.name if in_memory else source.path.stem
+        return file_name(source.name)
+    stem = source.name if in_memory else Path(file_name(source.name)).stem
     return f"{stem}.{image_format or ('png' if _fits_png(source) else 'tif')}"
 
 

@@ -98,11 +98,11 @@ def _listed(paths: Sequence[str]) -> str:
     """All of them; the folder is named where it changes."""
     folders = [None, *(Path(path).parent for path in paths)]
     named = zip(paths, names_of(paths), folders[:-1], folders[1:], strict=True)
-    return ", ".join(
-        name if folder == before or _is_temporary(folder) else path for path, name, before, folder in named
-    )
+    return ", ".join(name if folder == before else _within_temporary(path) for path, name, before, folder in named)
 
 
-def _is_temporary(folder: Path | None) -> bool:
-    """Check whether it is one that frames of a video were extracted to, which nobody finds afterwards."""
-    return folder is not None and folder.name.startswith("rdstitch-") and folder.suffix == ".part"
+def _within_temporary(path: str) -> str:
+    """A path; of a frame of a video that was extracted to a folder that nobody finds afterwards, its end."""
+    parts = Path(path).parts
+    inner = [k for k, part in enumerate(parts) if part.startswith("rdstitch-") and part.endswith(".part")]
+    return "/".join(parts[inner[-1] + 2 :] or parts[-1:]) if inner else path

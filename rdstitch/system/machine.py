@@ -22,28 +22,35 @@ def processor_count() -> int:
 
 def available_memory() -> int:
     """Bytes that this process can still take without swapping, within the limits of its control groups."""
-    return min([_free_memory(_SYSTEM), *_group_memory(_SYSTEM)])
+    return min([_memory(_SYSTEM, "MemAvailable:"), *_group_memory(_SYSTEM)])
 
 
-def _free_memory(root: Path) -> int:
+def memory_size() -> int:
+    """Bytes that the machine has, or that the control groups of this process may take."""
+    return min([_memory(_SYSTEM, "MemTotal:"), *_group_memory(_SYSTEM, in_use=False)])
+
+
+def _memory(root: Path, what: str) -> int:
     """Of the whole system."""
     for line in _text(root / "proc/meminfo").splitlines():
-        if line.startswith("MemAvailable:"):
+        if line.startswith(what):
             return int(line.split()[1]) * 1024
     with suppress(AttributeError, ValueError, OSError):
         # No system but Linux says what is available; half of what there is should be.
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // (1 if what == "MemTotal:" else 2)
     return _UNKNOWN
 
 
-def _group_memory(root: Path) -> Iterator[int]:
-    """Bytes left in each control group that limits memory; pages of files that can go count as free."""
+def _group_memory(root: Path, *, in_use: bool = True) -> Iterator[int]:
+    """Bytes of each control group that limits memory, less those in use; pages of files that can go count as free."""
     for folder in _groups(root, "memory"):
         for limit, usage, reclaimable in _MEMORY_FILES:
             with suppress(ValueError):
-                left = int(_text(folder / limit)) - int(_text(folder / usage))
-                stat = dict(line.split() for line in _text(folder / "memory.stat").splitlines())
-                yield max(0, left + int(stat.get(reclaimable, 0)))
+                left = int(_text(folder / limit))
+                if in_use:
+                    stat = dict(line.split() for line in _text(folder / "memory.stat").splitlines())
+                    left -= int(_text(folder / usage)) - int(stat.get(reclaimable, 0))
+                yield max(0, left)
 
 
 def _quotas(root: Path) -> Iterator[int]:

@@ -126,6 +126,36 @@ def test_a_missing_image_is_named(rdstitch: Run, frames: list[Path], stitched: P
     assert not (tmp_path / "strict.tif").exists()
 
 
+def test_images_of_one_name_in_two_folders(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    folders = [tmp_path / name for name in ("cam0", "cam1")]
+    for folder, frame in zip(folders, frames, strict=False):
+        folder.mkdir()
+        shutil.copy(frame, folder / "x.png")
+    output, layers = tmp_path / "out.png", tmp_path / "layers"
+    rdstitch("mosaic", *folders, "-o", output, "--layers", layers, *CACHED)
+    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    assert [image["name"] for image in record["images"]] == ["cam0/x.png", "cam1/x.png"]
+    assert {file.name for file in layers.iterdir()} == {
+        f"cam{k}_x{kind}.tif" for k in range(2) for kind in ("", "_mask")
+    }
+    # Whatever order they are given in, each is in its place.
+    _apply(rdstitch, _sidecar(output), folders[1], tmp_path / "again.png", "--images", str(folders[0]))
+    np.testing.assert_array_equal(read_image(tmp_path / "again.png").pixels, read_image(output).pixels)
+    _apply(rdstitch, _sidecar(output), folders[1], tmp_path / "one.png", told=f"left out {folders[0] / 'x.png'}")
+
+
+def test_layers_whose_masks_would_have_the_name_of_another_layer(
+    rdstitch: Run, frames: list[Path], tmp_path: Path
+) -> None:
+    for name, frame in zip(("a.png", "a_mask.png"), frames, strict=False):
+        shutil.copy(frame, tmp_path / name)
+    layers = tmp_path / "layers"
+    rdstitch("mosaic", tmp_path, "-o", tmp_path / "out.jpg", "--layers", layers, *CACHED)
+    assert {file.name for file in layers.iterdir()} == {
+        f"{name}.png{kind}.tif" for name in ("a", "a_mask") for kind in ("", "_mask")
+    }
+
+
 def test_what_does_not_fit_is_refused(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     sidecar = _sidecar(stitched)
     fewer = _written(frames[:2], tmp_path / "fewer", ["x.png", "y.png"])

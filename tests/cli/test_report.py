@@ -15,6 +15,7 @@ from PIL import Image
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.io import preview
+from rdstitch.io.opening import MAX_IMAGE_GB
 from rdstitch.pipeline import accept
 from rdstitch.pipeline.recipes import calibrate, pano
 from rdstitch.report import page as report
@@ -214,7 +215,7 @@ def test_the_best_pair_has_many_matches(frames: list[Path]) -> None:
 def test_an_image_larger_than_any_cameras_is_shown_or_said_to_be_too_large(
     pair: StitchResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rdstitch.io.opening._MAX_MEGAPIXELS", 0.01)
+    monkeypatch.setenv(MAX_IMAGE_GB, "0.0001")
     for suffix, shown in ((".jpg", True), (".png", False)):
         file = tmp_path / f"large{suffix}"
         Image.new("RGB", pair.canvas.size, (10, 200, 30)).save(file)

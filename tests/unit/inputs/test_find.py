@@ -12,6 +12,7 @@ from rdstitch.inputs.find import find_images
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.rosbag import _grey_of_compressed
 from rdstitch.inputs.selection import selected
+from rdstitch.inputs.source import read_sources
 from tests.videos import write_video
 
 
@@ -67,6 +68,38 @@ def test_a_video_among_images_is_used_only_when_asked_for(tmp_path: Path) -> Non
     assert len(find_images([clip], frames_folder=folder).frames) > 0
     with pytest.raises(InputError, match=r"clip\.avi: is a video beside one image"):
         find_images([clip, paths[0]], frames_folder=folder)
+
+
+def test_videos_of_one_name_are_filed_apart(tmp_path: Path) -> None:
+    frames = [np.full((48, 64, 3), 20 * k, np.uint8) for k in range(8)]
+    clips = []
+    for name, shown in (("cam0/drive.avi", frames[:4]), ("cam1/drive.avi", frames[4:])):
+        (tmp_path / name).parent.mkdir()
+        clips.append(write_video(tmp_path / name, shown))
+    found = find_images(clips, frames_folder=lambda: tmp_path, every=1).frames
+    grey = [int(np.asarray(Image.open(frame.path)).mean()) for frame in found]
+    assert grey == pytest.approx([20 * k for k in range(8)], abs=4)
+    assert [frame.name for frame in found] == [f"cam{k // 4}/drive_{k % 4:06d}.png" for k in range(8)]
+    # The same file by two names is one video.
+    twice = find_images([clips[0], clips[0]], frames_folder=lambda: tmp_path, every=1).frames
+    assert len(read_sources(twice, skip_bad=False)[0]) == 4
+
+
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        (["a/x.png", "b/x.png", "b/y.png"], ["a/x.png", "b/x.png", "y.png"]),
+        (["1/left/x.png", "2/left/x.png"], ["1/left/x.png", "2/left/x.png"]),
+        (["a/x.png", "a/../a/x.png"], ["x.png", "x.png"]),
+    ],
+)
+def test_images_of_one_name_are_called_by_their_folders(files: list[str], names: list[str], tmp_path: Path) -> None:
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).touch()
+    frames = find_images([tmp_path / file for file in files]).frames
+    assert [frame.name for frame in frames] == names
+    assert [frame.name for frame in selected(frames, [names[0]], [])] == [n for n in names if n != names[0]]
 
 
 FRAMES = [Frame(Path("flight") / name, index) for index, name in enumerate(("a1.jpg", "a2.jpg", "b1.jpg", "b[2].jpg"))]

@@ -100,7 +100,7 @@ def test_of_a_video_these_frames_are_written_unless_the_user_says_which(tmp_path
     assert 12 <= len(numbers) < 30
     assert sum(number is not None and number > 60 for number in numbers) <= 1
     assert f"{len(numbers)} of 80 frames" in str(found.messages[0])
-    assert len(list(folder.iterdir())) == len(numbers)
+    assert len(list(folder.rglob("*.png"))) == len(numbers)
     every = find_images([file], frames_folder=lambda: folder, every=20)
     assert [frame.number for frame in every.frames] == [0, 20, 40, 60]
     assert every.messages == []

@@ -351,13 +351,10 @@ def test_fields_that_bend_straight_edges_more_than_they_mend_are_left_out() -> N
     for match in matches(sequence, count=600):
         near = np.abs(match.points1 % 160.0 - 80.0).max(axis=1) < 45.0
         found.append(replace(match, points2=match.points2 + np.where(near, 4.0, 0.0)[:, None] * (1.0, -1.0)))
-    ends = np.array(
-        [[(x, y), (x + 300, y + 40 * k)] for k in (-1, 0, 1) for x in (20, 300) for y in range(60, 460, 20)]
-    )
-    off, on = (
-        align_locally(found, CAMERAS, homographies(sequence), edges=lambda image, found=edges: found)
-        for edges in (ends.astype(np.float64), np.empty((0, 2, 2)))
-    )
+    starts = [(x, y, 40.0 * k) for k in (-1, 0, 1) for x in (20, 300) for y in range(60, 460, 20)]
+    ends = np.array([[(x, y), (x + 300.0, y + rise)] for x, y, rise in starts])
+    on = align_locally(found, CAMERAS, homographies(sequence))
+    off = align_locally(found, CAMERAS, homographies(sequence), edges=lambda image: ends)
     assert len(on.fields) == 6
     worst = max(float(np.percentile(field.bends(ends), 95)) for field in on.fields)
     assert worst > 1.0

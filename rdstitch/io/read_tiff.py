@@ -1,0 +1,146 @@
+"""The samples of a TIFF page, whatever its compression: what a band is follows from the page's tags alone.
+
+The photometric interpretation says how many bands are colour, ExtraSamples which of the others is alpha; all others are
+data. An internal mask (a page of its own, as GDAL writes it), GDAL's NODATA and alpha say together where there is
+something.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from rdstitch.io.colour import srgb_of_lab, without_inks
+from rdstitch.system.late_imports import tifffile
+
+Pixels = NDArray[Any]
+
+_OPAQUE = 255
+_MASK, _MASK_WITHIN = 4, 40  # the kind of a page that masks the image, and how many pages are looked at for one
+_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _STENCIL, _INKS, _YCBCR = range(7)
+_LAB, _ICC_LAB, _LINEAR_RAW = 8, 9, 34892
+# Bands that are colour, by photometric interpretation.
+_COLOURS = {
+    **dict.fromkeys((_WHITE_IS_ZERO, _BLACK_IS_ZERO, _PALETTE, _STENCIL), 1),
+    **dict.fromkeys((_RGB, _YCBCR, _LAB, _ICC_LAB, _LINEAR_RAW), 3),
+    _INKS: 4,
+}
+_INDIRECT = (_PALETTE, _INKS)  # become 8-bit RGB, beside which their other bands say nothing
+_ASSOCIATED, _UNASSOCIATED = 1, 2  # alpha; colours of the first are multiplied by it
+_JPEG = (6, 7, 33007, 34892)  # compressions whose decoders make RGB of YCbCr
+_PROFILE, _NODATA = 34675, 42113
+_ROWS_AT_A_TIME = 128
+
+
+def channel_count(page: "tifffile.TiffPage") -> int:
+    """Bands of what a page is decoded to, with alpha; three of a palette, which may turn out to be grey."""
+    return 3 if page.photometric in _INDIRECT else int(page.samplesperpixel)
+
+
+def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[Pixels, NDArray[np.uint8] | None]:
+    """Samples (h, w) or (h, w, bands) of a page as stored, colours as grey or RGB, and its alpha."""
+    kind, bits = int(page.photometric), page.bitspersample
+    if kind not in _COLOURS or page.dtype is None or page.dtype.kind not in "buif":
+        raise ValueError(f"photometric interpretation {kind} with samples of type {page.dtype} is not read")
+    stored, axes = page.asarray(), page.axes
+    if axes.startswith("S"):
+        stored, axes = np.moveaxis(stored, 0, -1), axes[1:] + "S"
+    if axes not in ("YX", "YXS"):
+        raise ValueError(f"unexpected axes {axes}")
+    stored = stored if axes == "YXS" else stored[..., None]
+    if stored.shape[2] < (count := _COLOURS[kind]):
+        raise ValueError(f"has {stored.shape[2]} of {count} bands")
+    full = 2**bits - 1 if stored.dtype.kind in "bu" else np.iinfo(stored.dtype).max if stored.dtype.kind == "i" else 1.0
+    masks = [_mask(tiff, page)]
+    if (empty := _lacks_data(page, stored)) is not None:
+        stored[empty] = 0
+        masks.append(np.where(empty, np.uint8(0), np.uint8(_OPAQUE)))
+    colours, data = stored[..., :count], stored[..., count:]
+    alphas = [n for n, meaning in enumerate(page.extrasamples) if meaning in (_ASSOCIATED, _UNASSOCIATED)]
+    if alphas:
+        alpha, data = data[..., alphas[0]], np.delete(data, alphas[0], axis=2)
+        if page.extrasamples[alphas[0]] == _ASSOCIATED:
+            colours = _straight(colours, alpha, full)
+        masks.append(_as_uint8(alpha, full))
+    samples = _grey_or_rgb(page, kind, colours, full)
+    if kind not in _INDIRECT:
+        if data.shape[2]:
+            samples = np.concatenate([samples, data], axis=2)
+        if stored.dtype.kind in "bu" and full < _OPAQUE:
+            samples = np.rint(samples * (_OPAQUE / full)).astype(np.uint8)
+    found = [mask for mask in masks if mask is not None]
+    return samples[..., 0] if samples.shape[2] == 1 else samples, np.minimum.reduce(found) if found else None
+
+
+def _grey_or_rgb(page: "tifffile.TiffPage", kind: int, colours: Pixels, full: float) -> Pixels:
+    """Grey or RGB (h, w, 1 or 3) of the bands that are colour, in the type they are stored in."""
+    integers = colours.dtype in (np.uint8, np.uint16)
+    if kind == _WHITE_IS_ZERO:
+        return ~colours if colours.dtype == np.bool_ else full - colours if colours.dtype.kind == "u" else -colours
+    if kind == _PALETTE:
+        table = np.asarray(page.colormap).T
+        # Some programs write 8 bits where there should be 16.
+        table = (table if table.max() <= _OPAQUE else table >> 8).astype(np.uint8)
+        table = table[:, :1] if (table == table[:, :1]).all() else table
+        return table[colours[..., 0].astype(np.intp)]
+    if kind in (_LAB, _ICC_LAB, _INKS) and not integers:
+        raise ValueError(f"photometric interpretation {kind} with samples of type {colours.dtype} is not read")
+    if kind in (_LAB, _ICC_LAB):
+        return srgb_of_lab(colours, signed=kind == _LAB)
+    if kind == _INKS or (kind == _YCBCR and page.compression not in _JPEG):
+        return _by_pillow(page, colours, "CMYK" if kind == _INKS else "YCbCr")
+    return colours
+
+
+def _by_pillow(page: "tifffile.TiffPage", colours: Pixels, mode: str) -> Pixels:
+    """8-bit RGB of inks, by their colour profile where there is one, or of YCbCr."""
+    if colours.dtype == np.uint16:
+        colours = (colours >> 8).astype(np.uint8)
+    image = Image.frombytes(mode, colours.shape[1::-1], colours.tobytes())
+    profile = page.tags.get(_PROFILE)
+    if profile is not None:
+        image.info["icc_profile"] = profile.value
+    return np.asarray(without_inks(image).convert("RGB"))
+
+
+def _straight(colours: Pixels, alpha: Pixels, full: float) -> Pixels:
+    """Colours that were multiplied by alpha without it; black where it is 0."""
+    straight = np.empty_like(colours)
+    for top in range(0, len(colours), _ROWS_AT_A_TIME):
+        rows = slice(top, top + _ROWS_AT_A_TIME)
+        share = np.maximum(alpha[rows, :, None] / full, 0.0)
+        values = np.divide(colours[rows], share, out=np.zeros(colours[rows].shape), where=share > 0.0)
+        straight[rows] = np.rint(np.clip(values, 0, full)) if colours.dtype.kind in "ui" else values
+    return straight
+
+
+def _mask(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> NDArray[np.uint8] | None:
+    """The alpha of the page's internal mask, a page of the same size beside it."""
+    pages = (other for other in tiff.pages[1:_MASK_WITHIN] if isinstance(other, tifffile.TiffPage))
+    for other in pages:
+        same = (other.imagelength, other.imagewidth) == (page.imagelength, page.imagewidth)
+        if other.subfiletype == _MASK and same and other.samplesperpixel == 1:
+            stored = other.asarray()
+            return _as_uint8(stored, 2**other.bitspersample - 1)
+    return None
+
+
+def _lacks_data(page: "tifffile.TiffPage", stored: Pixels) -> NDArray[np.bool_] | None:
+    """Where a page has GDAL's NODATA; of counts, where all bands have it, since in one it may be part of a colour."""
+    tag = page.tags.get(_NODATA)
+    try:
+        number = float(str(tag.value).strip("\0 ")) if tag is not None else np.nan
+        nodata = stored.dtype.type(int(number) if stored.dtype.kind in "bui" else number)
+    except (ValueError, OverflowError):  # no number, or none that the samples can have
+        return None
+    equal = stored == nodata
+    return np.asarray(equal.all(axis=2) if stored.dtype.kind in "bu" else equal.any(axis=2))
+
+
+def _as_uint8(alpha: Pixels, full: float) -> NDArray[np.uint8]:
+    """Alpha of any sample type as 0..255."""
+    if alpha.dtype == np.uint8 and full == _OPAQUE:
+        return np.asarray(alpha, dtype=np.uint8)
+    share = np.clip(np.nan_to_num(alpha.astype(np.float32) / full), 0.0, 1.0)
+    return np.asarray(np.rint(share * _OPAQUE), dtype=np.uint8)
