@@ -51,7 +51,7 @@ class LaidOut:
 
     @property
     def faults(self) -> tuple[bool, int]:
-        """What speaks against it: overlaps that do not look alike, and how many of broken seams and stretched places."""
+        """What speaks against it: overlaps that do not look alike; and broken seams and stretched places, 0 to 2."""
         seams = self.layout.seams
         return seams.contradicted, int(seams.seen) + int(_is_stretched(self.layout))
 
