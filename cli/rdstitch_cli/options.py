@@ -111,6 +111,7 @@ known = together(
     option("--tilt", ANGLES),
     option("--attitude", FileOr("xmp")),
     option("--attitude-std", ANGLE, "1"),
+    option("--timestamps", IMAGE),
     option("--positions", IMAGE),
     option("--positions-offset", RealNumber(), 0.0),
 )

@@ -31,13 +31,16 @@ def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
     if file is None:
         return None
     from rdstitch.camera_files import read_camera_file
+    from rdstitch.inputs.rosbag import camera_in, is_bag
 
+    if is_bag(file):
+        return camera_in(file)
     read = read_camera_file(file, partial(_size_of_images, file))
     if read.fit is not None:
-        cause = f"; {read.cause}" if read.cause else ""
+        left = f"rms {read.fit.rms:.2f} pixels, at most {read.fit.largest:.2f} pixels"
+        left += ", by which images are corrected" if read.camera.lens_model is not None else ""
         reporter.warn(
-            f"{file}: λ = {read.camera.nearest_distortion:.6f} was fitted to the {read.kind} lens model, "
-            f"rms {read.fit.rms:.2f} pixels, at most {read.fit.largest:.2f} pixels{cause}"
+            f"{file}: λ = {read.camera.nearest_distortion:.6f} was fitted to the {read.kind} lens model, {left}"
         )
     return read.camera
 

@@ -19,13 +19,13 @@ from rdstitch.alignment.bundle_adjustment import (
 )
 from rdstitch.alignment.link_equations import split_lens, squared_lengths, whitened_errors
 from rdstitch.alignment.metric_upgrade import metric_upgrade
-from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, SIMILARITY, THETA, MotionModel, PlanarModel, inverses
+from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, SIMILARITY, THETA, MotionModel, PlanarModel
 from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors, Priors
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.division_model import undistort
-from rdstitch.geometry.radial_homography import RadialHomography, transfer
+from rdstitch.geometry.radial_homography import RadialHomography, inverses, transfer
 from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 from rdstitch.solvers.homography import direct_linear

@@ -131,7 +131,8 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
         problem, overdispersion=noise_of_links(problem.observations, problem.homographies, problem.lens).overdispersion
     )
     if (doubt := check_attitudes(problem, options)) is not None:
-        return replace(_chosen(cameras, links, doubt[0]), messages=(doubt[1],))
+        without = _chosen(cameras, links, doubt[0])
+        return replace(without, messages=(doubt[1], *without.messages))
     choice = select_model(
         problem,
         options.models,
@@ -141,7 +142,7 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
     )
     choice, images, wrong = _drop_wrong_pairs(whole, problem, images, choice, wrong)
     problem, _ = whole.part(~wrong, images)
-    choice = choose_over_relief(problem, choice, options.models)
+    choice = choose_over_relief(problem, choice, options.models, layout_matters=options.layout_matters)
     free_lens = choice.fit.free_lens
     whole = replace(whole, observations=everything, free_lens=free_lens, min_gain=MIN_GAIN)
     return AdjustedImages(

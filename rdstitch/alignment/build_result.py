@@ -24,6 +24,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane
+from rdstitch.geometry.radial_homography import inverses
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.results.messages import Message, Severity
@@ -214,7 +215,7 @@ def _in_frame_of_reference(adjustment: AdjustedImages) -> tuple[FloatArray, Plan
         gravity = None if given is None else np.asarray(given, dtype=np.float64)[adjustment.images]
         return of_all(levelled(matrices, reference, gravity)), None
     if not isinstance(fit.model, PlanarModel):
-        return of_all(matrices[reference] @ np.linalg.inv(matrices)), None
+        return of_all(matrices[reference] @ inverses(matrices)), None
     metric = fit.model.metric_poses(parameters.poses, parameters.shared)
     yaw, position, height, tilt = (
         metric[:, YAW],
@@ -227,7 +228,7 @@ def _in_frame_of_reference(adjustment: AdjustedImages) -> tuple[FloatArray, Plan
     wanted = adjustment.options.pose_covariance and adjustment.covariance is not None
     covariances = pose_covariances(adjustment.problem, fit) if wanted else ()
     aligned_poses = (poses.yaw, poses.position, poses.height, poses.tilt, *covariances)
-    return of_all(frame @ np.linalg.inv(matrices)), PlanarPoses(*map(of_all, aligned_poses))
+    return of_all(frame @ inverses(matrices)), PlanarPoses(*map(of_all, aligned_poses))
 
 
 def _groups(adjustment: AdjustedImages) -> tuple[tuple[int, ...], ...]:

@@ -19,11 +19,12 @@ from rdstitch.alignment.link_equations import (
     trial_errors,
     whitened_errors,
 )
-from rdstitch.alignment.motion_models import ModelMatrices, MotionModel, inverses
+from rdstitch.alignment.motion_models import ModelMatrices, MotionModel
 from rdstitch.alignment.normal_equations import PoseBlocks, SparseNormalEquations, chain
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors, costs, curvatures, slopes
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
 

@@ -11,7 +11,7 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.link_equations import split_lens
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.geometry.radial_homography import transfer_jacobian
+from rdstitch.geometry.radial_homography import are_homographies, inverses, transfer_jacobian
 from rdstitch.matching.links import spread_choice
 from rdstitch.system.late_imports import sparse
 
@@ -27,7 +27,7 @@ _MIN_ERROR = 0.02
 def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:
     """Links (T, 3) of all triangles i < j < k of the graph, in the order ij, jk, ik.
 
-    Of very many, an evenly spaced part.
+    Of very many, an evenly spaced part, and one of each link that has any.
     """
     low, high = np.minimum(image1, image2), np.maximum(image1, image2)
     number = sparse.coo_array((np.arange(1, len(low) + 1), (low, high)), shape=(count, count)).tocsr()
@@ -43,8 +43,11 @@ def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:
             ik = number.data[number.indptr[i] : number.indptr[i + 1]][np.searchsorted(partners, third)] - 1
             triples.append(np.column_stack([np.full(len(third), link), jk, ik]))
     result = np.concatenate(triples).astype(np.intp) if triples else np.empty((0, 3), dtype=np.intp)
-    every = -(-len(result) // _MAX_TRIANGLES) if len(result) else 1
-    return result[::every]
+    kept = np.zeros(len(result), dtype=np.bool_)
+    kept[:: max(-(-len(result) // _MAX_TRIANGLES), 1)] = True
+    links, first = np.unique(result, return_index=True)
+    kept[first[~np.isin(links, result[kept])] // 3] = True
+    return result[kept]
 
 
 def cycle_consistency(
@@ -52,17 +55,17 @@ def cycle_consistency(
 ) -> tuple[BoolArray, NDArray[np.intp]]:
     """Which links most of their triangles contradict.
 
-    One after the other, the link with the most contradictions is taken out together with its triangles, until every
-    link left is confirmed at least as often as it is contradicted.
+    What ran away and is no homography is suspect. One after the other, the link with the most contradictions is taken
+    out together with its triangles, until every link left is confirmed at least as often as it is contradicted.
     Takes every link on its own, with a homography, and the number of images; also gives how many of the triangles left
     with each link close, (L,).
     """
-    suspect = np.zeros(len(observations), dtype=np.bool_)
+    suspect = ~are_homographies(apart.homographies)
     corners = triangles(count, observations.image1, observations.image2)
     if not len(corners):
         return suspect, np.zeros(len(observations), dtype=np.intp)
     bad = _open_triangles(apart, observations, corners)
-    alive = np.isfinite(bad)
+    alive = np.isfinite(bad) & ~suspect[corners].any(axis=1)
     while True:
         weight = np.where(alive, np.where(bad > 0, 1.0, -1.0), 0.0)
         balance = np.bincount(corners.ravel(), np.repeat(weight, 3), len(observations))
@@ -134,17 +137,20 @@ def _probes(observations: Observations, link: int, backward: bool) -> FloatArray
 
 def _oriented(apart: BundleAdjustmentResult, backward: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Homographies (L, 3, 3) from the image of lower index to the other, and their covariances (L, 9, 9)."""
-    values, vectors = np.linalg.eigh(apart.equations.gram[:, :9, :9] / apart.sigma**2)
+    # What is no homography gets any value: its triangles do not count.
+    sound = are_homographies(apart.homographies)[:, None, None]
+    homographies = np.where(sound, apart.homographies, np.eye(3))
+    values, vectors = np.linalg.eigh(np.where(sound, apart.equations.gram[:, :9, :9] / apart.sigma**2, np.eye(9)))
     floor = np.maximum(values[:, -1:] * 1e-12, 1e-300)
     inverse = 1.0 / np.maximum(values, floor)
     inverse[:, 0] = 0.0  # the scale of H, of which nothing depends
     covariance = (vectors * inverse[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    inverted = np.linalg.inv(apart.homographies)
+    inverted = inverses(homographies)
     # d(H⁻¹) = -H⁻¹ dH H⁻¹, row by row
     change = np.einsum("lia,lbj->lijab", inverted, inverted).reshape(-1, 9, 9)
     turned = change @ covariance @ np.swapaxes(change, 1, 2)
     side = backward[:, None, None]
-    return np.where(side, inverted, apart.homographies), np.where(side, turned, covariance)
+    return np.where(side, inverted, homographies), np.where(side, turned, covariance)
 
 
 def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArray:

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y, inverses
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.planar_motion import rotation_from_tilt, tilt_from_normal
+from rdstitch.geometry.radial_homography import inverses
 
 _MAX_TILT = math.radians(75.0)
 _TILT_STEPS = 31

@@ -18,11 +18,11 @@ import numpy as np
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
 from rdstitch.alignment.linear_response import Fields, LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors, split_lens
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y, inverses
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y
 from rdstitch.alignment.noise import apart, neighbours
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.division_model import distort, undistort
-from rdstitch.geometry.radial_homography import project
+from rdstitch.geometry.radial_homography import inverses, project
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _STEP = 1e-4

@@ -36,7 +36,9 @@ _SIGNIFICANT = 3.0
 """Standard deviations of the logarithm of their ratio by which errors along the parallax must exceed those across."""
 
 
-def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[str]) -> ModelChoice:
+def choose_over_relief(
+    problem: Problem, choice: ModelChoice, names: Sequence[str], *, layout_matters: bool
+) -> ModelChoice:
     """The model of one camera chosen again, with heights that account for errors, where such heights show.
 
     Without a free distortion centre, which over rough ground bends the whole as the ground bends the images.
@@ -53,9 +55,9 @@ def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[st
             fits.append(fit)
     if not fits:
         return replace(choice, fit=_settled(problem, choice.fit)[1], over_relief=True)
-    return replace(
-        best_of(problem, [_refined(problem, fit) for fit in fits], requested=len(names) == 1), over_relief=True
-    )
+    refined = [_refined(problem, fit) for fit in fits]
+    best = best_of(problem, refined, requested=len(names) == 1, layout_matters=layout_matters)
+    return choice if best is None else replace(best, over_relief=True)
 
 
 def adjust_over_relief(problem: Problem, choice: ModelChoice) -> tuple[Problem, Fit]:

@@ -21,10 +21,11 @@ from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.lens_selection import shows_center
 from rdstitch.alignment.link_equations import split_lens, whitened_errors
-from rdstitch.alignment.motion_models import MODELS, MotionModel, inverses
+from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.alignment.residual_likelihood import ErrorCost, Evidence
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.division_model import undistort
+from rdstitch.geometry.radial_homography import inverses
 
 _GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
 """Half diagonals: points of an image of usual proportions, out to the corners."""
@@ -92,9 +93,16 @@ class ModelChoice:
     """The model chosen, why, and whether with heights of the ground that account for errors along the parallax."""
 
     fit: Fit
-    reason: str
+    others: str  # how it compares with other models
     overdispersion: float
     over_relief: bool = False
+
+    @property
+    def reason(self) -> str:
+        """One sentence."""
+        model, adjusted = self.fit.model, self.fit.adjusted
+        described = model.description(adjusted.parameters.poses, adjusted.parameters.shared)
+        return f"{model.name}: {described}; it leaves an error of {adjusted.sigma:.2f} pixels{self.others}"
 
 
 @dataclass(frozen=True)
@@ -222,14 +230,14 @@ def select_model(
         if posterior.could_win(best, turn, least) or (best.absurd and least.field < posterior.tolerable):
             tried.insert(0, posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
     tried = _with_wider_lenses(posterior, tried, lenses)
-    return _choice(posterior, tried, _best(posterior, tried), requested=len(names) == 1)
+    return _choice(tried, _best(posterior, tried), requested=len(names) == 1)
 
 
-def best_of(problem: Problem, fits: Sequence[Fit], *, requested: bool) -> ModelChoice:
-    """Take the best of some fits of the problem."""
-    posterior = Posterior(problem)
-    tried = [posterior.of(fit) for fit in fits]
-    return _choice(posterior, tried, min(tried, key=_score), requested=requested)
+def best_of(problem: Problem, fits: Sequence[Fit], *, requested: bool, layout_matters: bool) -> ModelChoice | None:
+    """Take the best of some fits of the problem; None where each has an absurd layout or focal length."""
+    posterior = Posterior(problem, layout_matters=layout_matters)
+    tried = [one for one in map(posterior.of, fits) if math.isfinite(one.score) and not one.absurd]
+    return _choice(tried, min(tried, key=_score), requested=requested) if tried else None
 
 
 def _with_wider_lenses(
@@ -284,16 +292,14 @@ def has_plausible_focal(fit: Fit) -> bool:
     return _FOCAL_LIMITS[0] < focal < _FOCAL_LIMITS[1]
 
 
-def _choice(posterior: Posterior, tried: Sequence[Hypothesis], best: Hypothesis, *, requested: bool) -> ModelChoice:
-    overdispersion, adjusted = best.fit.overdispersion, best.fit.adjusted
-    described = best.fit.model.description(adjusted.parameters.poses, adjusted.parameters.shared)
-    what = f"{best.fit.model.name}: {described}; it leaves an error of {adjusted.sigma:.2f} pixels"
+def _choice(tried: Sequence[Hypothesis], best: Hypothesis, *, requested: bool) -> ModelChoice:
     if requested:
-        return ModelChoice(best.fit, f"{what}; as requested", overdispersion)
-    others = [one for one in tried if one is not best]
+        return ModelChoice(best.fit, "; as requested", best.fit.overdispersion)
     listed = [
         f"{one.fit.model.name} {one.fit.adjusted.sigma:.2f} pixels"
         + (", an absurd layout" if one.absurd else f", {one.score - best.score:+.0f}")
-        for one in others
+        for one in tried
+        if one is not best
     ]
-    return ModelChoice(best.fit, f"{what} (others: {'; '.join(listed)})" if listed else what, overdispersion)
+    others = f" (others: {'; '.join(listed)})" if listed else ""
+    return ModelChoice(best.fit, others, best.fit.overdispersion)

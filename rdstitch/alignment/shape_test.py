@@ -26,18 +26,18 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, Parameters
+from rdstitch.alignment.bundle_adjustment import BundleAdjuster, Parameters, inverse_information
 from rdstitch.alignment.lens_selection import CENTER
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors, split_lens
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y, inverses
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y
 from rdstitch.alignment.noise import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ShapeTest
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.division_model import distort, undistort
-from rdstitch.geometry.radial_homography import project
+from rdstitch.geometry.radial_homography import inverses, project
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 Correction = Callable[[FloatArray, IntArray, float], FloatArray]
@@ -303,7 +303,7 @@ class _Answers:
         """Sizes of the first effects, by their standard deviations (K,), and of the shared parameters; covariance."""
         count, shared = len(stds), len(self.covariance)
         covariance = np.zeros((count + shared,) * 2)
-        covariance[:count, :count] = np.linalg.inv(self.information[:count, :count] + np.diag(stds**-2.0))
+        covariance[:count, :count] = inverse_information(self.information[:count, :count] + np.diag(stds**-2.0))
         covariance[count:, count:] = self.covariance
         return -covariance[:, :count] @ self.gradient[:count], covariance
 
@@ -319,7 +319,13 @@ def _inliers(adjuster: BundleAdjuster, fit: Fit) -> Observations:
     squared = replace(adjuster, observations=few).squared(fit.adjusted.parameters)
     kept = squared <= (ALIGNMENT_WIDTH * fit.adjusted.sigma) ** 2
     before = np.concatenate([[0], np.cumsum(kept)])
-    return replace(few, start=before[few.start], points1=few.points1[kept], points2=few.points2[kept])
+    return replace(
+        few,
+        start=before[few.start],
+        points1=few.points1[kept],
+        points2=few.points2[kept],
+        relief=None if few.relief is None else few.relief[kept],
+    )
 
 
 def _displacements(answers: _Answers, fit: Fit, count: int, cameras: Sequence[Camera]) -> tuple[FloatArray, IntArray]:
@@ -371,7 +377,7 @@ def _cause(effects: Sequence[Effect], sizes: FloatArray, covariance: FloatArray)
 
     def significance(cause: str) -> float:
         indices = [k for k, each in enumerate(causes) if each == cause]
-        return float(sizes[indices] @ np.linalg.solve(covariance[np.ix_(indices, indices)], sizes[indices])) / len(
+        return float(sizes[indices] @ inverse_information(covariance[np.ix_(indices, indices)]) @ sizes[indices]) / len(
             indices
         )
 

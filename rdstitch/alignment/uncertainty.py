@@ -70,7 +70,7 @@ def sandwich_covariances(
     for part in parts:
         block = np.ix_(part, part)
         # What moves all parameters moves the part as this says, where the rest is held.
-        moved = derivative[block] @ np.linalg.solve(information[block], information[part])
+        moved = derivative[block] @ inverse_information(information[block]) @ information[part]
         alone = derivative[block] @ inverse_information(independent[block]) @ derivative[block].T
         result.append(_at_least(alone, moved @ correlated @ moved.T))
     return result

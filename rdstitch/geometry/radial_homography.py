@@ -18,6 +18,28 @@ from rdstitch.geometry.division_model import distort, divisor, divisor_slope, me
 from rdstitch.geometry.planar_motion import PlanarMotion
 
 
+def inverses(matrices: FloatArray) -> FloatArray:
+    """Inverses of (N, 3, 3) by cofactors; not finite, instead of an exception, where a matrix is singular."""
+    (a, b, c), (d, e, f), (g, h, i) = matrices.transpose(1, 2, 0)
+    cofactors = np.empty((3, 3, len(matrices)))
+    with np.errstate(all="ignore"):
+        cofactors[:, 0] = e * i - f * h, f * g - d * i, d * h - e * g
+        cofactors[:, 1] = c * h - b * i, a * i - c * g, b * g - a * h
+        cofactors[:, 2] = b * f - c * e, c * d - a * f, a * e - b * d
+        cofactors /= a * cofactors[0, 0] + b * cofactors[1, 0] + c * cofactors[2, 0]
+    return np.ascontiguousarray(cofactors.transpose(2, 0, 1))
+
+
+_MIN_DETERMINANT = 1e-6  # of H at unit norm; an image is then squeezed to a millionth of its area
+
+
+def are_homographies(matrices: FloatArray) -> BoolArray:
+    """Which of matrices (N, 3, 3) could relate two images of a plane: none is mirrored, or squeezed to a line."""
+    with np.errstate(all="ignore"):
+        unit = matrices / np.sqrt(np.einsum("nij,nij->n", matrices, matrices))[:, None, None]
+        return np.asarray(np.linalg.det(unit) > _MIN_DETERMINANT)
+
+
 def lift(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
     """``(x, y, 1 + λ r² + μ r⁴ + ν r⁶)`` of normalized points (..., 2); shape (..., 3). λ broadcasts."""
     x = np.asarray(points, dtype=np.float64)

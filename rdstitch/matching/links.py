@@ -8,7 +8,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import ArgumentError
-from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.geometry.radial_homography import RadialHomography, inverses
 
 
 def spread_choice(points: FloatArray, most: int | None) -> IntArray:
@@ -59,10 +59,9 @@ class Link:
     def reversed(self) -> Self:
         """The same correspondences, from the second image to the first."""
         relation = self.relation
-        back: FloatArray = np.linalg.inv(relation.homography).astype(np.float64)
         relation = replace(
             relation,
-            homography=back,
+            homography=inverses(relation.homography[None])[0],
             camera=relation.camera2,
             camera2=relation.camera,
             covariance=np.empty((0, 0)),

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.geometry.radial_homography import inverses
 from rdstitch.system.late_imports import csgraph, sparse
 
 
@@ -33,7 +34,7 @@ class SpanningTree:
         """Plane-to-image homographies (N, 3, 3) by chaining those of the links (L, 3, 3) from the root's."""
         matrices = np.empty((len(self.link) + 1, 3, 3))
         matrices[self.root] = root_matrix
-        inverse = np.linalg.inv(homographies)
+        inverse = inverses(homographies)
         for link, parent, child in zip(self.link, self.parent, self.child, strict=True):
             step = homographies[link] if image1[link] == parent else inverse[link]
             product = step @ matrices[parent]

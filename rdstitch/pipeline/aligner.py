@@ -9,6 +9,7 @@ import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.bundle_adjustment import sigma_of
+from rdstitch.alignment.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames import stored, turned_alignment, turned_link, turned_tilts, turns
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
@@ -166,6 +167,9 @@ class Aligner:
         most, back = most_matches_read(len(related), self.options), stored(self._turns)
         cameras = tuple(camera.turned(turn) for camera, turn in zip(self.cameras, back, strict=True))
         links = tuple(turned_link(pair.link().thinned(most), self.cameras, back) for pair in related)
+        if (size := common_size(cameras, links)) is not None:
+            cameras = tuple(framed_camera(camera, size) for camera in cameras)
+            links = tuple(framed_link(link, size) for link in links)
         task = AlignmentTask(cameras, links, self.options)
         return AlignedPairs(tuple(pairs), self._recalled("draft", task, lambda: task.draft), task=task)
 
@@ -174,7 +178,11 @@ class Aligner:
         inputs = (task.cameras, self.cache.digest(task.links), task.options)
         gravity = task.options.gravity
         down = None if gravity is None else np.einsum("nij,nj->ni", turns(self._turns), np.asarray(gravity))
-        return turned_alignment(self.cache.recall(stage, inputs, compute), self._turns, down)
+        alignment = self.cache.recall(stage, inputs, compute)
+        sizes = [c.turned(turn).image_size for c, turn in zip(self.cameras, stored(self._turns), strict=True)]
+        if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
+            alignment = cut_alignment(alignment, sizes)
+        return turned_alignment(alignment, self._turns, down)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""

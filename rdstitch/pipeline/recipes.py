@@ -15,7 +15,7 @@ from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of,
 from rdstitch.geometry.exif_orientation import quarter_turn
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
-from rdstitch.inputs.measurements import timestamps_of
+from rdstitch.inputs.measurements import timestamps_of, with_times
 from rdstitch.inputs.source import Source
 from rdstitch.local_alignment import LocalAlignment
 from rdstitch.pipeline.accept import accept, scale_uncertainty
@@ -23,7 +23,7 @@ from rdstitch.pipeline.aligner import Purpose
 from rdstitch.pipeline.compose import blocks_on, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
-from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs
+from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag
 from rdstitch.pipeline.register import register, with_frontal_reference
 from rdstitch.pipeline.straighten import turned
 from rdstitch.pipeline.whole_pixels import on_whole_pixels
@@ -173,7 +173,8 @@ def mosaic_blocks(
         if options.cache is None:
             # What was found of images and pairs serves the next block.
             options = replace(options, cache=stack.enter_context(TemporaryFolder()))
-        frames = list(listed.frames)
+        frames = with_times(listed.frames, options.timestamps)
+        options = replace(options, timestamps=None)
         while len(frames) > 1 or not results:
             name = file.with_name(f"{file.stem}-{len(results) + 1}{file.suffix}") if results else file
             try:
@@ -226,12 +227,14 @@ def _stitch(
 ) -> StitchResult:
     """The stages of :func:`mosaic`, and, where every image must be readable and one gives the plane, :func:`pano`."""
     given = as_inputs(inputs, options.channel_order)
+    options, notes = with_camera_in_bag(given, options)
     with found_images(given, output=output, every=every, topic=options.topic) as listed:
         _check_outputs(output, options, listed.files)
-        sources, unread = read_inputs(in_lasting_order(listed.frames), options, skip_bad=not pano)
+        frames = in_lasting_order(with_times(listed.frames, options.timestamps))
+        sources, unread = read_inputs(frames, options, skip_bad=not pano)
         check_map(sources, options.composite)
         with options.executor(len(sources)) as executor:
-            known = [*unread, *listed.messages]
+            known = [*unread, *listed.messages, *notes]
             accepted = _accepted(sources, known, options, executor, progress, "pano" if pano else "mosaic")
             registration = on_whole_pixels(with_frontal_reference(accepted, options, always=pano))
             local = align_registration_locally(registration, options.local_alignment)
@@ -270,7 +273,7 @@ def calibrate(
     options = options or StitchOptions()
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
         _check_outputs(None, options, listed.files)
-        sources, unread = read_inputs(listed.frames, options, skip_bad=True)
+        sources, unread = read_inputs(with_times(listed.frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages]
             result = _finished(_accepted(sources, known, options, executor, progress, "calibrate"))
@@ -306,8 +309,7 @@ def trajectory(
     layout : str
         "csv", "tum" or "kitti"; see :mod:`rdstitch.export.trajectory_files`.
     timestamps : path, optional
-        File of the time stamps of the images; see :func:`rdstitch.inputs.measurements.timestamps_of`. Without it,
-        they are those of the video, the bag, or EXIF.
+        As in ``options``.
     plot : path, optional
         SVG file to draw the path to.
     height : float
@@ -322,22 +324,27 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = replace(options or StitchOptions(), pose_covariance=True)
-    with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
+    options = options if timestamps is None else replace(options, timestamps=timestamps)
+    given = as_inputs(inputs, options.channel_order)
+    options, notes = with_camera_in_bag(given, options)
+    with found_images(given, every=every, topic=options.topic) as listed:
         files = [file for file in (output, plot) if file is not None]
         for file in files:
-            read = [*listed.files, *options.files, *([] if timestamps is None else [timestamps])]
-            check_output(file, options.overwrite, read, suffixes=())
+            check_output(file, options.overwrite, [*listed.files, *options.files], suffixes=())
         check_distinct(files)
-        sources, unread = read_inputs(listed.frames, options, skip_bad=True)
-        times = timestamps_of(sources, timestamps)
+        # Numbered as they were named: what is left out leaves a gap.
+        frames = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
+        sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
-            known = [*unread, *listed.messages]
+            known = [*unread, *listed.messages, *notes]
             registration = _accepted(sources, known, options, executor, progress, "trajectory")
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])
     path = Trajectory.from_alignment(turned_alignment(registration.alignment, back, None), height)
-    path = path.labelled([s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], times)
+    path = path.labelled(
+        [s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], timestamps_of(sources)
+    )
     if layout == "tum" and not has_times(path):
         registration = registration.with_messages([_NO_TIMES])
     with Outputs(options.overwrite) as outputs:

@@ -189,8 +189,8 @@ def _matched(
     chosen = (distance[:, 0] < threshold) & (distance[:, 1] > 2.0 * threshold) & mutual
     indices = np.column_stack([seen, nearest[:, 0]])[chosen]
     points1, points2 = first[indices[:, 0]], second[indices[:, 1]]
-    keypoints, size = pair.link(), pair.relation.camera2.image_size
-    covered, before = places(points1, points2, size), places(keypoints.points1, keypoints.points2, size)
+    keypoints, sizes = pair.link(), (pair.relation.camera.image_size, pair.relation.camera2.image_size)
+    covered, before = places(points1, points2, *sizes), places(keypoints.points1, keypoints.points2, *sizes)
     if len(indices) < _MIN_MATCHES or covered < _MIN_PLACES * before:
         return pair
     matches = Correspondences(indices, points1, points2, np.zeros(len(indices)))

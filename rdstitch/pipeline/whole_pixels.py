@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.geometry.camera import Camera
 from rdstitch.matching.match_graph import spanning_tree
 from rdstitch.results.registration import Registration
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
@@ -23,6 +24,9 @@ _UPRIGHT = 0.01
 """Largest turn of the reference image in the output, radians, where that can be its frame."""
 
 
+_REASON = "moved by whole pixels, as parts of one image are"
+
+
 def on_whole_pixels(registration: Registration) -> Registration:
     """The same registration, with motion by whole pixels and no lens where that explains the matches as well.
 
@@ -37,19 +41,33 @@ def on_whole_pixels(registration: Registration) -> Registration:
     unit = math.sqrt(abs(float(np.linalg.det(linear))))
     if whole is None or np.abs(linear / unit - np.eye(2)).max() > _UPRIGHT:
         return registration
-    cameras = tuple(
-        replace(c, distortion=0.0, distortion2=0.0, distortion3=0.0, center=(math.nan, math.nan))
-        for c in alignment.cameras
-    )
+    # What was found of a camera over a plane is no property of a cut-out.
+    cameras = tuple(replace(Camera(c.image_size), distortion_std=0.0) for c in alignment.cameras)
     reference, homographies = cameras[alignment.reference], np.full_like(alignment.homographies, np.nan)
     for index, shift in zip(np.flatnonzero(alignment.used), whole, strict=True):
         camera = cameras[index]
         middle = (shift + camera.center - reference.center) / reference.scale
         homographies[index] = np.diag([unit * camera.scale / reference.scale] * 2 + [1.0])
         homographies[index][:2, 2] = frame[:2, 2] + unit * middle
-    return replace(
-        registration, alignment=replace(alignment, cameras=cameras, homographies=homographies, distortion=0.0)
+    moved = replace(
+        alignment,
+        cameras=cameras,
+        homographies=homographies,
+        model="rigid",
+        model_reason=f"rigid: {_REASON}",
+        poses=None,
+        tilt=None,
+        tilt_spread=0.0,
+        focal=None,
+        focal_std=None,
+        distortion=0.0,
+        distortion_std=0.0,
+        lens="division",
+        lens_reason=_REASON,
+        parameters=(),
+        covariance=np.empty((0, 0)),
     )
+    return replace(registration, alignment=moved)
 
 
 def _whole_shifts(registration: Registration) -> FloatArray | None:

@@ -189,7 +189,9 @@ def _lambda(registration: Registration) -> str:
     if not math.isfinite(alignment.distortion_std):
         return "not observable"
     given = alignment.distortion_std == 0.0
-    return f"{alignment.distortion:.6f} " + ("(given)" if given else f"± {alignment.distortion_std:.6f}")
+    return f"{alignment.distortion:.6f} " + (
+        f"({alignment.lens_reason})" if given else f"± {alignment.distortion_std:.6f}"
+    )
 
 
 def run(stages: Sequence[tuple[str, float]], command: str) -> str:

@@ -106,7 +106,9 @@ class Registration:
         distortion, deviation = self.alignment.distortion, self.alignment.distortion_std
         if not math.isfinite(deviation):
             return f"{images}, λ not observable"
-        return f"{images}, λ = {distortion:.4f} " + ("(given)" if deviation == 0.0 else f"± {deviation:.4f}")
+        return f"{images}, λ = {distortion:.4f} " + (
+            f"({self.alignment.lens_reason})" if deviation == 0.0 else f"± {deviation:.4f}"
+        )
 
     @property
     def upright_camera(self) -> Camera:

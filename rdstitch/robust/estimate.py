@@ -10,7 +10,7 @@ from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.choices import SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.geometry.radial_homography import RadialHomography, are_homographies
 from rdstitch.robust.estimation_options import EstimationOptions
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
@@ -49,6 +49,11 @@ class PairMatches:
     def batch_key(self) -> tuple[int, float, float, bool]:
         """What pairs that go on in lockstep have in common."""
         return padded_length(len(self)), self.focal, self.camera1.focal_log_std, self.tilts is None
+
+    @property
+    def sizes(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Of both images, pixels."""
+        return self.camera1.image_size, self.camera2.image_size
 
     @property
     def order(self) -> IntArray:
@@ -145,7 +150,7 @@ def estimate_radial_homographies(pairs: Sequence[PairMatches], options: Estimati
     result: dict[int, RadialHomography] = {}
     batches: dict[tuple[int, float, float, bool], list[int]] = {}
     for index, pair in enumerate(pairs):
-        if (cells := places(pair.points1, pair.points2, pair.camera2.image_size)) < MIN_PLACES:
+        if (cells := places(pair.points1, pair.points2, *pair.sizes)) < MIN_PLACES:
             reason = f"only {len(pair)} matches, in {cells} places of the image"
             result[index] = RadialHomography.failed(reason, pair.camera1, pair.camera2, len(pair))
         else:
@@ -231,7 +236,9 @@ def _result(
 ) -> RadialHomography:
     """What was found of a pair, unless that could be chance."""
     inliers = errors < threshold
-    doubt = rejection_reason(pair.points1, pair.points2, inliers, pair.camera2.image_size, threshold)
+    doubt = rejection_reason(pair.points1, pair.points2, inliers, pair.sizes, threshold)
+    if doubt is None and not are_homographies(fit.homography[None])[0]:
+        doubt = f"{int(inliers.sum())} of {len(pair)} matches agree, but on no homography that images can have"
     if doubt is not None:
         return RadialHomography.failed(doubt, pair.camera1, pair.camera2, len(pair), iterations)
     reason = fit.reason

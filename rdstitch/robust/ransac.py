@@ -110,8 +110,10 @@ def ransac(
     batch, hard = _FIRST_BATCH, active[:0]
     while len(active):
         for lane, rows in [*((lane, hard) for lane in lanes[:-1]), (lanes[-1], active)]:
-            left = options.max_iterations - int(np.sum([lane.drawn[active] for lane in lanes], axis=0).max())
-            lane.advance(best, rows[lane.drawn[rows] < lane.needed(best, rows, explore=True)], min(batch, left))
+            rows = rows[lane.drawn[rows] < lane.needed(best, rows, explore=True)]
+            left = options.max_iterations - np.sum([each.drawn[rows] for each in lanes], axis=0)
+            for size in np.unique(np.minimum(left, batch)).tolist():  # of each pair, whatever the others have drawn
+                lane.advance(best, rows[np.minimum(left, batch) == size], size)
         needed = np.stack([lane.needed(best, active) for lane in lanes])
         drawn = np.stack([lane.drawn[active] for lane in lanes])
         explored = (drawn >= np.minimum(_MIN_EXPLORATION, needed)).all(axis=0)

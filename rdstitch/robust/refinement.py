@@ -37,6 +37,7 @@ class PairEquations(BatchedNormalEquations):
 
     scale: FloatArray  # (B,): of the loss, pixels
     noise: FloatArray  # (B,): standard deviation of the errors per axis, pixels
+    prior: FloatArray  # (B,): cost of the priors, in units of the noise
     transferred: TransferDerivatives
 
     @property
@@ -88,25 +89,27 @@ class PairProblems:
         entries = entry_equations(transferred, self.data.present, scale, self.free > 0)
         information = np.swapaxes(chain, 1, 2) @ entries.information @ chain
         gradient = (entries.gradient[:, None] @ chain)[:, 0]
-        cost, weight = entries.cost, noise**2
+        weight = noise**2
         residual, by_state = self.model.prior(parameters[:, -_STATE:])
+        prior = (residual**2).sum(axis=1)
         if residual.shape[1]:
             information[:, self.free :, self.free :] += weight[:, None, None] * (by_state.T @ by_state)
             gradient[:, self.free :] += weight[:, None] * (residual @ by_state)
-            cost = cost + weight * (residual**2).sum(axis=1)
         if self.lens_std is not None:
             lens = parameters[:, :-_STATE] / self.lens_std
             information[:, : self.free, : self.free] += weight[:, None, None] * np.diag(self.lens_std**-2.0)
             gradient[:, : self.free] += weight[:, None] * lens / self.lens_std
-            cost = cost + weight * (lens**2).sum(axis=1)
-        return PairEquations(cost, information, gradient, entries.squared, scale, noise, transferred)
+            prior = prior + (lens**2).sum(axis=1)
+        cost = entries.cost + weight * prior
+        return PairEquations(cost, information, gradient, entries.squared, scale, noise, prior, transferred)
 
     def cost(self, before: PairEquations, after: PairEquations) -> FloatArray:
-        """Loss of ``before`` with the width of ``after``."""
+        """Loss of ``before`` with the width and the noise of ``after``."""
         if self.noise is not None:
             return before.cost
+        prior = (after.noise**2 - before.noise**2) * before.prior
         change, unchanged = (robust_cost(before.squared, each.scale[:, None]) for each in (after, before))
-        result: FloatArray = before.cost + ((change - unchanged) * self.data.present).sum(axis=1)
+        result: FloatArray = before.cost + prior + ((change - unchanged) * self.data.present).sum(axis=1)
         return result
 
     def chain(self, parameters: FloatArray) -> FloatArray:

@@ -3,12 +3,11 @@
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.geometry.radial_homography import are_homographies
 from rdstitch.robust.measurements import Measurements
 from rdstitch.solvers.solutions import Solutions
 
 _BLOCK = 1 << 15  # hypotheses x matches at once: the temporaries stay in cache
-
-_MIN_DETERMINANT = 1e-6  # of H at unit norm; an image is then squeezed to a millionth of its area
 
 
 def plausible(solutions: Solutions, corner_radius: float) -> BoolArray:
@@ -17,12 +16,7 @@ def plausible(solutions: Solutions, corner_radius: float) -> BoolArray:
     Impossible are a lens that folds within the image (``1 + λ r² <= 0`` at a corner, or ``λ r² >= 1``, where the
     undistorted radius stops growing), a mirrored image (``det H < 0``), and an image squeezed to a line.
     """
-    h = solutions.homography
-    with np.errstate(invalid="ignore", over="ignore"):
-        size = np.sqrt(np.einsum("mij,mij->m", h, h))
-        determinant = np.linalg.det(h) / size**3
-        bend = solutions.distortion * corner_radius**2
-        return np.asarray(np.isfinite(size) & (determinant > _MIN_DETERMINANT) & (np.abs(bend) < 1.0))
+    return are_homographies(solutions.homography) & (np.abs(solutions.distortion * corner_radius**2) < 1.0)
 
 
 def transfer_errors2(homography: FloatArray, distortion: FloatArray, pair: IntArray, data: Measurements) -> FloatArray:

@@ -22,9 +22,10 @@ _NEGLIGIBLE = 1e-17
 _MAX_CHANCE = 1e-4  # probability that as many wrong matches agree by chance
 
 
-def places(points1: FloatArray, points2: FloatArray, image_size: tuple[int, int]) -> int:
-    """In how many cells of a grid the matches (N, 2), pixels, lie, in the image in which these are fewer."""
-    cells = np.stack([points1, points2]) * (_CELLS_PER_DIAGONAL / math.hypot(*image_size))
+def places(points1: FloatArray, points2: FloatArray, size1: tuple[int, int], size2: tuple[int, int]) -> int:
+    """In how many cells of a grid over each image the matches (N, 2), pixels, lie, where these are fewer."""
+    sides = np.array([math.hypot(*size) for size in (size1, size2)]) / _CELLS_PER_DIAGONAL
+    cells = np.stack([points1, points2]) / sides[:, None, None]
     numbers = np.sort(np.floor(cells) @ _CELL_NUMBER, axis=1)
     return int((numbers[:, 1:] != numbers[:, :-1]).sum(axis=1).min()) + min(1, len(points1))
 
@@ -47,31 +48,25 @@ def binomial_tail(least: int, trials: int, probability: float) -> float:
 
 
 def rejection_reason(
-    points1: FloatArray, points2: FloatArray, inliers: NDArray[np.bool_], image_size: tuple[int, int], threshold: float
+    points1: FloatArray,
+    points2: FloatArray,
+    inliers: NDArray[np.bool_],
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+    threshold: float,
 ) -> str | None:
-    """Why the inliers could be chance, or None.
+    """Why the inliers (N,) of matches (N, 2), pixels, of images of two sizes could be chance, or None.
 
     Two tests. Are there more inliers than wrong matches would give by chance? A wrong match lies within
-    the threshold with a probability of a disc's share of the image. And do they lie in enough different places?
-    Neighbouring matches go wrong together, on a moving object or on a repeated pattern, and count once.
-
-    Parameters
-    ----------
-    points1, points2 : ndarray of shape (N, 2)
-        Measured points, pixels.
-    inliers : ndarray of shape (N,), bool
-    image_size : (int, int)
-        Of image 2, pixels.
-    threshold : float
-        pixels.
+    the threshold, pixels, with a probability of a disc's share of the second image. And do they lie in enough different
+    places? Neighbouring matches go wrong together, on a moving object or on a repeated pattern, and count once.
     """
     count = int(inliers.sum())
-    cells = places(points1[inliers], points2[inliers], image_size)
+    cells = places(points1[inliers], points2[inliers], *sizes)
     if cells < MIN_PLACES:
         if count < MIN_PLACES:
             return f"only {count} of {len(inliers)} matches agree"
         return f"{count} of {len(inliers)} matches agree, but they lie in {cells} places of the image only"
-    by_chance = min(0.5, np.pi * threshold**2 / (image_size[0] * image_size[1]) + 0.01)
+    by_chance = min(0.5, np.pi * threshold**2 / math.prod(sizes[1]) + 0.01)
     trials = len(inliers) - 4
     if trials > 0 and binomial_tail(count - 4, trials, by_chance) > _MAX_CHANCE:
         return f"{count} of {len(inliers)} matches agree, no more than chance allows"

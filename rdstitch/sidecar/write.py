@@ -197,6 +197,7 @@ def lens_fields(camera: Camera) -> dict[str, Any]:
         "image_circle_px": camera.image_circle,
         "lambda": camera.nearest_distortion,
         "coefficients": camera.coefficients,
+        "lens_model": None if camera.lens_model is None else dataclasses.asdict(camera.lens_model),
         "focal_px": camera.focal,
         "focal_source": camera.focal_source,
     }

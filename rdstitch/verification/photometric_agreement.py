@@ -29,6 +29,7 @@ COMPARED_SIDE = 512  # pixels of the longer side of the images that are compared
 CELL = 24  # pixels
 _SEARCH_RADIUS = 8  # pixels
 _OPAQUE = 250
+_PLAIN = 0.1  # of the median deviation of the rows of an image: a row of less is plain
 _LATTICE = 8  # pixels between the places that are computed; those between are interpolated
 
 
@@ -60,6 +61,7 @@ class ComparedImage:
     ) -> Self:
         """An image with its camera and its place, made small; ``stretch`` are the grey levels of black and white."""
         grey = _reduced_grey(image, stretch)
+        grey[_plain_frame(grey)] = np.nan
         return cls(grey, camera.resized((grey.shape[1], grey.shape[0])), homography)
 
     def sampled(self, plane: Callable[[FloatArray], FloatArray], box: Box) -> Grey:
@@ -91,6 +93,20 @@ def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> G
     if image.alpha is not None:
         grey[cv2.resize(image.alpha, size, interpolation=cv2.INTER_AREA) < _OPAQUE] = np.nan
     return grey
+
+
+def _plain_frame(grey: Grey) -> NDArray[np.bool_]:
+    """Where rows and columns from the border on show nothing: frames of two images coincide wherever these lie."""
+    frame = np.zeros_like(grey, dtype=np.bool_)
+    for image, masked in ((grey, frame), (grey.T, frame.T)):
+        inside = ~masked.all(axis=0)
+        texture = np.array([row[np.isfinite(row)].std() if np.isfinite(row).any() else 0.0 for row in image[:, inside]])
+        shown = np.flatnonzero(texture > _PLAIN * np.median(texture))
+        if len(shown) and len(shown) < len(image):
+            first, last = shown[[0, -1]]
+            # The next row is mixed with the frame where the image was made smaller.
+            masked[: first + (first > 0)] = masked[last + (last == len(image) - 1) :] = True
+    return frame
 
 
 def overlap_agreement(first: ComparedImage, second: ComparedImage) -> Agreement:

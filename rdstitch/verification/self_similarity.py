@@ -23,6 +23,7 @@ _MAX_PX = 4  # times the sides of an image that its outline on the plane may hav
 COARSEST = 8.0  # pixels, standard deviation of the blur that brightness is measured by
 _MIN_SHIFT = 14  # pixels: shifts that are none
 SLACK = 3  # pixels by which the registration may be off
+_NOISE = 0.02  # share of the power of an image that is noise and resampling, at least
 _MIN_NORM = 1e-4  # of the largest: where fewer pixels overlap, rounding decides
 
 
@@ -39,7 +40,9 @@ class Ambiguity:
     @property
     def ambiguous(self) -> bool:
         """Whether the images fit elsewhere as well as here."""
-        return self.elsewhere > max(limit("correlation"), limit("as well elsewhere") * self.here)
+        left, left_elsewhere = max(1.0 - self.here**2, _NOISE), 1.0 - self.elsewhere**2
+        as_well = self.elsewhere > max(limit("correlation"), limit("as well elsewhere") * self.here)
+        return as_well and left_elsewhere < limit("unexplained elsewhere") * left
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,14 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from rdstitch.alignment.motion_models import HOMOGRAPHY, SIMILARITY, TILTING, inverses
+from rdstitch.alignment.motion_models import HOMOGRAPHY, SIMILARITY, TILTING
 from rdstitch.alignment.motion_models.homography import _TRACELESS
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.division_model import distort, undistort, valid_radius
 from rdstitch.geometry.exif_orientation import inverse, turned, turning_matrix
 from rdstitch.geometry.planar_motion import PlanarMotion, rotation_from_tilt, tilt_from_normal
+from rdstitch.geometry.radial_homography import inverses
 from rdstitch.matching.links import spread_choice
 
 coordinates = st.floats(-1.0, 1.0, allow_subnormal=False)

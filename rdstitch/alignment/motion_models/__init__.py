@@ -22,7 +22,7 @@ new one is one more of :data:`PLANAR_MODELS`, or a class in a file of its own wi
 is a word of :mod:`rdstitch.choices`.
 """
 
-from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel, inverses
+from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel
 from rdstitch.alignment.motion_models.homography import HOMOGRAPHY
 from rdstitch.alignment.motion_models.planar import (
     LOG_HEIGHT,
@@ -60,5 +60,4 @@ __all__ = [
     "PlanarModel",
     "X",
     "Y",
-    "inverses",
 ]

@@ -94,15 +94,3 @@ class MotionModel(ABC):
     @abstractmethod
     def description(self, poses: FloatArray, shared: FloatArray) -> str:
         """What a fit says of the camera."""
-
-
-def inverses(matrices: FloatArray) -> FloatArray:
-    """Inverses of (N, 3, 3) by cofactors; not finite where a step made a matrix singular."""
-    (a, b, c), (d, e, f), (g, h, i) = matrices.transpose(1, 2, 0)
-    cofactors = np.empty((3, 3, len(matrices)))
-    with np.errstate(all="ignore"):
-        cofactors[:, 0] = e * i - f * h, f * g - d * i, d * h - e * g
-        cofactors[:, 1] = c * h - b * i, a * i - c * g, b * g - a * h
-        cofactors[:, 2] = b * f - c * e, c * d - a * f, a * e - b * d
-        cofactors /= a * cofactors[0, 0] + b * cofactors[1, 0] + c * cofactors[2, 0]
-    return np.ascontiguousarray(cofactors.transpose(2, 0, 1))

@@ -12,6 +12,7 @@ import numpy as np
 from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.planar_motion import ABOUT_X, ABOUT_Y, nearest_in_plane, rigid_in_plane, rotation_from_tilt
+from rdstitch.geometry.radial_homography import inverses
 
 YAW, X, Y, LOG_HEIGHT, PSI, THETA = range(6)
 """Columns of a planar model's poses."""
@@ -124,7 +125,7 @@ class PlanarModel(MotionModel):
     def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The nearest poses, given how the tilts of the images differ from the shared one."""
         poses = self._tilted(attitudes, shared)
-        motion = np.linalg.inv(self.origins(shared, attitudes)) @ homographies
+        motion = inverses(self.origins(shared, attitudes)) @ homographies
         poses[:, YAW], translation, height = nearest_in_plane(motion)
         poses[:, [X, Y]] = translation * np.exp(shared[2])
         if LOG_HEIGHT in self.free:

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rdstitch.alignment.adjustment_problem import independent_pairs, relations_at
+from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links, triangles
 from rdstitch.alignment.motion_models import HOMOGRAPHY, Y
 from rdstitch.alignment.observations import Observations
@@ -90,6 +91,11 @@ def test_pairs_that_show_a_vehicle_only_are_suspected_though_they_open_most_tria
 
 def _judged(given: Scene, links: list[Link]) -> tuple[BoolArray, NDArray[np.intp]]:
     """What :func:`cycle_consistency` says of links between the images of a scene."""
+    return cycle_consistency(*_apart(given, links), len(given.cameras))
+
+
+def _apart(given: Scene, links: list[Link]) -> tuple[BundleAdjustmentResult, Observations]:
+    """Links between the images of a scene, each on its own."""
     observations = Observations.from_links(links, given.cameras)
     lens = np.zeros(len(LENS_PARAMETERS))
     lens[0] = given.distortion
@@ -103,4 +109,24 @@ def _judged(given: Scene, links: list[Link]) -> tuple[BoolArray, NDArray[np.intp
         Priors.none(HOMOGRAPHY, 0),
         np.zeros((9, 2)),
     )
-    return cycle_consistency(adjuster.run(start), observations, len(given.cameras))
+    return adjuster.run(start), observations
+
+
+def test_a_fit_that_ran_away_is_suspected_and_says_nothing_of_others() -> None:
+    rng = np.random.default_rng(4)
+    given = scene(grid(3, 3, (0.3, 0.25), 0.1, rng), noise=0.3, outliers=0.0, per_link=40, rng=rng)
+    apart, observations = _apart(given, given.links)
+    for lost in (np.zeros((3, 3)), np.outer([1e200, 1.0, 1.0], [1.0, 1e-3, 1.0]), np.full((3, 3), np.nan)):
+        ran_away = replace(apart)
+        homographies = apart.homographies.copy()
+        homographies[5] = lost
+        ran_away.__dict__["homographies"] = homographies
+        suspects, confirmed = cycle_consistency(ran_away, observations, 9)
+        assert np.flatnonzero(suspects).tolist() == [5]
+        assert (np.delete(confirmed, 5) > 0).all()
+
+
+def test_every_link_keeps_a_triangle_of_very_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    i, j = (index.astype(np.intp) for index in np.triu_indices(12, 1))
+    monkeypatch.setattr("rdstitch.alignment.cycle_consistency._MAX_TRIANGLES", 5)
+    assert set(triangles(12, i, j).ravel().tolist()) == set(range(len(i)))

@@ -10,7 +10,7 @@ from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
-from rdstitch.alignment.select import ModelChoice
+from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.geometry.radial_homography import measurement_whitening
 from tests.alignment_scenes import Scene, grid, scene
 
@@ -51,7 +51,7 @@ def test_over_a_plane_nothing_changes() -> None:
     problem, fit = _fitted(_scene(0.0))
     choice = ModelChoice(fit, "", 1.0)
     assert weighted_by_relief(problem, fit) is problem
-    assert choose_over_relief(problem, choice, ["similarity", "tilting"]) is choice
+    assert choose_over_relief(problem, choice, ["similarity", "tilting"], layout_matters=True) is choice
 
 
 def test_of_two_images_tilts_do_what_heights_do() -> None:
@@ -64,7 +64,7 @@ def test_of_two_images_tilts_do_what_heights_do() -> None:
 def test_heights_are_found_as_they_scatter() -> None:
     """Of ``sin sin`` hills they scatter by half of the amplitude, which moves points by that share of the parallax."""
     problem, fit = _fitted(_scene(0.08))
-    choice = choose_over_relief(problem, ModelChoice(fit, "", 1.0), ["similarity"])
+    choice = choose_over_relief(problem, ModelChoice(fit, "", 1.0), ["similarity"], layout_matters=True)
     weighted = weighted_by_relief(problem, choice.fit)
     relief = weighted.observations.relief
     noise = choice.fit.adjusted.sigma
@@ -92,3 +92,25 @@ def test_the_displacements_go_with_their_observations() -> None:
         assert own.relief.shape == own.points1.shape
         rows = [int(np.flatnonzero((o.points1 == point).all(axis=1))[0]) for point in own.points1]
         np.testing.assert_array_equal(own.relief, o.relief[rows])
+
+
+def test_nothing_is_the_best_of_layouts_that_nobody_would_keep() -> None:
+    problem, fit = _fitted(_scene(0.0))
+    steep = replace(fit.adjusted.parameters, shared=SIMILARITY.shared_from_physical(np.array([1.2, 0.0, 0.3])))
+    leaning = replace(fit, adjusted=replace(fit.adjusted, parameters=steep))
+    for fits, layout_matters, found in (
+        ([leaning], True, False),
+        ([leaning], False, True),
+        ([leaning, fit], True, True),
+    ):
+        best = best_of(problem, fits, requested=False, layout_matters=layout_matters)
+        assert (best is not None) is found
+    assert best is not None
+    assert best.fit is fit
+
+
+def test_the_error_of_the_reason_is_that_of_the_fit() -> None:
+    _, fit = _fitted(_scene(0.0))
+    choice = ModelChoice(fit, "; as requested", 1.0)
+    later = replace(choice, fit=replace(fit, adjusted=replace(fit.adjusted, sigma=7.25)))
+    assert "7.25 pixels; as requested" in later.reason

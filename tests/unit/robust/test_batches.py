@@ -93,3 +93,15 @@ def test_normal_equations_are_those_of_the_jacobian(own: bool) -> None:
     np.testing.assert_allclose(equations.cost[0], (found.squared[0] * relative).sum())
     shares = influence(found, data.present, np.array([3.0]), True)[0]
     np.testing.assert_allclose(shares.sum(axis=0), equations.gradient[0])
+
+
+def test_the_samples_of_a_pair_are_its_own_however_many_others_draw() -> None:
+    """Beside a pair without a model, for which all solvers reach the limit of samples early."""
+    options = EstimationOptions(max_iterations=250)
+    hopeless = _pairs(1)[-2]
+    for outliers in (0.42, 0.45, 0.48):
+        matches = correspondences(80, seed=1, outliers=outliers, motion="homography")
+        camera = Camera(matches.truth.camera.image_size).with_focal()
+        pair = PairMatches(matches.points1, matches.points2, camera, camera)
+        alone, beside = (estimate_radial_homographies(pairs, options)[0] for pairs in ([pair], [pair, hopeless]))
+        assert (alone.iterations, alone.homography.tobytes()) == (beside.iterations, beside.homography.tobytes())

@@ -8,6 +8,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import transfer
 from rdstitch.robust.covariance import covariances
+from rdstitch.robust.loss import robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
@@ -178,3 +179,18 @@ def test_without_matches_only_the_priors_of_the_lens_count() -> None:
     assert found.cost == pytest.approx(0.25 * np.square(lens / std).sum())
     np.testing.assert_allclose(found.gradient[0, :5], 0.25 * lens / std**2)
     np.testing.assert_allclose(found.information[0, :5, :5], 0.25 * np.diag(std**-2.0))
+
+
+def test_priors_weigh_by_the_noise_that_they_are_compared_at() -> None:
+    """A step changes the noise: what the prior cost before is compared with what it costs after by the same noise."""
+    model = PlanarPairModel(FOCAL, 1e-4)
+    problems = PairProblems(model, _data(), np.array([3.0]), None, False)
+    start = model.initialize(H[None])
+    near, far = (
+        problems.normal_equations(np.column_stack([[DISTORTION + off], model.retract(start, np.array([step]))]))
+        for off, step in ((0.001, [0.0, 0.0, 0.0, 0.0, 0.0, 1e-4]), (0.003, [5e-4, 0.0, 0.0, 0.0, 0.0, 1e-4]))
+    )
+    assert near.noise[0] != pytest.approx(far.noise[0], rel=0.2)
+    np.testing.assert_allclose(near.prior, far.prior)
+    width = robust_cost(near.squared, far.scale[:, None]).sum(axis=1)
+    np.testing.assert_allclose(problems.cost(near, far), width + far.noise**2 * near.prior)

@@ -8,6 +8,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import transfer
+from rdstitch.robust import estimate_radial_homography
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.robust.verification import MIN_PLACES, binomial_tail, places, rejection_reason
@@ -136,21 +137,21 @@ def test_chance_is_that_of_a_wrong_match_near_its_place(matches: int, threshold:
     enough = int(np.argmax(tail <= 1e-4)) + 4
     points = _apart(matches)
     for count, reliable in ((enough, True), (enough - 1, False)):
-        reason = rejection_reason(points, points, np.arange(matches) < count, SIZE, threshold)
+        reason = rejection_reason(points, points, np.arange(matches) < count, (SIZE, SIZE), threshold)
         if count >= MIN_PLACES:
             assert (reason is None) is reliable, count
 
 
 def test_few_matches_that_all_agree_are_no_chance() -> None:
     points = _apart(MIN_PLACES)
-    assert rejection_reason(points, points, np.ones(len(points), dtype=np.bool_), SIZE, 3.0) is None
+    assert rejection_reason(points, points, np.ones(len(points), dtype=np.bool_), (SIZE, SIZE), 3.0) is None
 
 
 def test_a_wide_threshold_is_taken_for_even_odds_at_most() -> None:
     points = _apart(100)
     wide = 1e4
     enough = int(np.argmax(binom.sf(np.arange(96) - 1, 96, 0.5) <= 1e-4)) + 4
-    reasons = [rejection_reason(points, points, np.arange(100) < n, SIZE, wide) for n in (enough - 1, enough)]
+    reasons = [rejection_reason(points, points, np.arange(100) < n, (SIZE, SIZE), wide) for n in (enough - 1, enough)]
     assert [reason is None for reason in reasons] == [False, True]
 
 
@@ -158,17 +159,17 @@ def test_neighbouring_matches_count_once() -> None:
     points = np.repeat(_apart(MIN_PLACES - 1), 50, axis=0)
     everything = np.ones(len(points), dtype=np.bool_)
     assert (
-        rejection_reason(points, points, everything, SIZE, 3.0)
+        rejection_reason(points, points, everything, (SIZE, SIZE), 3.0)
         == "350 of 350 matches agree, but they lie in 7 places of the image only"
     )
     one_more = np.vstack([points, _apart(MIN_PLACES)[-1:]])
-    assert rejection_reason(one_more, one_more, np.ones(len(one_more), dtype=np.bool_), SIZE, 3.0) is None
+    assert rejection_reason(one_more, one_more, np.ones(len(one_more), dtype=np.bool_), (SIZE, SIZE), 3.0) is None
 
 
 def test_places_are_those_of_the_image_with_fewer() -> None:
-    assert places(_apart(30), _apart(30), SIZE) == 30
-    assert places(_apart(30), np.full((30, 2), 7.0), SIZE) == 1
-    assert places(_apart(30)[:0], _apart(30)[:0], SIZE) == 0
+    assert places(_apart(30), _apart(30), SIZE, SIZE) == 30
+    assert places(_apart(30), np.full((30, 2), 7.0), SIZE, SIZE) == 1
+    assert places(_apart(30)[:0], _apart(30)[:0], SIZE, SIZE) == 0
 
 
 @pytest.mark.parametrize(
@@ -178,3 +179,14 @@ def test_the_tail_is_that_of_the_binomial_distribution(least: int, trials: int, 
     assert binomial_tail(least, trials, probability) == pytest.approx(
         binom.sf(least - 1, trials, probability), rel=1e-9
     )
+
+
+@pytest.mark.parametrize("small_first", [True, False])
+def test_images_of_very_different_sizes_are_registered_either_way(small_first: bool) -> None:
+    """The cells of each are those of its own size."""
+    sizes = (320, 240), (4000, 3000)
+    points = np.random.default_rng(8).uniform((4, 4), (315, 235), (300, 2))
+    turned = 11.6 * (points - (160, 120)) @ np.array([[0.998, 0.07], [-0.07, 0.998]]) + (2037, 1475)
+    both = (points, turned) if small_first else (turned, points)
+    first, second = sizes if small_first else sizes[::-1]
+    assert estimate_radial_homography(both[0], both[1], first, image_size2=second)

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from rdstitch.geometry.camera import Camera
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import DecodedImage
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification.photometric_agreement import ComparedImage
-from rdstitch.verification.self_similarity import Ambiguity, draw, drawing_scale, placement_ambiguity
+from rdstitch.verification.self_similarity import Ambiguity, draw, drawing_scale, find_ambiguity, placement_ambiguity
 from rdstitch.verification.unique_places import departures, unique_shifts
 
 SIZE = (256, 192)
@@ -77,9 +79,17 @@ def test_brightness_does_not_matter() -> None:
 
 @pytest.mark.parametrize(
     ("here", "elsewhere", "ambiguous"),
-    [(0.9, 0.82, True), (0.9, 0.80, False), (0.3, 0.51, True), (0.3, 0.49, False), (0.0, 0.0, False)],
+    [
+        (0.9, 0.82, True),
+        (0.9, 0.80, False),
+        (0.3, 0.51, True),
+        (0.3, 0.49, False),
+        (0.0, 0.0, False),
+        (0.99, 0.93, False),  # a mown meadow
+        (0.99, 0.985, True),  # tiles
+    ],
 )
-def test_as_good_is_nine_tenths_and_alike(here: float, elsewhere: float, ambiguous: bool) -> None:
+def test_as_good_is_nine_tenths_and_alike_and_leaves_as_little(here: float, elsewhere: float, ambiguous: bool) -> None:
     assert Ambiguity(here, elsewhere, 0.2).ambiguous is ambiguous
 
 
@@ -145,3 +155,16 @@ def test_dust_on_the_lens_is_no_evidence() -> None:
     dust = np.array([[90, 70], [133, 111]])
     placed = {k: _image(dust + corner, *corner, seed=k) for k, corner in enumerate(((150, 100), (200, 140)))}
     assert not unique_shifts(placed, [(0, 1)])
+
+
+@pytest.mark.parametrize("level", [0.0, 0.6, 1.0])
+def test_frames_coincide_elsewhere_and_are_no_pattern(level: float) -> None:
+    framed = []
+    for left, top in ((100, 100), (250, 190)):
+        image = _placed(PLANE, left, top)
+        grey = (image.grey - PLANE.min()) / np.ptp(PLANE)
+        grey[:10], grey[-7:], grey[:, :9] = level, level, level
+        framed.append(ComparedImage.of(DecodedImage(grey, None, Metadata(SIZE)), LENS, image.homography))
+    assert not find_ambiguity(*framed).ambiguous
+    assert np.isnan(framed[0].grey[:, :9]).all()
+    assert np.isfinite(framed[0].grey[12:180, 12:240]).all()
