@@ -103,7 +103,7 @@ def _border(dark: NDArray[np.bool_], window: int) -> BoolArray:
 
     What is dark in all by chance (the ground of a microscope, a shadow) ends where the first of them is not.
     """
-    found = _regions(dark.all(axis=0))
+    found = _regions(np.asarray(dark.all(axis=0)))
     _, labels = cv2.connectedComponents(found.astype(np.uint8))
     border = np.zeros_like(found)
     for label in set(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]).tolist()) - {0}:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 from xml.etree import ElementTree
 
+import numpy as np
 from PIL import ExifTags, Image
 
 from rdstitch.geometry.camera import is_focal_length
@@ -254,8 +255,15 @@ def _colour_profile(profile: object) -> tuple[bytes, str]:
 
 def _channels(image: Image.Image) -> int:
     """Samples per pixel of what it is decoded to."""
-    palette = image.mode in ("P", "PA")
-    return len(image.getbands()) if not palette else 4 if "transparency" in image.info or image.mode == "PA" else 3
+    if image.mode not in ("P", "PA"):
+        return len(image.getbands())
+    return (1 if is_grey_palette(image) else 3) + ("transparency" in image.info or image.mode == "PA")
+
+
+def is_grey_palette(image: Image.Image) -> bool:
+    """Check whether a palette holds shades of grey only."""
+    palette = np.array(image.getpalette("RGB") or [], dtype=np.uint8).reshape(-1, 3)
+    return bool((palette == palette[:, :1]).all())
 
 
 def _text(value: Any) -> str:

@@ -103,6 +103,23 @@ def test_every_mode_becomes_grey_or_rgb(tmp_path: Path, colours: Samples, mode: 
     assert decoded.pixels.dtype in (np.uint8, np.uint16, np.float32)
 
 
+def test_the_header_knows_whether_there_are_colours(tmp_path: Path, colours: Samples) -> None:
+    for mode, suffix in (
+        ("L", "png"),
+        ("P", "png"),
+        ("P", "gif"),
+        ("P", "tif"),
+        ("RGB", "jpg"),
+        ("L", "jpg"),
+        ("1", "tif"),
+    ):
+        for coloured in (True, False):
+            image = Image.fromarray(colours if coloured else colours[..., 0]).convert(mode)
+            image.save(tmp_path / f"a.{suffix}")
+            bands = read_image(tmp_path / f"a.{suffix}").pixels.shape[2:]
+            assert read_metadata(tmp_path / f"a.{suffix}").channels == (bands[0] if bands else 1), (mode, suffix)
+
+
 def test_first_image_of_several(tmp_path: Path, colours: Samples) -> None:
     frames = [Image.fromarray(colours), Image.fromarray(255 - colours)]
     for name in ("a.gif", "a.png", "a.webp", "a.tif"):
