@@ -108,6 +108,8 @@ def _checked(value: Any, file: str) -> Any:
             name = f"{field}[{key}]" if isinstance(container, list) else f"{field}.{key}".lstrip(".")
             if isinstance(item, float) and not math.isfinite(item):
                 raise InputError(f"{file}: {name}: expected a finite number, not {item}")
+            if isinstance(item, str) and "\0" in item:  # which no system takes as part of a name
+                raise InputError(f"{file}: {name}: holds a NUL character")
             if isinstance(item, (dict, list)) and id(item) not in seen:
                 seen.add(id(item))
                 containers.append((name, depth + 1, item))
