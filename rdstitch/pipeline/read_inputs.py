@@ -74,7 +74,7 @@ def read_inputs(
         raise ArgumentError(f"{twice}stitching needs two different images or more; name at least one more")
     sources = with_attitudes(with_masks(sources, options.mask), options.attitude)
     sources = with_positions(sources, options.positions, options.composite.epsg, options.positions_offset)
-    sources = with_ground_control(sources, options.gcp)
+    sources = with_ground_control(with_ground_control(sources, options.gcp), options.check_points, check=True)
     return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), unread
 
 

@@ -73,6 +73,8 @@ class StitchOptions:
         Seconds to add to the images' times for those of a GPX track, which are in UTC.
     gcp : path, optional
         Ground control points, as OpenDroneMap's ``gcp_list.txt``: they alone place the output on the Earth.
+    check_points : path, optional
+        Points in the same format that are compared with the map, and take no part in it.
     mask : path, optional
         Image, or folder of them, that is dark where the images do not count.
     channel_order : str
@@ -137,6 +139,7 @@ class StitchOptions:
     positions: str | Path | None = None
     positions_offset: float = 0.0
     gcp: str | Path | None = None
+    check_points: str | Path | None = None
     mask: str | Path | None = None
     channel_order: ChannelOrder = "bgr"
     exclude: tuple[str, ...] = ()
@@ -221,6 +224,7 @@ class StitchOptions:
             self.timestamps,
             self.positions,
             self.gcp,
+            self.check_points,
             self.lightglue_model,
             self.features.aliked_model,
         )
