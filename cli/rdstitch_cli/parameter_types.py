@@ -148,13 +148,14 @@ def _lines(text: str) -> str | tuple[tuple[float, ...], ...]:
     return text if text in ("off", "auto") else tuple(_pixels(line, 4) for line in text.split(";"))
 
 
-ANGLES, ANGLE, BYTES, EPSG, CORNERS, LINES = (
+ANGLES, ANGLE, BYTES, EPSG, EXTENT, CORNERS, LINES = (
     Parsed(name, parse)
     for name, parse in (
         ("PSI,THETA", _angles),
         ("DEG", _angle),
         ("SIZE", _bytes),
         ("EPSG:N", _epsg),
+        ("W,S,E,N", partial(_pixels, count=4)),
         ("X1,Y1,…,X4,Y4", partial(_pixels, count=8)),
         ("off|auto|LINES", _lines),
     )

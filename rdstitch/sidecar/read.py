@@ -160,6 +160,13 @@ class ImageRecord(LensRecord, kw_only=True):
     to_output: Matrix | None = None
     displacement: Displacement | None = None
     pose: PoseRecord | None = None
+    timestamp: Annotated[float, Meta(description="s since 1970, by EXIF")] | None = None
+    gps: (
+        Annotated[
+            tuple[float, float, float | None], Meta(description="latitude and longitude, degrees; altitude, m, or null")
+        ]
+        | None
+    ) = None
 
     def __post_init__(self) -> None:
         if self.size is not None:
@@ -256,7 +263,7 @@ class Applied(Struct):
     """Only in the sidecar of ``apply``: what was applied, and how images found their places."""
 
     sidecar: str
-    matched: Literal["name", "order"]
+    matched: Literal["name", "time", "position", "order"]
 
 
 class SidecarRecord(Struct, kw_only=True):
