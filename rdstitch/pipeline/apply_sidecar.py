@@ -11,6 +11,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
+from rdstitch.export.georeference import Georeference
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.inputs.find import found_images
@@ -304,7 +305,7 @@ _GEOMETRY = (
 
 def _same_grid(
     saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions
-) -> tuple[FloatArray, tuple[int, int]] | None:
+) -> tuple[FloatArray, tuple[int, int], Georeference | None] | None:
     """The pixels of the saved output, where images of the same sizes are to have the same: bands, and dates."""
     output = saved.content["output"]
     asked = any(getattr(options, name) != getattr(saved.composite, name) for name in _GEOMETRY)
@@ -312,7 +313,7 @@ def _same_grid(
     if asked or not same_sizes or saved.turned or not options.same_turn(saved.composite) or not output.get("size"):
         return None
     width, height = output["size"]
-    return np.array(output["plane_to_output"], dtype=np.float64), (width, height)
+    return np.array(output["plane_to_output"], dtype=np.float64), (width, height), saved.output_place
 
 
 def _lens_of_band(

@@ -58,13 +58,15 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
                 raise ArgumentError(f"{name} needs a georeferenced output: {reason}; leave it out")
         return canvas, None, reason
     if placed.grid is not None:
-        return canvas, place, reason
+        return canvas, placed.grid[2], reason
     if (grid := _grid(options, place)) is not None:
         on_grid = grid.place.in_pixels(place) @ canvas.matrix
         laid = canvas.on_grid(on_grid, grid.size)
         if not any(_overlaps(outline, grid.size) for outline in laid.footprints):
             raise ArgumentError(f"{'like' if options.like else 'extent'}: none of the images lies there")
-        return laid, moved(place, canvas, laid), reason
+        # As in the file, without rounding.
+        exact = replace(place.after(grid.place.in_pixels(place)), scale=grid.place.scale, origin=grid.place.origin)
+        return laid, exact, reason
     rotate, scale = options.rotate, options.scale
     if options.north_up and not rotate and not options.upright:
         rotate = place.clockwise_deg
@@ -95,7 +97,9 @@ def _overlaps(outline: FloatArray, size: tuple[int, int]) -> bool:
 
 def moved(place: Georeference | None, one: Canvas, other: Canvas) -> Georeference | None:
     """The place of another canvas of the same plane."""
-    return None if place is None else place.after(other.matrix @ np.linalg.inv(one.matrix))
+    if place is None or np.array_equal(one.matrix, other.matrix):  # without rounding: grids are compared
+        return place
+    return place.after(other.matrix @ np.linalg.inv(one.matrix))
 
 
 def place_messages(place: Georeference | None, reason: str, placed: PlacedImages) -> list[Message]:
