@@ -106,7 +106,7 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 --yaw DEG: Turn the view of a panorama to the right, before it is projected.
 --pitch DEG: Turn the view of a panorama up, before it is projected.
 --roll DEG: Turn the view of a panorama clockwise, before it is projected.
-* --crop/--no-crop: Crop to the largest rectangle without holes.
+* --crop/--no-crop: Crop to --rectangle, otherwise to the largest rectangle without holes.
 --projection: Projection of images taken by turning on the spot.
 --max-stretch N: Leave out what an oblique image shows N times coarser than the reference image.
 * --max-size N: Longest side of the output, pixels; --scale is reduced to fit.

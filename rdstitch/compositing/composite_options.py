@@ -32,8 +32,8 @@ class CompositeOptions(UprightOptions):
         "multiband" hides the seam over a width that suits each size of detail, "feather" averages over a
         strip along the seam (without seams: over the whole overlap), "none" cuts.
     crop : str
-        "none"; "auto" cuts to the largest upright rectangle without holes, where that keeps a fair part of the
-        image.
+        "none"; "auto" cuts to ``rectangle``, or without one to the largest upright rectangle without holes, where that
+        keeps a fair part of the output.
     projection : str
         How images taken by turning on the spot are laid out: "plane", "cylinder", "sphere" (equirectangular),
         "mercator", "panini", "stereographic", or "auto": the plane up to a view of 90 degrees, the cylinder for what

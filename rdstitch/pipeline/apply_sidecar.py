@@ -10,7 +10,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
-from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
+from rdstitch.errors import ArgumentError, InputError, PartialResultError
 from rdstitch.export.georeference import Georeference
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse
@@ -20,7 +20,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.pipeline.band_lens import BandLens, band_lens
-from rdstitch.pipeline.compose import compose_images, plainly_viewed, write_page
+from rdstitch.pipeline.compose import check_world_files, compose_images, image_files, plainly_viewed, write_page
 from rdstitch.pipeline.counterparts import MatchBy, MatchedBy, counterparts, registered_files
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
@@ -41,7 +41,7 @@ from rdstitch.sidecar.write import (
     versions,
 )
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import Outputs, check_output, json_bytes
+from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
 from rdstitch.system.progress import Progress, silent
 
 
@@ -237,7 +237,7 @@ def apply(
     given = as_inputs(images, channel_order)
     with found_images(given, output=output, every=every, topic=topic) as listed, Outputs(overwrite) as outputs:
         if output is not None:
-            _check_outputs(Path(output), overwrite, listed.files, saved.path)
+            check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
         chosen, matched, said = counterparts(saved, listed.frames, match)
         doubts += said
         guard = InputGuard(strict)
@@ -248,6 +248,8 @@ def apply(
             corrected, said = with_flat_field(list(used.values()), flat_field)
             used = dict(zip(used, corrected, strict=True))
             doubts += said
+        if output is not None:
+            check_world_files([output], list(used.values()), overwrite)
         frames = {index: frame for index, frame in enumerate(chosen) if index in used and frame is not None}
         lens, said = _lens_of_band(saved, frames, used, progress)
         doubts += said
@@ -263,7 +265,6 @@ def apply(
             options,
             StitchOptions(workers=workers).threads,
             progress,
-            overwrite=overwrite,
             outputs=outputs,
             dry_run=dry_run,
         )
@@ -365,15 +366,6 @@ def _used(
         first = next(iter(left_out.values()))
         raise InputError(f"{saved.path}: none of its images can be used; {first.images[0]}: {first.text}")
     return dict(zip(used, with_masks(list(used.values()), mask), strict=True))
-
-
-def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sidecar: Path) -> None:
-    """Find out before long work whether the image and its sidecar can be written."""
-    beside = Path(f"{output}.json")
-    if beside.exists() and beside.samefile(sidecar):
-        raise OutputError(f"{output}: its sidecar is the one that is applied; choose another name")
-    check_output(output, overwrite, inputs)
-    check_output(beside, overwrite, inputs, suffixes=())
 
 
 def _sources(
