@@ -114,7 +114,9 @@ class Source:
     def _load(self, reduction: int) -> DecodedImage:
         """The pixels from the file, masked."""
         array = None if self.frame is None else self.frame.image
-        if array is None:
+        if self.frame is not None and self.frame.load is not None:
+            image = reduced(self.frame.load(), reduction)
+        elif array is None:
             with held_in_memory(self.path), self.guard.reading(self.path):
                 image = read_image(self.path, reduction, self.metadata)
         else:
@@ -168,7 +170,7 @@ def read_sources(
         path = frame.path
         try:
             key = path.resolve()
-            metadata = read_metadata(path) if frame.image is None else frame.image.metadata
+            metadata = frame.metadata or (read_metadata(path) if frame.image is None else frame.image.metadata)
             _check_memory(path, metadata, max_memory)
         except (InputError, LimitError, OSError, RuntimeError) as error:
             reason = error if isinstance(error, RdstitchError) else InputError(f"{path}: cannot be read: {error}")

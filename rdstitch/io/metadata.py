@@ -50,7 +50,7 @@ _OF_WHOM = {
     for name in ("Make", "Model", "Artist", "Copyright", "DateTime", "Software", "ImageDescription", "Orientation")
 }
 # What units of length count.
-_MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
+MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _XMP, _PROFILE, _RESOLUTION, _RESOLUTION_UNIT = 700, 34675, (282, 283), 296
 _INCHES = {2: 1.0, 3: 2.54}  # what pixels per unit are multiplied by
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
@@ -111,6 +111,7 @@ class Metadata:
     profile_lost: str = ""  # why the file's colour profile is not kept; empty where it is, or where there is none
     channels: int = 3  # samples per pixel, with alpha
     pixel_size: float | None = None  # micrometres, where OME-XML says it
+    channel_names: tuple[str, ...] = ()  # where OME-XML or Micro-Manager say them
     planes: bool = False  # whether the channels are those of a microscope, on pages of their own, and no colours
 
     @property
@@ -401,11 +402,11 @@ def read_ome(text: str | None) -> OmeImage | None:
     counts = [int(pixels.get(f"Size{axis}", 1)) for axis in "CZT"]
     samples = [int(e.get("SamplesPerPixel", 1)) for e in pixels.iter() if e.tag.rpartition("}")[2] == "Channel"]
     apart = len(images) == 1 and counts[1:] == [1, 1] and all(count == 1 for count in samples)
-    size, scale = pixels.get("PhysicalSizeX"), _MICROMETRES.get(pixels.get("PhysicalSizeXUnit", "µm"))
+    size, scale = pixels.get("PhysicalSizeX"), MICROMETRES.get(pixels.get("PhysicalSizeXUnit", "µm"))
     return OmeImage(
         counts[0] if apart else 1,
         float(size) * scale if size and scale else None,
         None if plane is None else (float(plane.attrib["PositionX"]), float(plane.attrib["PositionY"])),
         # What programs write that do not know the unit counts pixels.
-        None if plane is None else _MICROMETRES.get(plane.get("PositionXUnit", "µm")),
+        None if plane is None else MICROMETRES.get(plane.get("PositionXUnit", "µm")),
     )

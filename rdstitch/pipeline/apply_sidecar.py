@@ -346,7 +346,8 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens
         ],
         saved.turned,
         saved.place,
-        saved.orientation,
+        whole=saved.content.get("stage") is not None,
+        orientation=saved.orientation,
     )
 
 

@@ -81,6 +81,7 @@ class PlacedImages:
     # whether the camera turned on the spot, so that the homographies lead to directions, not to a plane
     turned: bool = False
     place: Georeference | None = None  # of the plane, where it is known from an earlier run
+    whole: bool = False  # whether nothing of them can be static: tiles on a stage, whose ground may be black
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
     # pixels that the output is made on, as of an earlier run: from the plane (3, 3), their size, and their place
@@ -98,6 +99,7 @@ class PlacedImages:
             int(np.flatnonzero(used == alignment.reference)[0]),
             displacements,
             alignment.on_sphere,
+            whole=registration.tiles is not None,
         )
 
     @cached_property
@@ -107,7 +109,7 @@ class PlacedImages:
         A few images of the commonest size are compared, reduced; those of other sizes count as a whole.
         """
         size, count = Counter(camera.image_size for camera in self.cameras).most_common(1)[0]
-        if count < MIN_IMAGES:
+        if self.whole or count < MIN_IMAGES:
             return None
         alike = [s for s, camera in zip(self.sources, self.cameras, strict=True) if camera.image_size == size]
         chosen = np.linspace(0, count - 1, min(count, _COMPARED)).astype(np.intp).tolist()
