@@ -150,7 +150,16 @@ class PlacedImages:
                 for reader, camera in zip(read, self.cameras, strict=True)
             ]
         return [
-            PlacedImage(reader, camera, matrix, reader, source.metadata.exposure, displacement, str(source.path))
+            PlacedImage(
+                reader,
+                camera,
+                matrix,
+                reader,
+                source.metadata.exposure,
+                displacement,
+                str(source.path),
+                source.metadata.channels in (3, 4),
+            )
             for reader, camera, matrix, source, displacement in zip(
                 read,
                 self.cameras,
