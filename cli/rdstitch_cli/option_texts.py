@@ -68,6 +68,8 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 --timestamps FILE: Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; otherwise those of
     the video, bag or EXIF.
 # Camera
+tiles --lambda L|auto: Known λ (half-diagonal frame), or auto: estimate it; otherwise 0 unless all
+    overlaps show it.
 * --lambda L: Known λ (half-diagonal frame); it is not estimated.
 --lens: Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient.
 --tilt: Known tilt of the camera, degrees.

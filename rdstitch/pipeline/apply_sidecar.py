@@ -291,7 +291,8 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImage
         ],
         saved.turned,
         saved.place,
-        saved.orientation,
+        whole=saved.content.get("stage") is not None,
+        orientation=saved.orientation,
     )
 
 

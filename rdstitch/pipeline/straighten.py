@@ -2,9 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
-import cv2
 import numpy as np
 
 from rdstitch.arrays import FloatArray
@@ -20,17 +18,15 @@ from rdstitch.compositing.upright import (
     to_axes,
 )
 from rdstitch.errors import ArgumentError
-from rdstitch.features.prepared_image import prepare
+from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.messages import Message
 
-_MEGAPIXELS = 0.6  # of the images that edges are found in
 _MAX_IMAGES = 40
 _MIN_LENGTH = 0.03  # of an edge, half diagonals
 _POINTING = 2.0  # pixels: how well people point at places
 _DETECTION = 0.3  # pixels: how well the detector does
-_CLEARANCE = 3.0  # pixels that an edge keeps from what is masked
 _SURE = 0.01  # relative standard deviation of an aspect ratio that needs no warning
 _STEEP = math.cos(math.radians(30.0))  # a camera that looks nearer to straight up or down shows nothing upright
 
@@ -123,21 +119,17 @@ def _in_reference(placed: PlacedImages, points: FloatArray) -> FloatArray:
 
 
 def _edges(placed: PlacedImages) -> Edges:
-    """Straight edges in the images, by the line segment detector of Grompone von Gioi et al. (2010)."""
+    """Straight edges in the images."""
     assert placed.reference is not None
     to_reference = np.linalg.inv(placed.homographies[placed.reference]) @ placed.homographies
-    detector = cv2.createLineSegmentDetector()
     segments, error = [], 0.0
     count = len(placed.sources)
     for k in np.unique(np.linspace(0, count - 1, min(count, _MAX_IMAGES)).astype(np.intp)).tolist():
-        camera, image = placed.cameras[k], prepare(placed.sources[k].view(_MEGAPIXELS), _MEGAPIXELS)
-        lines: Any = detector.detect(image.grey)[0]
-        ends = np.reshape(np.empty(0) if lines is None else lines, (-1, 2)).astype(np.float64)
-        clear = image.covers(ends, np.full(len(ends), _CLEARANCE)).reshape(-1, 2).all(axis=1)
-        flat = camera.normalize(camera.undistort(image.to_full_size(ends))).reshape(-1, 2, 2)[clear]
+        camera, (ends, pixel) = placed.cameras[k], line_segments(placed.sources[k].view(MEGAPIXELS))
+        flat = camera.normalize(camera.undistort(ends.reshape(-1, 2))).reshape(-1, 2, 2)
         flat = flat[np.linalg.norm(flat[:, 1] - flat[:, 0], axis=1) > _MIN_LENGTH]
         segments.append(np.concatenate([flat, np.ones((len(flat), 2, 1))], axis=2) @ to_reference[k].T)
-        error = max(error, _DETECTION * float(image.factor.max()) / camera.scale)
+        error = max(error, _DETECTION * pixel / camera.scale)
     return _between(placed, np.concatenate(segments), error)
 
 

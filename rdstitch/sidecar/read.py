@@ -236,6 +236,7 @@ class TileRecord(Struct):
     row: Count
     column: Count
     placed_by: Literal["overlap", "stage"]
+    std_px: NonNegative = 0.0
 
 
 class StageRecord(Struct):
@@ -246,8 +247,8 @@ class StageRecord(Struct):
     matrix: tuple[Pair, Pair]
     rows_px: list[Pair]
     columns_px: list[Pair]
-    row_std_px: NonNegative
-    column_std_px: NonNegative
+    row_std_px: NonNegative | None
+    column_std_px: NonNegative | None
     tile_std_px: NonNegative
     tiles: list[TileRecord]
 

@@ -169,7 +169,9 @@ def _stage(registration: Registration) -> dict[str, Any] | None:
     if registration.tiles is None:
         return None
     grid, model = registration.tiles.grid, registration.tiles.adjustment.stage
-    lines = zip(registration.sources, grid.rows, grid.columns, registration.tiles.linked, strict=True)
+    # Whole pixels are another source of error.
+    stds = np.hypot(registration.tiles.stds, 0.0 if registration.alignment.distortion else math.sqrt(1.0 / 12.0))
+    lines = zip(registration.sources, grid.rows, grid.columns, registration.tiles.linked, stds, strict=True)
     return {
         "source": grid.source,
         "pixel_um": grid.pixel_size,
@@ -180,8 +182,14 @@ def _stage(registration: Registration) -> dict[str, Any] | None:
         "column_std_px": model.column_std,
         "tile_std_px": model.std,
         "tiles": [
-            {"name": source.name, "row": row, "column": column, "placed_by": "overlap" if linked else "stage"}
-            for source, row, column, linked in lines
+            {
+                "name": source.name,
+                "row": row,
+                "column": column,
+                "placed_by": "overlap" if linked else "stage",
+                "std_px": std,
+            }
+            for source, row, column, linked, std in lines
         ],
     }
 
