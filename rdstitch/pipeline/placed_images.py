@@ -84,6 +84,8 @@ class PlacedImages:
     whole: bool = False  # whether nothing of them can be static: tiles on a stage, whose ground may be black
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
+    # pixels that the output is made on, as of an earlier run: from the plane (3, 3), their size, and their place
+    grid: tuple[FloatArray, tuple[int, int], Georeference | None] | None = None
 
     @classmethod
     def of(cls, registration: Registration, displacements: Sequence[Displacement | None] | None) -> Self:
@@ -186,6 +188,8 @@ def _read_near(read: Callable[..., DecodedImage], part: NearPart, reduction: int
 def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
     """The canvas of the images, no larger than ``options.max_size``."""
     canvas = _plan(placed, options, options.scale)
+    if placed.grid is not None:
+        return canvas.on_grid(*placed.grid[:2])
     if options.max_size is None or max(canvas.size) <= options.max_size:
         return canvas
     # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.
