@@ -14,6 +14,7 @@ from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import CONTRADICTS, Alignment, PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.alignment.unaligned import explain_unaligned
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import PlanarMotion
@@ -222,6 +223,25 @@ def test_the_reference_image_is_the_frame() -> None:
     np.testing.assert_allclose(found.homographies[4], np.eye(3), atol=1e-12)
     rigid = _run(given, model="rigid", reference=4)
     np.testing.assert_allclose([rigid.poses.yaw[4], *rigid.poses.position[4], rigid.poses.height[4]], [0, 0, 0, 1])
+
+
+def test_a_reduced_image_is_the_reference_only_where_it_is_named() -> None:
+    given = scene(grid(3, 1, (0.4, 0.3), 0.2, np.random.default_rng(13)), rng=np.random.default_rng(14))
+    middle = _run(given, model="similarity").reference
+    small = given.cameras[middle].resized((320, 240))
+    cameras = [small if k == middle else camera for k, camera in enumerate(given.cameras)]
+    links = []
+    for link in given.links:
+        ends: dict[str, FloatArray] = {}
+        for name, image in (("1", link.image1), ("2", link.image2)):
+            if image == middle:
+                points = getattr(link, f"points{name}")
+                ends |= {f"points{name}": (points + 0.5) / 2.0 - 0.5}
+        links.append(replace(link, **ends))
+    reduced = replace(given, cameras=cameras, links=links)
+    assert middle == 1
+    assert _run(reduced, model="similarity").reference in (0, 2)
+    assert _run(reduced, model="similarity", reference=middle).reference == middle
 
 
 def test_any_image_can_become_the_frame_after_the_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
