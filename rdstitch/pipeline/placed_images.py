@@ -81,8 +81,11 @@ class PlacedImages:
     # whether the camera turned on the spot, so that the homographies lead to directions, not to a plane
     turned: bool = False
     place: Georeference | None = None  # of the plane, where it is known from an earlier run
+    whole: bool = False  # whether nothing of them can be static: tiles on a stage, whose ground may be black
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
+    # pixels that the output is made on, as of an earlier run: from the plane (3, 3), their size, and their place
+    grid: tuple[FloatArray, tuple[int, int], Georeference | None] | None = None
 
     @classmethod
     def of(cls, registration: Registration, displacements: Sequence[Displacement | None] | None) -> Self:
@@ -96,6 +99,7 @@ class PlacedImages:
             int(np.flatnonzero(used == alignment.reference)[0]),
             displacements,
             alignment.on_sphere,
+            whole=registration.tiles is not None,
         )
 
     @cached_property
@@ -105,7 +109,7 @@ class PlacedImages:
         A few images of the commonest size are compared, reduced; those of other sizes count as a whole.
         """
         size, count = Counter(camera.image_size for camera in self.cameras).most_common(1)[0]
-        if count < MIN_IMAGES:
+        if self.whole or count < MIN_IMAGES:
             return None
         alike = [s for s, camera in zip(self.sources, self.cameras, strict=True) if camera.image_size == size]
         chosen = np.linspace(0, count - 1, min(count, _COMPARED)).astype(np.intp).tolist()
@@ -146,7 +150,16 @@ class PlacedImages:
                 for reader, camera in zip(read, self.cameras, strict=True)
             ]
         return [
-            PlacedImage(reader, camera, matrix, reader, source.metadata.exposure, displacement, str(source.path))
+            PlacedImage(
+                reader,
+                camera,
+                matrix,
+                reader,
+                source.metadata.exposure,
+                displacement,
+                str(source.path),
+                source.metadata.channels in (3, 4),
+            )
             for reader, camera, matrix, source, displacement in zip(
                 read,
                 self.cameras,
@@ -175,6 +188,8 @@ def _read_near(read: Callable[..., DecodedImage], part: NearPart, reduction: int
 def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
     """The canvas of the images, no larger than ``options.max_size``."""
     canvas = _plan(placed, options, options.scale)
+    if placed.grid is not None:
+        return canvas.on_grid(*placed.grid[:2])
     if options.max_size is None or max(canvas.size) <= options.max_size:
         return canvas
     # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.

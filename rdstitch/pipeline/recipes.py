@@ -405,13 +405,14 @@ def _accepted(
     purpose: Purpose,
     beside: FilesBeside = NOTHING_BESIDE,
 ) -> Registration:
-    """Register and check, with what is known of the inputs already; a failure names those that could not be read."""
+    """Register and check, with what is known of the inputs already; a failure names what could not be read well."""
     try:
         registration = register(sources, options, executor, purpose=purpose, progress=progress)
         return accept(registration.with_messages(known), options, purpose)
     except RegistrationError as error:
-        unread = [str(replace(message, code="")) for message in told_once(known) if message.severity == "left out"]
-        error.args = ("; ".join([str(error), *unread]),)
+        unread = [message for message in known if message.severity == "left out"]
+        told = [str(replace(message, code="")) for message in told_once([*unread, *sources[0].guard.complaints])]
+        error.args = ("; ".join([str(error), *told]),)
         if isinstance(error, RefusedError):
             beside.explain(error.registration)
         raise

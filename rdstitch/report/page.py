@@ -279,13 +279,14 @@ def stage(registration: Registration) -> str:
     model, grid = tiled.adjustment.stage, tiled.grid
     turn = math.degrees(math.atan2(model.matrix[1, 0] - model.matrix[0, 1], np.trace(model.matrix)))
     x, y = backlash(model.rows)
+    stds = (("rows", model.row_std), ("columns", model.column_std), ("tiles", model.std))
     rows = [
         ("places", grid.source),
         ("tiles placed by overlaps", f"{int(tiled.linked.sum())} of {len(grid)}"),
         ("groups of tiles", str(len(tiled.groups))),
         ("camera against the stage", f"{turn:.3f}°, scale {math.sqrt(abs(np.linalg.det(model.matrix))):.5f}"),
         ("backlash of rows", f"{x:.2f}, {y:.2f} pixels, every other row against the rest"),
-        ("scatter", f"rows {model.row_std:.2f}, columns {model.column_std:.2f}, tiles {model.std:.2f} pixels"),
+        ("scatter", ", ".join(f"{what} {std:.2f}" for what, std in stds if std is not None) + " pixels"),
     ]
     if grid.pixel_size is not None:
         rows.append(("pixel", f"{grid.pixel_size:g} µm"))
