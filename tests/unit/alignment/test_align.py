@@ -14,7 +14,6 @@ from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import CONTRADICTS, Alignment, PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.alignment.unaligned import explain_unaligned
-from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import PlanarMotion
@@ -230,14 +229,15 @@ def test_a_reduced_image_is_the_reference_only_where_it_is_named() -> None:
     middle = _run(given, model="similarity").reference
     small = given.cameras[middle].resized((320, 240))
     cameras = [small if k == middle else camera for k, camera in enumerate(given.cameras)]
-    links = []
-    for link in given.links:
-        ends: dict[str, FloatArray] = {}
-        for name, image in (("1", link.image1), ("2", link.image2)):
-            if image == middle:
-                points = getattr(link, f"points{name}")
-                ends |= {f"points{name}": (points + 0.5) / 2.0 - 0.5}
-        links.append(replace(link, **ends))
+    half = {True: 0.5, False: 1.0}
+    links = [
+        replace(
+            link,
+            points1=(link.points1 + 0.5) * half[link.image1 == middle] - 0.5,
+            points2=(link.points2 + 0.5) * half[link.image2 == middle] - 0.5,
+        )
+        for link in given.links
+    ]
     reduced = replace(given, cameras=cameras, links=links)
     assert middle == 1
     assert _run(reduced, model="similarity").reference in (0, 2)
