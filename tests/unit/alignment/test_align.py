@@ -164,7 +164,7 @@ def test_images_without_connection_are_named() -> None:
         for message in explain_unaligned(found, [f"{k}.png" for k in range(9)], [900] * 9, {})
     }
     assert list(reasons) == [("6.png",), ("7.png",), ("8.png",)]
-    assert reasons["6.png",].startswith("in block 2 of 2, whose 2 images overlap with none of the others")
+    assert reasons["6.png",].startswith("in block 2 of 2, whose 2 images overlap too little with the others")
     assert reasons["7.png",] == reasons["6.png",]
     assert "no reliable overlap" in reasons["8.png",]
     blurred = explain_unaligned(found, [f"{k}.png" for k in range(9)], [900] * 8 + [290], {})
