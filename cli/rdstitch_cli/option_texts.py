@@ -25,7 +25,7 @@ _TABLE = """
     estimated.
 * --focal PX: Focal length, pixels; otherwise from EXIF, or a guess.
 * --mask DIR|FILE: Mask whose black pixels are excluded: a folder of masks with the images' names, or one file for all.
-* --scale: Scale of the output; 1 keeps the resolution of the reference image.
+* --scale: Scale of the output; 1 keeps the resolution of the reference image, one of the largest.
 * --report FILE: Write a report to FILE (.html): graph, votes on λ, matches, residuals.
 trajectory --format: csv: a table with names, time stamps, x, y, yaw_deg, height and their covariances. tum: time,
     position and quaternion. kitti: matrices.
