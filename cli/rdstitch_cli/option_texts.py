@@ -46,6 +46,7 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 * tiles --positions FILE: CSV with name,x,y (pixels) or name,x_um,y_um; otherwise what OME-TIFF or Micro-Manager say.
 --positions-offset S: Seconds from the times of the images to those of the GPX track (UTC).
 --gcp FILE: Ground control points, as OpenDroneMap's gcp_list.txt; they place the output on the Earth.
+--check-points FILE: Points like those of --gcp that are compared with the map, and take no part in it.
 * --positions-only FILE: Write the places of the tiles to this CSV file; without --output nothing is composed.
 * --pixel-size UM: Pixel size, micrometres, if no file states it.
 * --search PX: Search radius around the nominal offset of neighbours.  [default: 5 % of a tile's side]
@@ -91,6 +92,8 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 * --gsd M: Ground sample distance, metres; instead of --scale.
 --crs: Coordinate system of the map, and of x and y in --positions; otherwise UTM on WGS 84. All but UTM need
     rasterio.
+--georeference: Place the output where positions or control points agree with the images, also where these contradict
+    them (force), or never.
 --north-up/--no-north-up: Turn north up where three images or more have a GPS position that fits.  [default: north up]
 --rotate DEG: Turn the output clockwise, degrees; north is then not turned up.
 --straighten off|auto|LINES: Make horizontal and vertical edges of the scene so in the output. auto: edges detected in
@@ -101,7 +104,7 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 --yaw DEG: Turn the view of a panorama to the right, before it is projected.
 --pitch DEG: Turn the view of a panorama up, before it is projected.
 --roll DEG: Turn the view of a panorama clockwise, before it is projected.
-* --crop/--no-crop: Crop to the largest rectangle without holes.
+* --crop/--no-crop: Crop to --rectangle, otherwise to the largest rectangle without holes.
 --projection: Projection of images taken by turning on the spot.
 --max-stretch N: Leave out what an oblique image shows N times coarser than the reference image.
 * --max-size N: Longest side of the output, pixels; --scale is reduced to fit.

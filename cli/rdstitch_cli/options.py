@@ -111,6 +111,7 @@ known = together(
     option("--tilt", ANGLES),
     option("--attitude", FileOr("xmp")),
     option("--attitude-std", ANGLE, "1"),
+    option("--timestamps", IMAGE),
     option("--positions", IMAGE),
     option("--positions-offset", RealNumber(), 0.0),
 )
@@ -167,6 +168,7 @@ compositing = together(
     option("--north-up/--no-north-up", default=True),
     option("--gsd", RealNumber()),
     option("--crs", EPSG, dest="epsg"),
+    option("--georeference", ("auto", "force", "off"), "auto"),
 )
 
 # What every command that registers images takes, and what those take that also compose them.
@@ -178,6 +180,7 @@ stitching = together(
     option("--local-alignment", word_or_number(("auto", "off"), 2, 100), "auto"),
     compositing,
     option("--gcp", IMAGE),
+    option("--check-points", IMAGE),
     option("--layers", IMAGE),
     option("--whole-layers", bool),
     option("--hugin-project", IMAGE),

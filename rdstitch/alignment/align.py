@@ -13,10 +13,10 @@ from rdstitch.alignment.adjustment_problem import (
     thin_for_selection,
 )
 from rdstitch.alignment.alignment_options import AlignmentOptions
-from rdstitch.alignment.attitude_check import check_attitudes
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
+from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, noise_of_links
 from rdstitch.alignment.observations import Observations
@@ -92,7 +92,7 @@ class AlignmentTask:
     @cached_property
     def result(self) -> Alignment:
         """Adjusted to all matches."""
-        return build_alignment(_adjusted(self._chosen))
+        return build_alignment(_checked_focal(_adjusted(self._chosen)))
 
     @cached_property
     def _chosen(self) -> AdjustedImages:
@@ -187,6 +187,23 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         covariance=covariance,
         lens_covariance=of_lens,
     )
+
+
+def _checked_focal(told: AdjustedImages) -> AdjustedImages:
+    """Without the focal length that was given, where it gave way and the images by themselves show another one."""
+    if told.covariance is None or not is_strained(told.whole.camera_priors, told.choice.fit):
+        return told
+    cameras = [replace(camera, focal=None, focal_std=None, focal_source=None).with_focal() for camera in told.cameras]
+    # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
+    options = told.options if told.options.attitudes is not None else replace(told.options, tilt=None)
+    shown = _adjusted(_chosen(cameras, told.links, options))
+    camera = told.cameras[shown.images[0]]
+    doubt = check_focal(camera, shown.choice.fit, shown.covariance)
+    if doubt is None:
+        return told
+    if options != told.options:
+        shown = _adjusted(_chosen(cameras, told.links, told.options))
+    return replace(shown, messages=(*shown.messages, doubt))
 
 
 def most_matches_read(links: int, options: AlignmentOptions) -> int | None:

@@ -32,7 +32,16 @@ from rdstitch.system.file_access import read_text
 from rdstitch.system.outputs import json_bytes, text_bytes, write_bytes_atomic
 from rdstitch.system.records import convert, parse_json, parse_yaml
 
-__all__ = ["CAMERA_SUFFIXES", "CameraFile", "LensFit", "export_note", "load_camera", "read_camera_file", "save_camera"]
+__all__ = [
+    "CAMERA_SUFFIXES",
+    "CameraFile",
+    "LensFit",
+    "camera_of_content",
+    "export_note",
+    "load_camera",
+    "read_camera_file",
+    "save_camera",
+]
 
 Value = TypeVar("Value")
 
@@ -83,6 +92,14 @@ def read_camera_file(path: str | Path, image_size: formats.ImageSize | None = No
         if cameras := formats.colmap_cameras(text):
             return formats.read_colmap(_only(cameras), file)
         return _of_content(parse_yaml(text, file), file, image_size)
+    except ArgumentError as error:
+        raise InputError(f"{file}: {error}") from error
+
+
+def camera_of_content(content: dict[str, Any], file: str) -> CameraFile:
+    """The camera of a message of ROS, as plain values, to which λ is fitted."""
+    try:
+        return _of_content(content, file, None)
     except ArgumentError as error:
         raise InputError(f"{file}: {error}") from error
 

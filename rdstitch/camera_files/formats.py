@@ -12,9 +12,10 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from rdstitch.camera_files.lens_models import CameraFile, LensFit, LensModel, fitted_lens, nearest_model
+from rdstitch.camera_files.lens_models import CameraFile, LensFit, fitted_camera, nearest_model
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.lens_model import LensKind, LensModel
 from rdstitch.system.records import Count, Side, Size, convert
 
 OWN, OWN_COMMENT = "rdstitch", "#rdstitch "
@@ -24,12 +25,12 @@ ImageSize = Callable[[], tuple[int, int]]
 """Gives width and height, pixels, where a file does not say them."""
 
 _ALIASES = {
-    **dict.fromkeys(("cameraMatrix", "Camera_Matrix", "K"), "camera_matrix"),
-    **dict.fromkeys(("distCoeffs", "dist_coeffs", "Distortion_Coefficients", "D"), "distortion_coefficients"),
-    "image_Width": "image_width",
-    "image_Height": "image_height",
+    **dict.fromkeys(("cameraMatrix", "Camera_Matrix", "K", "k"), "camera_matrix"),
+    **dict.fromkeys(("distCoeffs", "dist_coeffs", "Distortion_Coefficients", "D", "d"), "distortion_coefficients"),
+    **dict.fromkeys(("image_Width", "width"), "image_width"),
+    **dict.fromkeys(("image_Height", "height"), "image_height"),
 }
-"""Names in files of OpenCV's samples and of ROS, and what OpenCV's calibration calls the same."""
+"""Names in files of OpenCV's samples and in messages of ROS 1 and 2, and what OpenCV's calibration calls the same."""
 
 _WIDE = 0.9  # half diagonals in focal lengths: fisheyes begin there, at 84 degrees by the usual model
 _ASYMMETRIC, _TIMES_CLOSER = 0.005, 4.0  # half diagonals off every symmetric lens, and times the fisheye's error
@@ -129,6 +130,9 @@ def read_opencv(content: dict[str, Any], file: str, image_size: ImageSize | None
     are Brown's, unless they clearly make a fisheye.
     """
     named = {_ALIASES.get(name, name): value for name, value in content.items()}
+    for name, rows in (("camera_matrix", 3), ("distortion_coefficients", 1)):
+        if isinstance(values := named.get(name), list):  # as ``ros2 topic echo`` prints them
+            named[name] = {"rows": rows, "cols": len(values) // rows, "data": values}
     record = convert(named, _OpenCV, file, strict=False)
     matrix, k = record.camera_matrix, tuple(record.distortion_coefficients.data)
     if (matrix.rows, matrix.cols) != (3, 3):
@@ -139,8 +143,8 @@ def read_opencv(content: dict[str, Any], file: str, image_size: ImageSize | None
     size = _size(record, (cx, cy), image_size)
 
     def read(*, fisheye: bool) -> CameraFile:
-        lens = LensModel((fx, fy), (cx, cy), k if fisheye else k[:8], fisheye)
-        return fitted_lens(lens, "OpenCV", size, "distortion_coefficients: ")
+        lens = LensModel((fx, fy), (cx, cy), k if fisheye else k[:8], _kind(fisheye))
+        return fitted_camera(lens, "OpenCV", size, "distortion_coefficients: ")
 
     if record.is_fisheye:
         if len(k) != 4:
@@ -163,6 +167,11 @@ def read_opencv(content: dict[str, Any], file: str, image_size: ImageSize | None
             'are that, add "fisheye_model: 1", else "distortion_model: plumb_bob"'
         )
     return brown
+
+
+def _kind(fisheye: bool) -> LensKind:
+    """The word for a model of OpenCV."""
+    return "fisheye" if fisheye else "brown"
 
 
 def _is_rather(fisheye: CameraFile, brown: CameraFile) -> bool:
@@ -200,7 +209,7 @@ def read_opendronemap(entry: Any, file: str, name: str) -> CameraFile:
     fisheye = record.projection_type == "fisheye_opencv"
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     k = tuple(getattr(record, name) for name in names)
-    return fitted_lens(LensModel(focal, center, k, fisheye), "OpenDroneMap", size)
+    return fitted_camera(LensModel(focal, center, k, _kind(fisheye)), "OpenDroneMap", size)
 
 
 def read_kalibr(entry: Any, file: str, name: str) -> CameraFile:
@@ -208,8 +217,8 @@ def read_kalibr(entry: Any, file: str, name: str) -> CameraFile:
     record = convert(entry, _Kalibr, file, name, strict=False)
     k = () if record.distortion_model == "none" else tuple(record.distortion_coeffs)
     fx, fy, cx, cy = record.intrinsics
-    lens = LensModel((fx, fy), (cx, cy), k, record.distortion_model == "equi")
-    return fitted_lens(lens, "Kalibr", record.resolution)
+    lens = LensModel((fx, fy), (cx, cy), k, _kind(record.distortion_model == "equi"))
+    return fitted_camera(lens, "Kalibr", record.resolution)
 
 
 def colmap_cameras(text: str) -> list[tuple[str, ...]]:
@@ -231,8 +240,8 @@ def read_colmap(camera: Sequence[str], file: str) -> CameraFile:
     size = convert((width, height), tuple[int, int], file, "SIZE", strict=False)
     # COLMAP's pixels have their centres at halves.
     focal, center = (values[0], values[focals - 1]), (values[focals] - 0.5, values[focals + 1] - 0.5)
-    lens = LensModel(focal, center, tuple(values[focals + 2 :]), "FISHEYE" in model)
-    return fitted_lens(lens, "COLMAP", size)
+    lens = LensModel(focal, center, tuple(values[focals + 2 :]), _kind("FISHEYE" in model))
+    return fitted_camera(lens, "COLMAP", size)
 
 
 def opencv_text(camera: Camera, *, yaml: bool = True, fisheye: bool = False) -> str:

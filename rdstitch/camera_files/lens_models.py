@@ -1,12 +1,12 @@
 """Lens models of others, Brown's polynomial and Kannala and Brandt's fisheye: the nearest to a camera, and back.
 
-Every model is a *forward* map: pixels of a lens without distortion to measured pixels. It is fitted to a camera, and
-the division model to it, by least squares over the image, and what that costs in pixels is stated. The division model
-has λ alone where that is enough, else μ too, else ν too.
+A lens model is fitted to a camera, and the division model to it, by least squares over the image, and what that costs
+in pixels is stated. The division model has λ alone where that is enough, else μ too, else ν too; what is left goes with
+the camera, whose images are resampled by it.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -14,17 +14,17 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera, points_over
+from rdstitch.geometry.lens_model import LensKind, LensModel
 
 _GRID = 65  # points along each side of the image that models are fitted at
 _RATIONAL_STEPS = 12
-_NEWTON_STEPS, _NEWTON_TOLERANCE = 20, 1e-10
 
 Forward = Callable[[FloatArray], FloatArray]
 
 _STEPS = 8
 _MAX_ERROR = 0.1  # half diagonals: then the file is no lens of these images
 _RAYS, _SAMPLES, _REACH = 64, 1200, 8.0  # where other models are looked at: directions, steps, half diagonals
-_SQUARE = 0.005  # calibrations give focal lengths along x and y that differ by less
+_RESOLVED = 1.0 / 32.0  # pixels: what OpenCV resamples images to
 
 CLOSE = 0.1
 """Pixels: a model that is nowhere farther from a lens needs no better one in its place."""
@@ -36,69 +36,6 @@ class LensFit:
 
     rms: float  # rms, largest: of the distances between the pixels that both models give, over the whole image, pixels
     largest: float
-
-
-@dataclass(frozen=True)
-class LensModel:
-    """A lens as OpenCV has it: Brown's model, with its rational denominator, or the one of ``cv2.fisheye``."""
-
-    focal: tuple[float, float]  # along x and y, pixels
-    center: tuple[float, float]  # pixels
-    # in OpenCV's order: up to 8 of k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye up to 4 of k1, k2, k3, k4, for which a
-    # ray at angle θ from the axis is measured ``f (θ + k1 θ³ + k2 θ⁵ + k3 θ⁷ + k4 θ⁹)`` from the centre
-    coefficients: tuple[float, ...]
-    fisheye: bool = False
-
-    @property
-    def mean_focal(self) -> float:
-        """One focal length for both directions, pixels."""
-        return float(np.sqrt(self.focal[0] * self.focal[1]))
-
-    def distort(self, points: FloatArray) -> FloatArray:
-        """Map pixels (..., 2) of a lens without distortion and with square pixels to measured pixels.
-
-        Beyond the radius at which Brown's polynomial folds, the result has no meaning.
-        """
-        return self._bend((points - self.center) / self.mean_focal) * self.focal + self.center
-
-    def undistort(self, points: FloatArray) -> FloatArray:
-        """Invert :meth:`distort` of Brown's model by Newton's method; NaN where the polynomial folds on the way."""
-        target = (points - self.center) / self.focal
-        x, step = target.copy(), 1e-30
-        for _ in range(_NEWTON_STEPS):
-            # Derivatives are the imaginary parts: the model is analytic.
-            a, c = np.moveaxis(self._bend(x + np.array([1j * step, 0.0])).imag / step, -1, 0)
-            b, d = np.moveaxis(self._bend(x + np.array([0.0, 1j * step])).imag / step, -1, 0)
-            determinant = a * d - b * c
-            ex, ey = np.moveaxis(target - self._bend(x), -1, 0) / np.where(determinant > 0.0, determinant, np.nan)
-            move = np.stack([d * ex - b * ey, a * ey - c * ex], axis=-1)
-            x = x + move
-            if not np.nanmax(np.abs(move), initial=0.0) > _NEWTON_TOLERANCE:
-                break
-        return x * self.mean_focal + self.center
-
-    def _bend(self, points: FloatArray) -> FloatArray:
-        """Undistorted points (..., 2) to measured ones, both in focal lengths; Brown's also for complex numbers."""
-        if self.fisheye:
-            radius = np.linalg.norm(points, axis=-1, keepdims=True)
-            angle = np.arctan(radius)
-            bent = angle * _series(self.coefficients, angle**2)
-            bent = np.where(radius > 0.0, bent / np.maximum(radius, 1e-300), 1.0)
-            return np.asarray(points * bent)
-        k1, k2, p1, p2, k3, *below = (*self.coefficients, *[0.0] * (8 - len(self.coefficients)))
-        x, y = np.moveaxis(points, -1, 0)
-        r2 = x * x + y * y
-        ratio = _series((k1, k2, k3), r2) / _series(below, r2)
-        tangential = [2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y]
-        return np.asarray(points * ratio[..., None] + np.stack(tangential, axis=-1))
-
-
-def _series(coefficients: Sequence[float], squares: FloatArray) -> FloatArray:
-    """``1 + c1 s + c2 s² + …``."""
-    total = np.zeros_like(squares)
-    for coefficient in reversed(coefficients):
-        total = (total + coefficient) * squares
-    return 1.0 + total
 
 
 def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
@@ -176,7 +113,8 @@ def nearest_model(camera: Camera, *models: str, close: float = CLOSE) -> tuple[L
         start = np.arctan(samples.straight) if model == "fisheye" else samples.straight
         numbers, error = samples.fit(start, start[:, None] ** np.array(powers)) if powers else samples.fit_rational()
         coefficients = tuple(0.0 if place is None else float(numbers[place]) for place in places)
-        fits.append((LensModel((samples.focal,) * 2, camera.center, coefficients, model == "fisheye"), error))
+        kind: LensKind = "fisheye" if model == "fisheye" else "brown"
+        fits.append((LensModel((samples.focal,) * 2, camera.center, coefficients, kind), error))
         if error.largest <= close:
             break
     return min(fits, key=lambda one: one[1].largest)
@@ -188,37 +126,21 @@ class CameraFile:
 
     camera: Camera
     kind: str  # whose format it is: "rdstitch", "OpenCV", "COLMAP", "Kalibr", "OpenDroneMap", "Hugin" or "lensfun"
-    fit: LensFit | None = None  # how well λ agrees with the file's own lens model; None where the file gives λ itself
-    cause: str = ""  # what of the file's model λ cannot describe; empty where it is only the curve of the lens
+    # how well the division model agrees with the file's own lens model, which stays with the camera where that is not
+    # exactly; None where the file gives λ itself
+    fit: LensFit | None = None
 
 
-def fitted_camera(
-    forward: Forward,
-    kind: str,
-    size: tuple[int, int],
-    center: tuple[float, float],
-    focal: float,
-    field: str = "",
-    cause: str = "",
-) -> CameraFile:
-    """Fit λ to the lens model of a file."""
-    camera = Camera(size, center=center, focal=focal, focal_source="file")
-    try:
-        lens, fit = fit_lens(forward, camera)
-    except ArgumentError as error:
-        raise ArgumentError(f"{field}{error}{cause and f'; {cause}'}") from error
-    return CameraFile(lens, kind, fit, cause)
-
-
-def fitted_lens(lens: LensModel, kind: str, size: tuple[int, int], field: str = "") -> CameraFile:
-    """Fit λ to a lens model that several formats share, and say what of it λ cannot describe."""
+def fitted_camera(lens: LensModel, kind: str, size: tuple[int, int], field: str = "") -> CameraFile:
+    """Fit the division model to the lens model of a file, which goes with it where it is not exactly that."""
     if not min(lens.focal) > 0.0:
         raise ArgumentError(f"expected positive focal lengths, not {lens.focal[0]:g} and {lens.focal[1]:g}")
-    stretch = lens.focal[0] / lens.focal[1] - 1.0
-    cause = ""
-    if abs(stretch) > _SQUARE:
-        cause = f"its focal lengths along x and y differ by {abs(stretch):.1%}, but only square pixels are known here"
-    return fitted_camera(lens.distort, kind, size, lens.center, lens.mean_focal, field, cause)
+    camera = Camera(size, center=lens.center, focal=lens.mean_focal, focal_source="file")
+    try:
+        fitted, fit = fit_lens(lens.distort, camera)
+    except ArgumentError as error:
+        raise ArgumentError(f"{field}{error}") from error
+    return CameraFile(fitted if fit.largest <= _RESOLVED else replace(fitted, lens_model=lens), kind, fit)
 
 
 def fit_lens(forward: Forward, camera: Camera) -> tuple[Camera, LensFit]:

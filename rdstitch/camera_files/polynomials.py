@@ -18,11 +18,11 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
-from rdstitch.arrays import FloatArray
 from rdstitch.camera_files.formats import comments
 from rdstitch.camera_files.lens_models import CLOSE, CameraFile, LensFit, LensSamples, fitted_camera
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.lens_model import LensModel
 from rdstitch.system.records import Side, convert, parse_xml
 
 _RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE = 0, 2, 3
@@ -88,17 +88,11 @@ def read_polynomial(
     """
     if linear <= 0.0:
         raise ArgumentError("the coefficients of the polynomial must leave a scale above 0 at the centre")
-    at_center, bend = focal * linear, np.arctan if fisheye else np.positive
-
-    def forward(points: FloatArray) -> FloatArray:
-        rays = (points - center) / at_center
-        radius = np.linalg.norm(rays, axis=1, keepdims=True)
-        ideal = bend(radius) * focal / unit
-        bent = (linear * ideal + sum(k * ideal**p for p, k in terms.items())) * unit
-        result: FloatArray = np.where(radius > 0.0, bent / np.maximum(radius, 1e-300), at_center) * rays + center
-        return result
-
-    return fitted_camera(forward, kind, size, center, at_center)
+    at_center = focal * linear
+    powers = range(2, max(terms, default=1) + 1)
+    coefficients = tuple(terms.get(p, 0.0) * (focal / unit) ** p * unit / at_center for p in powers)
+    lens = LensModel((at_center, at_center), center, coefficients, "fisheye polynomial" if fisheye else "polynomial")
+    return fitted_camera(lens, kind, size)
 
 
 def hugin_lens(camera: Camera) -> tuple[str, LensFit]:

@@ -156,6 +156,7 @@ class Canvas:
     near: tuple[NearPart | None, ...] = ()  # what of each image is drawn; None for all of it, empty for all of all
     # (3, 3): what the registered images were turned by before, as it is recorded; None where they were not
     orientation: FloatArray | None = None
+    cropped_to: Box | None = None  # what a crop leaves, instead of the largest part without holes
 
     def box(self, index: int) -> Box:
         """Bounds (x0, y0, x1, y1) of an image, whole pixels inside the canvas, end exclusive.
@@ -204,7 +205,12 @@ class Canvas:
         x0, y0, x1, y1 = box
         shift = np.array([[1.0, 0.0, -x0], [0.0, 1.0, -y0], [0.0, 0.0, 1.0]])
         footprints = tuple(outline - (x0, y0) for outline in self.footprints)
-        return replace(self, size=(x1 - x0, y1 - y0), matrix=shift @ self.matrix, footprints=footprints)
+        wanted = None
+        if self.cropped_to is not None:
+            left, top, right, bottom = self.cropped_to
+            wanted = left - x0, top - y0, right - x0, bottom - y0
+        size = x1 - x0, y1 - y0
+        return replace(self, size=size, matrix=shift @ self.matrix, footprints=footprints, cropped_to=wanted)
 
     def widened(self, margin: int) -> "Canvas":
         """The same with ``margin`` pixels more on the left and on the right."""

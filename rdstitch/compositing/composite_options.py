@@ -32,8 +32,8 @@ class CompositeOptions(UprightOptions):
         "multiband" hides the seam over a width that suits each size of detail, "feather" averages over a
         strip along the seam (without seams: over the whole overlap), "none" cuts.
     crop : str
-        "none"; "auto" cuts to the largest upright rectangle without holes, where that keeps a fair part of the
-        image.
+        "none"; "auto" cuts to ``rectangle``, or without one to the largest upright rectangle without holes, where that
+        keeps a fair part of the output.
     projection : str
         How images taken by turning on the spot are laid out: "plane", "cylinder", "sphere" (equirectangular),
         "mercator", "panini", "stereographic", or "auto": the plane up to a view of 90 degrees, the cylinder for what
@@ -54,7 +54,10 @@ class CompositeOptions(UprightOptions):
     gsd : float, optional
         Metres on the map that a pixel takes, instead of ``scale``; the output must be georeferenced.
     epsg : int, optional
-        Code of the map's coordinate system; None: UTM on WGS 84. Others need the extra ``crs``.
+        Code of the map's coordinate system; None: UTM (UPS near the poles) on WGS 84. Others need the extra ``crs``.
+    georeference : str
+        "auto" places the output where positions or control points agree with the images, "force" also where these
+        contradict them, "off" never.
     max_memory : int, optional
         Bytes that the compositor may hold in images and tiles; None: a quarter of the memory that is
         available, at least 400 MB, or more where the canvas needs it.
@@ -89,6 +92,7 @@ class CompositeOptions(UprightOptions):
     north_up: bool = True
     gsd: float | None = None
     epsg: int | None = None
+    georeference: Literal["auto", "force", "off"] = "auto"
     max_memory: int | None = None
     interpolation: Interpolation = "cubic"
     background: int = 0

@@ -107,7 +107,9 @@ def _decided(
             if options.blend == "feather":
                 seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
     box, note = _unwidened(canvas), ""
-    if survey is not None and options.crop == "auto":
+    if canvas.cropped_to is not None and options.crop == "auto":
+        box = canvas.cropped_to
+    elif survey is not None and options.crop == "auto":
         find = crop_box if box is None else partial(crop_rows, whole=box)
         cropped_box, note = find(covered_pixels(survey), survey.factor, canvas.size)
         box = cropped_box or box

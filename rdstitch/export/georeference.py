@@ -1,8 +1,7 @@
 """Where the output lies on the Earth, by the images' positions or ground control points: GeoTIFF tags, or a world file.
 
-The output is a plane seen straight from above, so that a similarity takes its pixels to map coordinates. It is fitted
-robustly to ground control points, or to the positions of the cameras, which are taken to be above the centres of their
-images.
+The output is a plane seen straight from above, so that a similarity takes its pixels to map coordinates. See
+:mod:`rdstitch.export.map_fit` for how it is fitted.
 """
 
 import math
@@ -13,28 +12,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.alignment.position_priors import POSITION_STD
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.export.map_fit import MapFit, Views, fit_map, views_of
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.crs import WGS84, Crs
+from rdstitch.geometry.crs import WGS84, Crs, middle
 from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.io.tiff import ExtraTag
-from rdstitch.robust.similarity_fit import fit_similarity
 
 MIN_POSITIONS = 3
 # Positions must agree with the images to this share of their own spread: else it is no view from above, or the GPS
 # says less than nothing.
 _MAX_ERROR = 0.25
-_CONTROL_STD = 0.03  # m: of a point surveyed by satellite with corrections
-_GPS, _CONTROL = "GPS positions", "ground control points"
+GPS, CONTROL = "GPS positions", "ground control points"
 _MODEL_SCALE, _MODEL_TIEPOINT, _MODEL_TRANSFORMATION, _GEO_KEYS = 33550, 33922, 34264, 34735
 _SHORT, _DOUBLE = 3, 12
 
 
 @dataclass(frozen=True)
 class Residual:
-    """How far east and north of a position, of an image or a control point, the output has it, m."""
+    """How far east and north of a position, of an image or a point, the map has it by all others, m."""
 
     name: str
     east: float
@@ -54,9 +51,15 @@ class Georeference:
     crs: Crs
     scale: complex  # metres per pixel times the turn: easting + i northing = ``scale`` (x - i y) + ``origin``
     origin: complex  # easting + i northing of the centre of the top-left pixel, m
-    rms: float  # root mean square distance of the positions used from where the images put them, m
-    source: str = _GPS  # what the positions are
+    # root mean square distance of the positions used from where all others and the images put them, m
+    rms: float
+    source: str = GPS  # what the positions are
     residuals: tuple[Residual, ...] = ()  # of every position
+    # standard deviation of one coordinate of a place on the ground, in the mean over the positions, m
+    std: float | None = None
+    map_scale: float = 1.0  # metres of the map per metre on the ground, where that is worth telling
+    assumption: str = ""  # what had to be assumed of the cameras, and how far that may shift the map
+    checks: tuple[Residual, ...] = ()  # of points that took no part
 
     @property
     def used(self) -> int:
@@ -71,7 +74,7 @@ class Georeference:
     @property
     def gsd(self) -> float:
         """Ground sample distance, m."""
-        return abs(self.scale)
+        return abs(self.scale) / self.map_scale
 
     @property
     def clockwise_deg(self) -> float:
@@ -87,10 +90,26 @@ class Georeference:
     def summary(self) -> str:
         """Everything that there is to say of it, in one line."""
         turned = "" if self.north_up else f", north {abs(self.clockwise_deg):.1f}° {self._side} of up"
-        return (
-            f"georeferenced: {self.crs.name}, {self.gsd:.4g} m a pixel{turned}; {self.used} of {len(self.residuals)} "
-            f"{self.source} used, {self.rms:.2f} m rms"
+        what, agree = ("GPS", "agree with the map") if self.source == GPS else (self.source, "agree")
+        text = (
+            f"georeferenced: {self.crs.name}, {self.gsd:.4g} m a pixel{turned}; {what} {agree} to "
+            f"{_metres(self.rms)} ({self.used} of {len(self.residuals)}, each predicted by the others)"
         )
+        if self.source == CONTROL:
+            text += f", worst {self._worst(self.residuals)}"
+        return text if self.std is None else f"{text}; map ± {_metres(self.std)}"
+
+    @property
+    def check_summary(self) -> str:
+        """How far check points are off, in one line."""
+        rms = math.sqrt(sum(check.off**2 for check in self.checks) / max(len(self.checks), 1))
+        return (
+            f"{len(self.checks)} check points: {_metres(rms)} off horizontally (rms), worst {self._worst(self.checks)}"
+        )
+
+    def _worst(self, residuals: Sequence[Residual]) -> str:
+        worst = max((one for one in residuals if one.used), key=lambda one: one.off)
+        return f"{worst.name} by {_metres(worst.off)} = {worst.off / abs(self.scale):.1f} pixels"
 
     @property
     def _side(self) -> str:
@@ -109,6 +128,19 @@ class Georeference:
         if abs(scale.imag) < 1e-12 * abs(scale):
             scale = complex(abs(scale))
         return replace(self, scale=scale, origin=self.origin - scale * complex(change[0, 2], -change[1, 2]))
+
+    def in_system(self, crs: Crs, pixels: ArrayLike) -> "Georeference":
+        """The same place in another coordinate system, nearest at some pixels (N, 2) of the output."""
+        if crs == self.crs:
+            return self
+        points = np.asarray(pixels, dtype=np.float64)
+        latitude, longitude = self.crs.geographic(self.to_map(points)).T
+        places = crs.project(latitude, longitude) @ np.array([1, 1j])
+        flipped = points @ np.array([1, -1j])
+        system = np.stack([flipped, np.ones_like(flipped)], axis=1)
+        scale, origin = np.linalg.lstsq(system, places, rcond=None)[0].tolist()
+        map_scale = crs.map_scale(*middle(latitude, longitude))
+        return replace(self, crs=crs, scale=scale, origin=origin, map_scale=map_scale)
 
     def to_map(self, points: ArrayLike) -> FloatArray:
         """Easting and northing (N, 2), m, of pixels (N, 2) of the output."""
@@ -139,6 +171,12 @@ class Georeference:
         return "".join(f"{number:.10f}\n" for number in numbers), self.crs.well_known_text() + "\n"
 
 
+def _metres(value: float) -> str:
+    """A length with its unit, to two digits, but no finer than a millimetre."""
+    digits = max(0, min(3, 1 - math.floor(math.log10(value)))) if value > 0.0 and math.isfinite(value) else 1
+    return f"{value:.{digits}f} m"
+
+
 def world_file_paths(image: str | Path) -> tuple[Path, ...]:
     """The world file, and the coordinate system as .prj, of an image; none where its own format has a place for both.
 
@@ -156,61 +194,125 @@ def has_place(positions: Sequence[GpsPosition | None]) -> bool:
     return sum(position is not None for position in positions) >= MIN_POSITIONS
 
 
-def georeference(
-    positions: Sequence[GpsPosition | None],
-    cameras: Sequence[Camera],
-    to_output: FloatArray,
-    names: Sequence[str],
-    epsg: int | None = None,
-    control: Sequence[Sequence[GroundControl]] = (),
-) -> tuple[Georeference | None, str]:
+@dataclass(frozen=True)
+class Located:
+    """Registered images, and what is known of where they are."""
+
+    positions: Sequence[GpsPosition | None]
+    cameras: Sequence[Camera]
+    to_output: FloatArray  # (N, 3, 3): normalized undistorted coordinates of each image to pixels of the output
+    names: Sequence[str]
+    nadirs: Sequence[tuple[float, float, float] | None] = ()  # straight down by each camera's attitude, where known
+    control: Sequence[Sequence[GroundControl]] = ()
+
+
+def georeference(located: Located, epsg: int | None = None, *, force: bool = False) -> tuple[Georeference | None, str]:
     """Place the output on the Earth, or say why that cannot be done; control points, where there are any, count alone.
 
-    ``to_output`` (N, 3, 3) takes normalized undistorted coordinates of each image to pixels of the output. Without
-    ``epsg`` the map is that of the control points, else UTM on WGS 84.
+    Without ``epsg`` the map is that of the control points, else UTM (UPS near the poles) on WGS 84. With ``force``
+    positions that the images contradict place it too, and the reason says so.
     """
-    source, std = (_CONTROL, _CONTROL_STD) if any(control) else (_GPS, POSITION_STD)
-    if source == _GPS:
-        control = [
-            () if place is None else (GroundControl(name, place, WGS84, _middle(camera)),)
-            for name, place, camera in zip(names, positions, cameras, strict=True)
-        ]
+    points = [point for shown in located.control for point in shown]
+    return (_by_control if any(not p.check for p in points) else _by_positions)(located, epsg, force)
+
+
+def _by_positions(located: Located, epsg: int | None, force: bool) -> tuple[Georeference | None, str]:
+    known = np.array([place is not None for place in located.positions])
+    places = [place for place in located.positions if place is not None]
+    if len(places) < MIN_POSITIONS:
+        count = f"{len(places)} of {len(known)} images have a GPS position"
+        return None, f"{count}, and {MIN_POSITIONS} are needed"
+    different = len({(place.latitude, place.longitude) for place in places})
+    if different == 1:
+        return None, "all images have the same GPS position"
+    views = views_of(located.cameras, located.to_output, located.nadirs).of(known)
+    std = np.array([(np.nan, np.nan) if place.std is None else place.std for place in places])
+    names = [name for name, is_known in zip(located.names, known.tolist(), strict=True) if is_known]
+    return _placed(views, [(p.latitude, p.longitude) for p in places], _altitudes(places), std, names, epsg, force, GPS)
+
+
+def _altitudes(places: Sequence[GpsPosition]) -> FloatArray:
+    return np.array([np.nan if place.altitude is None else place.altitude for place in places])
+
+
+def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georeference | None, str]:
     # A control point that several images show counts once, at the mean of where they have it.
-    shown: dict[str | int, list[tuple[GroundControl, complex]]] = {}
-    for k, points in enumerate(control):
+    shown: dict[tuple[str, bool], list[tuple[GroundControl, complex]]] = {}
+    for k, points in enumerate(located.control):
         for point in points:
-            x, y = to_plane(cameras[k], to_output[k], np.array([point.pixel])).reshape(2)
-            shown.setdefault(k if source == _GPS else point.name, []).append((point, complex(x, -y)))
-    known = [same[0][0] for same in shown.values()]
-    if len(known) < MIN_POSITIONS:
-        what = f"of {len(names)} images have a GPS position" if source == _GPS else f"{source} are in the images"
-        return None, f"{len(known)} {what}, and {MIN_POSITIONS} are needed"
-    latitude, longitude = np.array([(point.place.latitude, point.place.longitude) for point in known]).T
-    if epsg is None and known[0].epsg != WGS84:
-        epsg = known[0].epsg
-    crs = Crs.utm(float(np.median(latitude)), float(np.median(longitude))) if epsg is None else Crs(epsg)
+            x, y = to_plane(located.cameras[k], located.to_output[k], np.array([point.pixel])).reshape(2)
+            shown.setdefault((point.name, point.check), []).append((point, complex(x, -y)))
+    means = {key: (same[0][0], complex(np.mean([pixel for _, pixel in same]))) for key, same in shown.items()}
+    control = [mean for (_, check), mean in means.items() if not check]
+    checks = [mean for (_, check), mean in means.items() if check]
+    if len(control) < MIN_POSITIONS:
+        return None, f"{len(control)} {CONTROL} are in the images, and {MIN_POSITIONS} are needed"
+    if epsg is None and control[0][0].epsg != WGS84:
+        epsg = control[0][0].epsg
+    views = Views.of_ground(np.array([pixel for _, pixel in control]))
+    std = np.array([[np.nan if point.std is None else point.std] * 2 for point, _ in control])
+    degrees = [(point.place.latitude, point.place.longitude) for point, _ in control]
+    names = [point.name for point, _ in control]
+    place, reason = _placed(views, degrees, np.full(len(names), np.nan), std, names, epsg, force, CONTROL)
+    if place is None or not checks:
+        return place, reason
+    latitude, longitude = np.array([(p.place.latitude, p.place.longitude) for p, _ in checks]).T
+    right = place.crs.project(latitude, longitude)
+    off = place.to_map([(pixel.real, -pixel.imag) for _, pixel in checks]) - right
+    residuals = [
+        Residual(p.name, east, north, True) for (p, _), (east, north) in zip(checks, off.tolist(), strict=True)
+    ]
+    return replace(place, checks=tuple(residuals)), reason
+
+
+def _placed(
+    views: Views,
+    degrees: Sequence[tuple[float, float]],
+    altitude: FloatArray,
+    std: FloatArray,
+    names: Sequence[str],
+    epsg: int | None,
+    force: bool,
+    source: str,
+) -> tuple[Georeference | None, str]:
+    """Place the output by some positions."""
+    latitude, longitude = np.array(degrees).T
+    crs = Crs.nearest(latitude, longitude) if epsg is None else Crs(epsg)
+    map_scale = crs.map_scale(*middle(latitude, longitude))
     places = crs.project(latitude, longitude) @ np.array([1, 1j])
-    pixels = np.array([np.mean([pixel for _, pixel in same]) for same in shown.values()])
-    usable = np.isfinite(places) & np.isfinite(pixels)
+    usable: BoolArray = np.isfinite(places) & views.usable
     if usable.sum() < MIN_POSITIONS:
         return None, f"{crs.name} does not reach the {source}"
-    fit = fit_similarity(pixels[usable], places[usable], std)
-    used = np.zeros(len(known), dtype=bool)
-    used[usable] = fit.inliers
-    off = np.full(len(known), complex(np.inf))
-    off[usable] = fit.scale * pixels[usable] + fit.origin - places[usable]
+    fit = fit_map(views.of(usable), places[usable], altitude[usable], std[usable], map_scale)
+    used = np.zeros(len(names), dtype=bool)
+    used[usable] = fit.used
+    off = np.full(len(names), complex(np.inf))
+    off[usable] = fit.left_out
     rms = math.sqrt(float(np.mean(np.abs(off[used]) ** 2)))
     spread = math.sqrt(float(np.mean(np.abs(places[used] - places[used].mean()) ** 2)))
-    # Four of the coordinates are used up by the fit: three positions agree with anything to some extent.
-    free = max(1.0 - 2.0 / max(int(used.sum()), 1), 1e-9)
-    if used.sum() < max(MIN_POSITIONS, len(known) / 2) or not rms < _MAX_ERROR * spread * math.sqrt(free):
+    reason = ""
+    if used.sum() < max(MIN_POSITIONS, len(names) / 2) or not rms < _MAX_ERROR * spread:
         median = float(np.median(np.abs(off)))
-        return None, f"the {source} are {median:.1f} m off in the median, and spread over {spread:.1f} m"
-    residuals = tuple(Residual(p.name, e.real, e.imag, u) for p, e, u in zip(known, off, used.tolist(), strict=True))
-    return Georeference(crs, fit.scale, fit.origin, rms, source, residuals), ""
+        reason = (
+            f"the {source} contradict the images: they are {_metres(median)} off in the median, and spread over "
+            f"{_metres(spread)}"
+        )
+        if not force:
+            return None, f"{reason}; --georeference force places it nevertheless"
+    residuals = tuple(Residual(n, e.real, e.imag, u) for n, e, u in zip(names, off, used.tolist(), strict=True))
+    assumption = _assumption(views, fit) if source == GPS else ""
+    place = Georeference(
+        crs, fit.scale, fit.origin, rms, source, residuals, fit.std, map_scale=map_scale, assumption=assumption
+    )
+    return place, reason
 
 
-def _middle(camera: Camera) -> tuple[float, float]:
-    """The centre of an image, pixels."""
-    width, height = camera.image_size
-    return (width - 1) / 2, (height - 1) / 2
+def _assumption(views: Views, fit: MapFit) -> str:
+    """What was assumed of where cameras are, and how far that may shift the map."""
+    if views.known == "centres":
+        shift = _metres(float(np.median(views.height)) * abs(fit.scale) * math.radians(1.0))
+        return (
+            "the images have no poses: GPS positions are taken for those of the image centres, and each degree that "
+            f"the cameras were tilted together shifts the map by {shift}"
+        )
+    return ""

@@ -10,7 +10,7 @@ coefficients.
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -31,6 +31,7 @@ from rdstitch.geometry.division_model import (
     undistort,
 )
 from rdstitch.geometry.exif_orientation import SIDEWAYS, turned_size, turning_matrix
+from rdstitch.geometry.lens_model import LensKind, LensModel
 from rdstitch.geometry.planar_motion import turned_tilt
 from rdstitch.system.file_access import read_text
 from rdstitch.system.outputs import check_output, json_bytes, write_bytes_atomic
@@ -114,6 +115,9 @@ class Camera:
     lens_covariance : tuple of 5 tuples of 5 floats, or None
         Covariance of :data:`LENS_PARAMETERS` by the matches alone, if those that were not estimated, for which it is
         zero, are exactly as given; None where nothing was.
+    lens_model : LensModel or None
+        The lens itself, of another program's calibration, that the coefficients only come close to: images are
+        resampled so that they are exactly those of the coefficients. None where they are so as they are.
 
     Raises
     ------
@@ -140,6 +144,7 @@ class Camera:
     tilt: tuple[float, float] | None = None
     tilt_std: tuple[float, float] | None = None
     image_circle: float | None = None
+    lens_model: LensModel | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Fill in the image centre and check every value."""
@@ -270,8 +275,10 @@ class Camera:
 
     def with_coefficients(self, distortion: float, distortion2: float = 0.0, distortion3: float = 0.0) -> Self:
         """The camera with another, given lens; the distortion centre stays."""
+        if (distortion, distortion2, distortion3) == self.coefficients:
+            return replace(self, distortion_std=None, lens_covariance=None)
         lens = replace(self, distortion=distortion, distortion2=distortion2, distortion3=distortion3)
-        return replace(lens, distortion_std=None, lens_covariance=None)
+        return replace(lens, distortion_std=None, lens_covariance=None, lens_model=None)
 
     def without_lens(self) -> "Camera":
         """A camera of which only the images' size and centre, and its image circle, are known."""
@@ -316,7 +323,9 @@ class Camera:
         focal, std, circle = (
             None if value is None else value * factor for value in (self.focal, self.focal_std, self.image_circle)
         )
-        return replace(self, image_size=image_size, center=center, focal=focal, focal_std=std, image_circle=circle)
+        lens = None if self.lens_model is None else self.lens_model.resized(factor, center)
+        sized = replace(self, image_size=image_size, center=center, focal=focal, focal_std=std, image_circle=circle)
+        return replace(sized, lens_model=lens)
 
     def turned(self, orientation: int) -> Self:
         """The same camera on the image after an EXIF orientation: what has a direction is turned with it."""
@@ -334,7 +343,8 @@ class Camera:
             tilt = turned_tilt(tilt, matrix)
         if std is not None and orientation in SIDEWAYS:
             std = std[1], std[0]
-        return replace(self, image_size=size, center=(x, y), lens_covariance=covariance, tilt=tilt, tilt_std=std)
+        turned = replace(self, image_size=size, center=(x, y), lens_covariance=covariance, tilt=tilt, tilt_std=std)
+        return replace(turned, lens_model=None if self.lens_model is None else self.lens_model.turned(matrix, (x, y)))
 
     def as_dict(self) -> dict[str, Any]:
         """Everything known of the camera as plain values, the content of a camera file."""
@@ -350,6 +360,7 @@ class Camera:
             "lambda_fit_rms_px": rms,
             "lambda_fit_largest_px": largest,
             "coefficients": list(self.coefficients),
+            "lens_model": None if self.lens_model is None else asdict(self.lens_model),
             "lens_covariance": None if covariance is None else [list(row) for row in covariance],
             "lambda_px": self.distortion_px,
             "lambda_focal": self.distortion_focal,
@@ -387,6 +398,19 @@ FocalSource = Literal["option", "file", "exif", "estimate", "guess"]
 _Row = tuple[float, float, float, float, float]
 
 
+class LensModelRecord(Struct, kw_only=True):
+    """A lens of another program's calibration, see :class:`rdstitch.geometry.lens_model.LensModel`."""
+
+    focal: Pair
+    center: Pair
+    coefficients: Annotated[list[float], Meta(max_length=8)]
+    kind: LensKind
+
+    def model(self) -> LensModel:
+        """Give it as the library has it."""
+        return LensModel(self.focal, self.center, tuple(self.coefficients), self.kind)
+
+
 class LensRecord(Struct, kw_only=True):
     """What of a camera depends on the size of the image, and λ with it."""
 
@@ -396,6 +420,7 @@ class LensRecord(Struct, kw_only=True):
     # Version 1 had λ and μ only.
     lambda2: float = 0.0
     coefficients: Triple | None = None
+    lens_model: LensModelRecord | None = None
     focal_px: float | None = None
     focal_source: FocalSource | None = None
 
@@ -413,6 +438,7 @@ class LensRecord(Struct, kw_only=True):
             focal=self.focal_px,
             focal_source=self.focal_source,
             image_circle=self.image_circle_px,
+            lens_model=None if self.lens_model is None else self.lens_model.model(),
         )
 
 

@@ -1,7 +1,8 @@
-"""Coordinate reference systems: UTM on WGS 84, and through rasterio every other projected one."""
+"""Coordinate reference systems: UTM and UPS on WGS 84, and through rasterio (PROJ) every other projected one."""
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
@@ -14,12 +15,51 @@ from rdstitch.errors import ArgumentError
 
 _AXIS, _FLATTENING, _SCALE = 6378137.0, 1 / 298.257223563, 0.9996
 _FALSE_EASTING, _FALSE_NORTHING = 500_000.0, 10_000_000.0
+
+
+class NotMetricError(ArgumentError):
+    """A coordinate system that is no map in metres."""
+
+
 WGS84 = 4326
 """Code of latitude and longitude on WGS 84."""
 
 _THIRD_FLATTENING = _FLATTENING / (2 - _FLATTENING)
 _RADIUS = _SCALE * _AXIS / (1 + _THIRD_FLATTENING) * (1 + _THIRD_FLATTENING**2 / 4 + _THIRD_FLATTENING**4 / 64)
+_POLAR_SCALE, _POLAR_FALSE = 0.994, 2_000_000.0
+_ECCENTRICITY = math.sqrt(_FLATTENING * (2 - _FLATTENING))
+_POLAR_RADIUS = (
+    2
+    * _POLAR_SCALE
+    * _AXIS
+    / math.sqrt((1 + _ECCENTRICITY) ** (1 + _ECCENTRICITY) * (1 - _ECCENTRICITY) ** (1 - _ECCENTRICITY))
+)
 _NORTH, _SOUTH = 32600, 32700  # EPSG codes of UTM on WGS 84 are these and the zone
+_POLAR = 61  # the one after the last zone is UPS
+_MAP_SCALE_ERROR = 0.01  # UTM, UPS and national grids stay below; the Mercator projection of web maps does not
+
+
+_GEOGCS = (
+    'GEOGCS["GCS_WGS_1984",DATUM["D_WGS_1984",SPHEROID["WGS_1984",6378137.0,298.257223563]],PRIMEM["Greenwich",0.0],'
+    'UNIT["Degree",0.0174532925199433]]'
+)
+
+
+def middle(latitude: ArrayLike, longitude: ArrayLike) -> tuple[float, float]:
+    """Median latitude and mean direction of longitude of places (N,), degrees."""
+    turns = np.exp(1j * np.radians(np.asarray(longitude, dtype=np.float64)))
+    return float(np.median(np.asarray(latitude))), math.degrees(np.angle(turns.sum()))
+
+
+def _zone_of(latitude: float, longitude: float) -> int:
+    """Number of the UTM zone of a place, with those that are wider for Norway and Svalbard; 61 near the poles."""
+    if not -80.0 <= latitude <= 84.0:
+        return _POLAR
+    if 56.0 <= latitude < 64.0 and 3.0 <= longitude < 12.0:
+        return 32
+    if latitude >= 72.0 and 0.0 <= longitude < 42.0:
+        return 31 + 2 * int((longitude + 3.0) // 12.0)
+    return int((longitude + 180.0) // 6.0) % 60 + 1
 
 
 @dataclass(frozen=True)
@@ -33,23 +73,44 @@ class Crs:
             _check_projected(self.epsg)
 
     @classmethod
-    def utm(cls, latitude: float, longitude: float) -> "Crs":
-        """UTM on WGS 84 in the zone of a place, degrees."""
-        zone = int(np.clip((longitude + 180) // 6 + 1, 1, 60))
-        return cls((_NORTH if latitude >= 0 else _SOUTH) + zone)
+    def nearest(cls, latitude: ArrayLike, longitude: ArrayLike) -> "Crs":
+        """UTM on WGS 84 in the zone of the middle of places (N,), degrees; UPS near the poles."""
+        phi, away = middle(latitude, longitude)
+        zone = _zone_of(phi, away)
+        return cls((_NORTH if phi >= 0 else _SOUTH) + zone)
 
     @property
     def _zone(self) -> int:
-        """Of UTM on WGS 84, negative in the south; 0 of other systems."""
+        """Of UTM on WGS 84, 61 of UPS, negative in the south; 0 of other systems."""
         for first, sign in ((_NORTH, 1), (_SOUTH, -1)):
-            if 1 <= self.epsg - first <= 60:
+            if 1 <= self.epsg - first <= _POLAR:
                 return sign * (self.epsg - first)
         return 0
+
+    @classmethod
+    def in_metres(cls, epsg: int) -> "Crs | None":
+        """The system of a code; None where it is not projected, or not in metres."""
+        try:
+            return cls(epsg)
+        except NotMetricError:
+            return None
+
+    def map_scale(self, latitude: float, longitude: float) -> float:
+        """Metres of the map per metre on the ground at a place, degrees; 1 where maps for surveys differ by less."""
+        step = 1e-3  # degrees
+        ends = self.project([latitude - step, latitude + step], [longitude, longitude])
+        phi = math.radians(latitude)
+        squared = _FLATTENING * (2 - _FLATTENING)
+        radius = _AXIS * (1 - squared) / (1 - squared * math.sin(phi) ** 2) ** 1.5  # of the meridian
+        ratio = float(np.hypot(*(ends[1] - ends[0]))) / (radius * math.radians(2 * step))
+        return ratio if abs(ratio - 1) > _MAP_SCALE_ERROR else 1.0
 
     @property
     def name(self) -> str:
         """Code and name."""
         zone = self._zone
+        if abs(zone) == _POLAR:
+            return f"EPSG:{self.epsg}, UPS {'north' if zone > 0 else 'south'}"
         if zone:
             return f"EPSG:{self.epsg}, UTM zone {abs(zone)}{'N' if zone > 0 else 'S'}"
         return f"EPSG:{self.epsg}"
@@ -58,7 +119,7 @@ class Crs:
         """Easting and northing (N, 2), m, of places (N,) on WGS 84, degrees."""
         if self._zone:
             return utm(latitude, longitude, self._zone)
-        rasterio = _rasterio(self.epsg)
+        rasterio = _rasterio(f"EPSG:{self.epsg}")
         east, north = rasterio.warp.transform(
             rasterio.crs.CRS.from_epsg(WGS84),
             rasterio.crs.CRS.from_epsg(self.epsg),
@@ -73,7 +134,7 @@ class Crs:
         if self._zone:
             with np.errstate(over="ignore", invalid="ignore"):  # of what is no place of the zone
                 return _from_utm(east, north, self._zone)
-        rasterio = _rasterio(self.epsg)
+        rasterio = _rasterio(f"EPSG:{self.epsg}")
         systems = (rasterio.crs.CRS.from_epsg(code) for code in (self.epsg, WGS84))
         longitude, latitude = rasterio.warp.transform(*systems, east, north)
         return np.stack([latitude, longitude], axis=-1)
@@ -81,11 +142,18 @@ class Crs:
     def well_known_text(self) -> str:
         """The definition, as a ``.prj`` file has it."""
         zone, south = abs(self._zone), self._zone < 0
+        if zone == _POLAR:
+            name, pole = ("South", -90.0) if south else ("North", 90.0)
+            return (
+                f'PROJCS["UPS_{name}",{_GEOGCS},PROJECTION["Stereographic"],'
+                f'PARAMETER["False_Easting",{_POLAR_FALSE}],PARAMETER["False_Northing",{_POLAR_FALSE}],'
+                f'PARAMETER["Central_Meridian",0.0],PARAMETER["Scale_Factor",{_POLAR_SCALE}],'
+                f'PARAMETER["Latitude_Of_Origin",{pole}],UNIT["Meter",1.0]]'
+            )
         if not zone:
-            return str(_rasterio(self.epsg).crs.CRS.from_epsg(self.epsg).to_wkt(version="WKT1_ESRI"))
+            return str(_rasterio(f"EPSG:{self.epsg}").crs.CRS.from_epsg(self.epsg).to_wkt(version="WKT1_ESRI"))
         return (
-            f'PROJCS["WGS_1984_UTM_Zone_{zone}{"S" if south else "N"}",GEOGCS["GCS_WGS_1984",DATUM["D_WGS_1984",'
-            'SPHEROID["WGS_1984",6378137.0,298.257223563]],PRIMEM["Greenwich",0.0],UNIT["Degree",0.0174532925199433]],'
+            f'PROJCS["WGS_1984_UTM_Zone_{zone}{"S" if south else "N"}",{_GEOGCS},'
             f'PROJECTION["Transverse_Mercator"],PARAMETER["False_Easting",{_FALSE_EASTING}],'
             f'PARAMETER["False_Northing",{_FALSE_NORTHING if south else 0.0}],'
             f'PARAMETER["Central_Meridian",{_central_meridian(zone):.1f}],PARAMETER["Scale_Factor",{_SCALE}],'
@@ -93,32 +161,78 @@ class Crs:
         )
 
 
-def epsg_of(text: str) -> int | None:
-    """Code of the coordinate system that a line of OpenDroneMap's lists names; None where it names none.
+@dataclass(frozen=True)
+class NamedSystem:
+    """The coordinate system that a line of a list names, as EPSG's code, WGS 84's UTM zone, or PROJ's definition."""
 
-    ``EPSG:32632``, ``WGS84 UTM 32N`` and PROJ's ``+proj=utm +zone=32 +datum=WGS84`` and ``+proj=longlat`` are known.
-    """
-    if code := re.fullmatch(r"EPSG:(\d{1,5})", text.strip(), re.IGNORECASE):
-        return int(code[1])
-    if code := re.fullmatch(r"WGS ?84 UTM (\d{1,2}) ?([NS])", text.strip(), re.IGNORECASE):
-        return (_NORTH if code[2] in "nN" else _SOUTH) + int(code[1])
-    if re.search(r"\+proj=(longlat|latlong)\b", text):
+    text: str
+    epsg: int | None  # where it is one in metres or degrees of WGS 84 whose code is known
+
+    @classmethod
+    def named_by(cls, text: str) -> "NamedSystem | None":
+        """The system; None where the text names none."""
+        text = text.strip()
+        if code := re.fullmatch(r"EPSG:(\d{1,5})", text, re.IGNORECASE):
+            return cls(text.upper(), int(code[1]))
+        if code := re.fullmatch(r"WGS ?84[ /]*UTM(?: zone)? (\d{1,2}) ?([NS])", text, re.IGNORECASE):
+            zone = int(code[1])
+            return cls(text, (_NORTH if code[2] in "nN" else _SOUTH) + zone) if 1 <= zone <= 60 else None
+        terms = dict(re.findall(r"\+(\w+)(?:=(\S+))?", text))
+        if "proj" not in terms and "init" not in terms:
+            return None
+        return cls(text, _code_of(terms))
+
+    def geographic(self, places: ArrayLike) -> FloatArray:
+        """Latitude and longitude (N, 2) on WGS 84, degrees, of coordinates (N, 2) in the system's order x, y."""
+        points = np.asarray(places, dtype=np.float64).reshape(-1, 2)
+        if self.epsg == WGS84:
+            return points[:, ::-1]
+        if self.epsg is not None and (crs := Crs.in_metres(self.epsg)) is not None:
+            return crs.geographic(points)
+        rasterio = _rasterio(self.text)
+        with rasterio.Env():  # else GDAL prints
+            try:
+                system = rasterio.crs.CRS.from_user_input(self.text)
+                longitude, latitude = rasterio.warp.transform(system, rasterio.crs.CRS.from_epsg(WGS84), *points.T)
+            except (rasterio.errors.CRSError, rasterio.errors.RasterioError) as error:
+                raise ArgumentError(f"{self.text}: PROJ does not know this coordinate system ({error})") from error
+        return np.stack([latitude, longitude], axis=-1)
+
+
+_PLAIN_TERMS = {"datum": ("WGS84",), "ellps": ("WGS84",), "units": ("m",), "no_defs": ("",), "type": ("crs",)}
+"""Terms of PROJ that leave a system one on WGS 84 in metres."""
+
+
+def _code_of(terms: Mapping[str, str]) -> int | None:
+    """Code of what PROJ's terms define, where that is UTM or degrees on WGS 84 and nothing else."""
+    others = {name: value for name, value in terms.items() if name not in ("proj", "zone", "south")}
+    if any(value not in _PLAIN_TERMS.get(name, ()) for name, value in others.items()):
+        return None
+    if terms["proj"] in ("longlat", "latlong"):
         return WGS84
-    if re.search(r"\+proj=utm\b", text) and (code := re.search(r"\+zone=(\d{1,2})\b", text)):
-        return (_SOUTH if "+south" in text else _NORTH) + int(code[1])
+    zone = terms.get("zone", "")
+    if terms["proj"] == "utm" and zone.isdecimal() and 1 <= int(zone) <= 60:
+        return (_SOUTH if "south" in terms else _NORTH) + int(zone)
     return None
 
 
 def utm(latitude: ArrayLike, longitude: ArrayLike, zone: int) -> FloatArray:
     """UTM coordinates (N, 2) on WGS 84, m: easting and northing, of degrees (N,); the zone is negative in the south.
 
-    Krüger's series to the third power of the third flattening (Karney 2011, equations 7-9, 11, 35): exact to 0.1 mm
-    within a zone.
+    Of UPS (zone 61) the polar stereographic projection (Snyder 1987, equations 15-9 and 21-33). Krüger's series to the
+    third power of the third flattening (Karney 2011, equations 7-9, 11, 35): exact to 0.1 mm within a zone.
     """
     phi = np.radians(np.asarray(latitude, dtype=np.float64))
-    away = np.radians(np.asarray(longitude, dtype=np.float64) - _central_meridian(abs(zone)))
+    degrees = np.asarray(longitude, dtype=np.float64) - _central_meridian(abs(zone))
+    away = np.radians((degrees + 180.0) % 360.0 - 180.0)
     n = _THIRD_FLATTENING
     eccentricity = 2 * math.sqrt(n) / (1 + n)
+    if abs(zone) == _POLAR:
+        pole = math.copysign(1.0, zone)
+        sine = np.sin(pole * phi)
+        conformal = np.exp(eccentricity * np.arctanh(eccentricity * sine)) * np.tan(np.pi / 4 - pole * phi / 2)
+        distance = _POLAR_RADIUS * conformal
+        return _POLAR_FALSE + np.stack([distance * np.sin(away), -pole * distance * np.cos(away)], axis=-1)
     sine = np.sin(phi)
     t = np.sinh(np.arctanh(sine) - eccentricity * np.arctanh(eccentricity * sine))
     xi, eta = np.arctan2(t, np.cos(away)), np.arctanh(np.sin(away) / np.hypot(1.0, t))
@@ -136,29 +250,39 @@ def _from_utm(east: FloatArray, north: FloatArray, zone: int) -> FloatArray:
     Exact to 1 mm within a zone.
     """
     n = _THIRD_FLATTENING
+    if abs(zone) == _POLAR:
+        x, y, pole = east - _POLAR_FALSE, north - _POLAR_FALSE, math.copysign(1.0, zone)
+        chi = np.pi / 2 - 2 * np.arctan(np.hypot(x, y) / _POLAR_RADIUS)
+        return np.stack([pole * np.degrees(_latitude(chi)), np.degrees(np.arctan2(x, -pole * y))], axis=-1)
     place = (north - (_FALSE_NORTHING if zone < 0 else 0.0) + 1j * (east - _FALSE_EASTING)) / _RADIUS
     series = (n / 2 - 2 * n**2 / 3 + 37 * n**3 / 96, n**2 / 48 + n**3 / 15, 17 * n**3 / 480)
     sphere = place - sum(factor * np.sin(2 * order * place) for order, factor in enumerate(series, start=1))
     conformal = np.arcsin(np.sin(sphere.real) / np.cosh(sphere.imag))
-    to_latitude = (2 * n - 2 * n**2 / 3 - 2 * n**3, 7 * n**2 / 3 - 8 * n**3 / 5, 56 * n**3 / 15)
-    phi = conformal + sum(factor * np.sin(2 * k * conformal) for k, factor in enumerate(to_latitude, start=1))
-    away = np.arctan2(np.sinh(sphere.imag), np.cos(sphere.real))
-    return np.stack([np.degrees(phi), np.degrees(away) + _central_meridian(abs(zone))], axis=-1)
+    away = np.degrees(np.arctan2(np.sinh(sphere.imag), np.cos(sphere.real))) + _central_meridian(abs(zone))
+    return np.stack([np.degrees(_latitude(conformal)), (away + 180.0) % 360.0 - 180.0], axis=-1)
+
+
+def _latitude(conformal: FloatArray) -> FloatArray:
+    """Latitudes of conformal ones, radians."""
+    n = _THIRD_FLATTENING
+    series = (2 * n - 2 * n**2 / 3 - 2 * n**3, 7 * n**2 / 3 - 8 * n**3 / 5, 56 * n**3 / 15)
+    phi: FloatArray = conformal + sum(factor * np.sin(2 * k * conformal) for k, factor in enumerate(series, start=1))
+    return phi
 
 
 def _central_meridian(zone: int) -> float:
     """Degrees."""
-    return 6.0 * zone - 183.0
+    return 0.0 if zone == _POLAR else 6.0 * zone - 183.0
 
 
-def _rasterio(epsg: int) -> ModuleType:
+def _rasterio(system: str) -> ModuleType:
     """The module, with what is needed of it."""
     try:
         module = import_module("rasterio")
         import_module("rasterio.warp")
     except ImportError as error:
         raise ArgumentError(
-            f"EPSG:{epsg} needs rasterio (pip install 'rdstitch[crs]'); UTM on WGS 84, EPSG:32601 to 32660 and "
+            f"{system} needs rasterio (pip install 'rdstitch[crs]'); UTM on WGS 84, EPSG:32601 to 32660 and "
             "32701 to 32760, does not"
         ) from error
     return module
@@ -166,11 +290,11 @@ def _rasterio(epsg: int) -> ModuleType:
 
 def _check_projected(epsg: int) -> None:
     """Refuse what is not a projected system in metres."""
-    rasterio = _rasterio(epsg)
+    rasterio = _rasterio(f"EPSG:{epsg}")
     try:
         with rasterio.Env():  # else GDAL prints
             crs = rasterio.crs.CRS.from_epsg(epsg)
     except rasterio.errors.CRSError as error:
         raise ArgumentError(f"EPSG:{epsg} is not known; give the code of a projected coordinate system") from error
     if not crs.is_projected or crs.linear_units != "metre":
-        raise ArgumentError(f"EPSG:{epsg} is not a projected coordinate system in metres; choose one that is")
+        raise NotMetricError(f"EPSG:{epsg} is not a projected coordinate system in metres; choose one that is")

@@ -12,10 +12,11 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import tilt_from_normal, turned_tilt
+from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import by_image, csv_rows, image_name
 from rdstitch.results.messages import shortened
-from rdstitch.system.file_access import file_state, read_text
+from rdstitch.system.file_access import canonical_name, file_state, read_text
 
 XMP = "xmp"
 """The value of ``attitude`` that stands for the images' own XMP."""
@@ -97,33 +98,60 @@ def positions_of(sources: Sequence[Source]) -> FloatArray:
     return metres
 
 
-def timestamps_of(sources: Sequence[Source], file: str | Path | None = None) -> FloatArray:
+def timestamps_of(sources: Sequence[Source]) -> FloatArray:
     """Time stamps (N,), s; NaN where nothing is known.
 
-    Without a file, that of the video (from its beginning) or bag, else that of EXIF (since 1970, in UTC where EXIF has
-    no time zone).
+    That of a table, see :func:`with_times`, or of the video (from its beginning) or bag, else that of EXIF (since 1970,
+    in UTC where EXIF has no time zone).
+    """
+    own = [(None if source.frame is None else source.frame.timestamp) for source in sources]
+    times = [s.metadata.timestamp if known is None else known for s, known in zip(sources, own, strict=True)]
+    return np.array([math.nan if time is None else time for time in times])
+
+
+def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
+    """Everything that was named, each with its time by a file; before anything of it is left out.
 
     Parameters
     ----------
-    file : path, optional
+    file : path or None
         CSV with a header that names the columns ``name`` and ``timestamp``; or lines ``TIMESTAMP NAME`` as in the lists
         of the TUM benchmark; or one time a line, the n-th for the n-th image or frame of the video, as KITTI's
         ``times.txt``. Lines that begin with ``#`` are ignored.
     """
     if file is None:
-        own = [(None if source.frame is None else source.frame.timestamp) for source in sources]
-        times = [s.metadata.timestamp if known is None else known for s, known in zip(sources, own, strict=True)]
-        return np.array([math.nan if time is None else time for time in times])
+        return list(frames)
     named = _read_times(file, file_state(file))
-    if isinstance(named, list):
-        numbers = [source.number(position) for position, source in enumerate(sources)]
-        if max(numbers) >= len(named):
-            raise InputError(f"{file}: has {len(named)} times, but image or frame {max(numbers)} (from 0) needs one")
-        return np.array([named[number] for number in numbers])
-    for source in sources:
-        if source.name not in named:
-            raise InputError(f"{file}: has no time for {source.name}; add a line with its name and time")
-    return np.array([named[source.name] for source in sources])
+    if not isinstance(named, list):
+        return [replace(frame, timestamp=_time_of(frame, named, file)) for frame in frames]
+    numbers = np.array([position if frame.number is None else frame.number for position, frame in enumerate(frames)])
+    if len(np.unique(numbers)) < len(numbers):  # of several videos
+        numbers = np.arange(len(frames))
+    steps = np.unique(np.diff(np.sort(numbers)))
+    # Of every n-th frame of a video up to n - 1 may follow the last; of chosen ones, any number.
+    most = numbers.max() + steps[0] if len(steps) == 1 else math.inf if len(steps) else 1
+    if not numbers.max() < len(named) <= most:
+        last = f" or frames, the last with the number {numbers.max()} from 0" if most != len(frames) else ""
+        raise InputError(f"{file}: has {len(named)} times for {len(frames)} images{last}; give one for each, in order")
+    return [replace(frame, timestamp=named[number]) for frame, number in zip(frames, numbers.tolist(), strict=True)]
+
+
+def time_of(frame: Frame, file: str | Path) -> float | None:
+    """The same of one frame, by its number or name; None where a file that grows as the frames do has no time yet."""
+    try:
+        named = _read_times(file, file_state(file))
+        if isinstance(named, list):
+            return named[frame.number] if frame.number is not None and frame.number < len(named) else None
+        return _time_of(frame, named, file)
+    except InputError:
+        return None
+
+
+def _time_of(frame: Frame, named: dict[str, float], file: str | Path) -> float:
+    name = canonical_name(frame.path.name)
+    if name not in named:
+        raise InputError(f"{file}: has no time for {name}; add a line with its name and time")
+    return named[name]
 
 
 @lru_cache(maxsize=1)  # frames that are followed ask one after the other

@@ -4,28 +4,29 @@
 CSV with a header                 a name, and latitude and longitude, or x and y; as ``exiftool -csv`` too
 JSON                              what ``exiftool -json`` writes
 GPX                               a track, in which images have their places by their times
-a coordinate system, then lines   OpenDroneMap's ``geo.txt``: NAME X Y [Z …]
+SRT                               subtitles of a DJI video, a track likewise
+MRK                               events of a DJI receiver, by the number that the images' names end with
+a coordinate system, then lines   OpenDroneMap's ``geo.txt``: NAME X Y [Z … HORIZONTAL VERTICAL ACCURACY]
 ================================= ====================================================================
 """
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.errors import InputError
-from rdstitch.geometry.crs import WGS84, Crs, epsg_of
-from rdstitch.inputs.measurements import timestamps_of
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.geometry.crs import WGS84, Crs, NamedSystem
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import Row, by_image, csv_rows, json_rows, listed_rows
+from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points
 from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.system.file_access import canonical_text, read_text
-from rdstitch.system.records import parse_xml
 
 _COLUMNS = {
     "name": "name filename sourcefile image imagename file label",
@@ -36,8 +37,12 @@ _COLUMNS = {
     "y": "y northing north",
     "south": "gpslatituderef",
     "west": "gpslongituderef",
+    "north_std": "rtkstdlat northstd horizontalaccuracy haccuracy hacc accuracy",
+    "east_std": "rtkstdlon eaststd",
+    "up_std": "rtkstdhgt upstd verticalaccuracy vaccuracy vacc",
 }
-_GEOGRAPHIC = (("longitude", "west"), ("latitude", "south"))
+_SIDES = (("latitude", "south"), ("longitude", "west"))
+_LISTED = ("name", "x", "y", "altitude", "yaw", "pitch", "roll", "north_std", "up_std")  # in geo.txt
 _WANTED = ("name,latitude,longitude", "name,x,y")
 _UNITS = ("deg", "degrees", "m", "metres", "meters")
 _RECORDS = "a list of objects with SourceFile, GPSLatitude and GPSLongitude"
@@ -50,18 +55,24 @@ def with_positions(
     if file is None:
         return list(sources)
     text, name = read_text(file), str(file)
+    system = None if epsg is None else NamedSystem(f"EPSG:{epsg}", epsg)
     lines = text.split("\n", 1)
     if text.lstrip().startswith("<"):
-        places = _on_track(sources, text, name, offset)
+        places = on_track(sources, track_points(text, name), name, offset)
+    elif points := subtitle_points(text):
+        places = on_track(sources, points, name, offset)
+    elif is_list_of_events(text):
+        places = by_events(sources, text, name)
     else:
         if text.lstrip().startswith(("[", "{")):
             rows = json_rows(text, name, _COLUMNS, _RECORDS)
-        elif (system := epsg_of(lines[0])) is not None:
-            rows, epsg = listed_rows("".join(lines[1:]).splitlines(), name, ("name", "x", "y", "altitude"), 2), system
+        elif (named := NamedSystem.named_by(lines[0])) is not None:
+            rows, system = listed_rows("".join(lines[1:]).splitlines(), name, _LISTED, 2), named
         else:
             rows = csv_rows(text, name, _COLUMNS, _WANTED, _UNITS)
-        table = _table(rows, name, epsg)
-        places = [table.get(source.name) for source in sources]
+        table = _table(rows, name, system)
+        called = _same_names(sources, table)
+        places = [table.get(called[source.name]) for source in sources]
         if not any(places):
             raise InputError(f"{file}: has no position of {sources[0].name}, nor of any other of the images")
     return [
@@ -70,14 +81,14 @@ def with_positions(
     ]
 
 
-def _table(rows: Iterable[Row], file: str, epsg: int | None) -> dict[str, GpsPosition]:
+def _table(rows: Iterable[Row], file: str, system: NamedSystem | None) -> dict[str, GpsPosition]:
     """The positions by the names of the images; what has no position, or no fix, is not in it."""
     table: dict[str, GpsPosition] = {}
-    projected: dict[str, tuple[float, float, float | None]] = {}
+    projected: dict[str, tuple[float, float]] = {}
     placed = []
     for row in rows:
         geographic = not row.values.keys().isdisjoint(("latitude", "longitude"))
-        x, y = (_degrees(row, *c) for c in _GEOGRAPHIC) if geographic else (row.number("x"), row.number("y"))
+        y, x = (_degrees(row, *c) for c in _SIDES) if geographic else (row.number("y"), row.number("x"))
         if x is not None and y is not None and not (geographic and x == y == 0.0):
             placed.append((row, x, y, geographic))
     by_image(row for row, *_ in placed)
@@ -85,27 +96,39 @@ def _table(rows: Iterable[Row], file: str, epsg: int | None) -> dict[str, GpsPos
         altitude = next(iter(row.numbers_within("altitude")), None)
         if altitude is not None and "below" in row.values["altitude"].lower():
             altitude = -altitude
-        if geographic or epsg == WGS84:
+        if geographic or (system is not None and system.epsg == WGS84):
             if not (abs(y) <= 90.0 and abs(x) <= 180.0):
                 raise InputError(f"{row.where}: expected latitude and longitude in degrees, not {y:g} and {x:g}")
-            table[row.image] = GpsPosition(y, x, altitude)
-        elif epsg is None:
+        elif system is None:
             raise InputError(f"{row.where}: in which coordinate system x and y are is not known; give --crs")
         else:
-            projected[row.image] = x, y, altitude
+            projected[row.image] = x, y
+        table[row.image] = GpsPosition(y, x, altitude, _accuracy(row))
     if projected:
-        assert epsg is not None
-        values = np.array([(x, y) for x, y, _ in projected.values()])
-        for (name, (_, _, altitude)), place in zip(projected.items(), _geographic(epsg, values, file), strict=True):
-            table[name] = GpsPosition(*place, altitude)
+        assert system is not None
+        places = _geographic(system, np.array(list(projected.values())), file)
+        for name, (latitude, longitude) in zip(projected, places, strict=True):
+            table[name] = replace(table[name], latitude=latitude, longitude=longitude)
     return table
 
 
-def _geographic(epsg: int, places: FloatArray, file: str) -> list[tuple[float, float]]:
+def _accuracy(row: Row) -> tuple[float, float] | None:
+    """Standard deviations of one horizontal coordinate and of the altitude, m; None where the row has none."""
+    along, across, up = (row.number(name) for name in ("north_std", "east_std", "up_std"))
+    if not (along and along > 0.0):
+        return None
+    across = across if across and across > 0.0 else along
+    return math.hypot(along, across) / math.sqrt(2.0), up if up and up > 0.0 else 2.0 * max(along, across)
+
+
+def _geographic(system: NamedSystem, places: FloatArray, file: str) -> list[tuple[float, float]]:
     """Latitude and longitude of eastings and northings (N, 2)."""
-    found = np.asarray(Crs(epsg).geographic(places))
+    try:
+        found = system.geographic(places)
+    except ArgumentError as error:
+        raise InputError(f"{file}: {error}") from error
     if not (np.isfinite(found).all() and (np.abs(found) <= (90.0, 180.0)).all()):
-        raise InputError(f"{file}: EPSG:{epsg} has no such places; give the coordinate system of x and y")
+        raise InputError(f"{file}: {system.text} has no such places; give the coordinate system of x and y")
     return [(latitude, longitude) for latitude, longitude in found.tolist()]
 
 
@@ -116,80 +139,68 @@ def _degrees(row: Row, column: str, reference: str) -> float | None:
     text = row.values[column]
     value = sum(abs(part) / 60.0**k for k, part in enumerate(parts[:3]))
     side = re.search(r"\b([NSEW])\w*\s*$", f"{text} {row.values.get(reference, '')}", re.IGNORECASE)
+    if side is None and "deg" in text:
+        raise InputError(f"{row.where}: '{text}' does not say whether north or south, east or west; add N, S, E or W")
     return -value if text.startswith("-") or (side is not None and side[1] in "SsWw") else value
 
 
-def _on_track(sources: Sequence[Source], text: str, file: str, offset: float) -> list[GpsPosition | None]:
-    """Where the images are on a track, straight from point to point."""
-    points = []
-    for item in parse_xml(text, file).iter():
-        time = item.findtext("time")
-        if item.tag not in ("trkpt", "rtept", "wpt") or time is None:
-            continue
-        try:
-            moment = datetime.fromisoformat(time.strip())
-            values = (float(item.get("lat", "")), float(item.get("lon", "")), float(item.findtext("ele") or "nan"))
-        except ValueError as error:
-            raise InputError(f"{file}: a point of the track at {time!r} cannot be read: {error}") from error
-        points.append(((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp(), *values))
-    if not points:
-        raise InputError(f"{file}: has no points with a time; give a GPX track")
-    seconds, latitude, longitude, altitude = np.array(sorted(points)).T
-    times = timestamps_of(sources) + offset
-    if not ((times >= seconds[0]) & (times <= seconds[-1])).any():
-        taken = f"from {_moment(np.nanmin(times))} to {_moment(np.nanmax(times))}" if np.isfinite(times).any() else ""
-        raise InputError(
-            f"{file}: the track goes from {_moment(seconds[0])} to {_moment(seconds[-1])} UTC, the images "
-            f"{f'were taken {taken}; give --positions-offset' if taken else 'have no time'}"
-        )
-    known = (latitude, np.unwrap(longitude, period=360.0), altitude)
-    rows = np.stack([np.interp(times, seconds, values, left=np.nan, right=np.nan) for values in known], axis=1)
-    return [
-        None if math.isnan(y) else GpsPosition(y, (x + 180.0) % 360.0 - 180.0, None if math.isnan(z) else z)
-        for y, x, z in rows.tolist()
-    ]
+def _same_names(sources: Sequence[Source], listed: Iterable[str]) -> dict[str, str]:
+    """What a list calls each image: its name, or that in other case where only one image and one line are called so."""
+    names, lines = Counter(s.name.casefold() for s in sources), {name.casefold(): name for name in set(listed)}
+    known = set(listed)
+    found = {}
+    for source in sources:
+        alike = lines.get(source.name.casefold(), source.name)
+        found[source.name] = alike if source.name not in known and names[alike.casefold()] == 1 else source.name
+    return found
 
 
-def _moment(seconds: float) -> str:
-    return str(np.datetime64(int(seconds), "s"))
-
-
-def with_ground_control(sources: Sequence[Source], file: str | Path | None) -> list[Source]:
+def with_ground_control(sources: Sequence[Source], file: str | Path | None, *, check: bool = False) -> list[Source]:
     """The sources with the ground control points that they show by OpenDroneMap's ``gcp_list.txt``, if there is one.
 
     Its first line names the coordinate system, each other one is ``X Y Z PX PY IMAGE [NAME]``: pixels of the upright
-    image, the centre of the top-left one at (0, 0).
+    image, the centre of the top-left one at (0, 0). Points to ``check`` come besides those that the sources have.
     """
     if file is None:
         return list(sources)
-    system, *lines = read_text(file).splitlines() or [""]
-    epsg = epsg_of(system)
-    if epsg is None:
+    first, *lines = read_text(file).splitlines() or [""]
+    system = NamedSystem.named_by(first)
+    if system is None:
         raise InputError(f"{file}: line 1: expected a coordinate system like EPSG:32632 or WGS84 UTM 32N")
     sizes = {source.name: source.metadata.size for source in sources}
     shown: list[tuple[str, str, FloatArray]] = []
     for number, line in enumerate(lines, start=2):
-        fields = line.split()
+        fields = line.split(maxsplit=5)
         if not fields or fields[0].startswith("#"):
             continue
         try:
-            values, rest = np.array([float(field) for field in fields[:5]]), canonical_text(line.split(maxsplit=5)[5])
+            values, rest = np.array([float(field) for field in fields[:5]]), canonical_text(fields[5].strip())
         except (ValueError, IndexError):
             raise InputError(f"{file}: line {number}: expected X Y Z PX PY IMAGE [NAME]") from None
-        # Names may hold blanks: the longest one that is an image's.
-        ends = [blank.start() for blank in re.finditer(r"\s+|$", rest)]
-        image = next((rest[:end] for end in reversed(ends) if rest[:end] in sizes), None)
-        if image is not None:
-            if not ((values[3:] >= -0.5) & (values[3:] < np.array(sizes[image]) - 0.5)).all():
-                size = "{} x {}".format(*sizes[image])
-                raise InputError(f"{file}: line {number}: is not within the {size} pixels of {image}")
-            shown.append((image, rest[len(image) :].strip() or " ".join(fields[:2]), values))
+        image, point = _image_and_point(rest, sizes)
+        if image is None:
+            continue
+        if not ((values[3:] >= -0.5) & (values[3:] < np.array(sizes[image]) - 0.5)).all():
+            size = "{} x {}".format(*sizes[image])
+            raise InputError(f"{file}: line {number}: is not within the {size} pixels of {image}")
+        shown.append((image, point or " ".join(fields[:2]), values))
     if not shown:
         raise InputError(f"{file}: has no ground control point in any of the images")
-    xy = np.array([values[:2] for _, _, values in shown])
-    places = [(y, x) for x, y in xy.tolist()] if epsg == WGS84 else _geographic(epsg, xy, str(file))
+    places = _geographic(system, np.array([values[:2] for _, _, values in shown]), str(file))
+    on_map = system.epsg is not None and system.epsg != WGS84 and Crs.in_metres(system.epsg) is not None
+    epsg = system.epsg if on_map and system.epsg is not None else WGS84
     control: dict[str, list[GroundControl]] = {}
     for (image, name, values), place in zip(shown, places, strict=True):
         pixel = (float(values[3]), float(values[4]))
-        control.setdefault(image, []).append(GroundControl(name, GpsPosition(*place), epsg, pixel))
-    return [replace(source, control=tuple(control.get(source.name, ()))) for source in sources]
+        control.setdefault(image, []).append(GroundControl(name, GpsPosition(*place), epsg, pixel, check=check))
+    return [replace(source, control=(*source.control, *control.get(source.name, ()))) for source in sources]
+
+
+def _image_and_point(text: str, names: Iterable[str]) -> tuple[str | None, str]:
+    """The image that the rest of a line begins with, which may have spaces and other case, and the point's name."""
+    for same in (str, str.casefold):
+        begun = [name for name in names if f"{same(text)} ".startswith(f"{same(name)} ")]
+        if begun:
+            image = max(begun, key=len)
+            return image, text[len(image) :].strip()
+    return None, ""

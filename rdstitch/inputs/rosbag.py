@@ -1,17 +1,20 @@
 """Images of a ROS bag, of version 1 or 2, as image files with time stamps; no ROS is needed, only ``rosbags``."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from rdstitch.camera_files import CameraFile, camera_of_content, load_camera
 from rdstitch.errors import InputError, OutputError
+from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.keyframes import Wanted, wanted_frames
 from rdstitch.io.video import write_frame
@@ -19,6 +22,7 @@ from rdstitch.io.video import write_frame
 _SUFFIXES = (".bag", ".db3", ".mcap")
 _DESCRIPTION = "metadata.yaml"
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TYPES = {
     **dict.fromkeys(("mono8", "8UC1", "rgb8", "bgr8", "8UC3", "rgba8", "bgra8", "8UC4"), np.uint8),
     **dict.fromkeys(("mono16", "16UC1", "rgb16", "bgr16", "16UC3", "rgba16", "bgra16"), np.uint16),
@@ -45,10 +49,9 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in _SUFFIXES or (path.is_dir() and (path / _DESCRIPTION).is_file())
 
 
-def extract_images(
-    path: Path, folder: Path, every: int | None = 1, topic: str | None = None
-) -> tuple[list[Frame], Wanted]:
-    """Write images of a topic to a folder, losslessly, with number and time stamp (s) of the header."""
+@contextmanager
+def opened_bag(path: Path) -> "Iterator[Any]":
+    """The reader of ``rosbags`` for a bag; what goes wrong inside the block is an error that names it."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -58,16 +61,68 @@ def extract_images(
     bag = path.parent if path.suffix.lower() in (".db3", ".mcap") and (path.parent / _DESCRIPTION).is_file() else path
     try:
         with AnyReader([bag], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            connections = [c for c in reader.connections if c.msgtype in (_IMAGE, _COMPRESSED)]
-            chosen = _chosen_topic(path, sorted({c.topic for c in connections}), topic)
-            messages = _Messages(reader, [c for c in connections if c.topic == chosen], path)
-            wanted = wanted_frames(every, messages.grey)
-            return list(messages.frames(folder, wanted)), wanted
+            yield reader
     except (InputError, OutputError):
         raise
     except Exception as error:  # rosbags raises many kinds on damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: cannot be read as a ROS bag ({reason[:160]})") from error
+
+
+def extract_images(
+    path: Path, folder: Path, every: int | None = 1, topic: str | None = None
+) -> tuple[list[Frame], Wanted]:
+    """Write images of a topic to a folder, losslessly, with number and time stamp (s) of the header."""
+    with opened_bag(path) as reader:
+        messages = _Messages.of(reader, path, topic)
+        wanted = wanted_frames(every, messages.grey)
+        return list(messages.frames(folder, wanted)), wanted
+
+
+def images_in_bag(path: Path, folder: Path, every: int, topic: str | None = None) -> Iterator[Frame]:
+    """The same one after the other, every n-th one."""
+    with opened_bag(path) as reader:
+        yield from _Messages.of(reader, path, topic).frames(folder, Wanted(every))
+
+
+def camera_in_bag(path: Path, topic: str | None = None) -> tuple[CameraFile, str] | None:
+    """The calibration that the bag has for a topic of images, and its own topic; None where it has none.
+
+    That is the one beside the images, ``/camera/camera_info`` for ``/camera/image_raw``, or else the only one. Of
+    images that are rectified already (``image_rect``) it is that of the rectified camera.
+    """
+    with opened_bag(path) as reader:
+        connections = [c for c in reader.connections if c.msgtype == _CAMERA_INFO]
+        images = _chosen_topic(path, _image_topics(reader), topic)
+        beside = f"{images.rpartition('/image')[0]}/camera_info"
+        chosen = [c for c in connections if c.topic == beside] or connections
+        for connection, _, data in reader.messages(connections=chosen) if len(chosen) == 1 else ():
+            message = reader.deserialize(data, connection.msgtype)
+            values = {name: getattr(message, name, getattr(message, name.upper(), None)) for name in "dkp"}
+            k, d, p = (np.asarray(values[name], dtype=np.float64).ravel() for name in "kdp")
+            if not k[0] > 0.0:  # as a driver without a calibration writes it
+                return None
+            if "rect" in images.rpartition("/")[2] and p[0] > 0.0:
+                k, d = p.reshape(3, 4)[:, :3].ravel(), d[:0]
+            content: dict[str, Any] = {"width": int(message.width), "height": int(message.height), "k": k.tolist()}
+            content["d"] = d.tolist()
+            if d.size:
+                content["distortion_model"] = message.distortion_model
+            return camera_of_content(content, f"{path}: {connection.topic}"), connection.topic
+    return None
+
+
+def camera_in(path: str | Path) -> Camera:
+    """The camera of a camera file, or of a bag that has its calibration."""
+    if not is_bag(Path(path)):
+        return load_camera(path)
+    if (found := camera_in_bag(Path(path))) is None:
+        raise InputError(f"{path}: the bag has no calibration in a topic of camera_info")
+    return found[0].camera
+
+
+def _image_topics(reader: Any) -> list[str]:
+    return sorted({c.topic for c in reader.connections if c.msgtype in (_IMAGE, _COMPRESSED)})
 
 
 def _chosen_topic(path: Path, topics: list[str], wanted: str | None) -> str:
@@ -89,15 +144,26 @@ class _Messages:
     connections: list[Any]
     path: Path
 
+    @classmethod
+    def of(cls, reader: Any, path: Path, topic: str | None) -> Self:
+        """The images of a topic, or of the only one that has images."""
+        chosen = _chosen_topic(path, _image_topics(reader), topic)
+        images = [c for c in reader.connections if c.topic == chosen and c.msgtype in (_IMAGE, _COMPRESSED)]
+        return cls(reader, images, path)
+
     def grey(self) -> Iterator[NDArray[np.uint8]]:
         """All of them, (H, W), 8 bits; black where one cannot be decoded."""
+        bits = 8
         for connection, _, data in self.reader.messages(connections=self.connections):
             message = self.reader.deserialize(data, connection.msgtype)
             if connection.msgtype == _COMPRESSED:
                 yield _grey_of_compressed(message.data)
                 continue
             pixels = _pixels(self.path, message)
-            pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+            if pixels.dtype != np.uint8:
+                # Sensors of 10 or 12 bits leave the highest ones empty.
+                bits = max(bits, int(pixels.max()).bit_length())
+                pixels = (pixels >> (bits - 8)).astype(np.uint8)
             yield pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
     def frames(self, folder: Path, wanted: Wanted) -> Iterator[Frame]:

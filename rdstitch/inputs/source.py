@@ -19,6 +19,7 @@ from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.io.flat_field import FlatField
+from rdstitch.io.lens_correction import corrected
 from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import GroundControl, Metadata, read_metadata
 from rdstitch.io.read import DecodedImage, read_image, reduced
@@ -83,9 +84,10 @@ class Source:
         return cache.digest((self.frame.image.pixels, self.frame.image.alpha))
 
     def mask_content(self, cache: Cache) -> tuple[object, ...]:
-        """The same of its mask, and of the image circle."""
+        """The same of its mask, of the image circle, and of the lens that it is resampled by."""
         circle = () if self.camera.image_circle is None else (*self.camera.center, self.camera.image_circle)
-        return cache.file(self.mask), self.mask_frame, circle
+        resampled = (self.camera,) if self.camera.lens_model is not None else ()
+        return cache.file(self.mask), self.mask_frame, circle, *resampled
 
     def reduction(self, megapixels: float | None) -> int:
         """By how much it can be read smaller and has no fewer pixels than an image halved to so many 10⁶ pixels."""
@@ -97,7 +99,7 @@ class Source:
         usual = self.reduction(WORK_MEGAPIXELS)
         if reduction % usual:
             return self._within_circle(self._load(reduction), reduction)
-        key = (self.path, self.mask, self.mask_frame, self.flat_field)
+        key = (self.path, self.mask, self.mask_frame, self.flat_field, self.camera.lens_model)
         image = self.decoded_images.take(key) or self._load(usual)
         if keep:
             self.decoded_images.put(key, image)
@@ -124,9 +126,9 @@ class Source:
             raise InputError(f"{self.path}: has {now} pixels now, but had {before} before; run again")
         if self.flat_field is not None:
             image = replace(image, pixels=self.flat_field.corrected(image.pixels, reduction))
-        if self.mask is None:
-            return image
-        return _masked(image, block_minimum(read_mask(self.mask, expected, self.mask_frame), reduction))
+        if self.mask is not None:
+            image = _masked(image, block_minimum(read_mask(self.mask, expected, self.mask_frame), reduction))
+        return corrected(image, self.camera, reduction)
 
     def _within_circle(self, image: DecodedImage, reduction: int) -> DecodedImage:
         """The image without what lies beyond the image circle; its pixels are blocks of so many a side."""

@@ -58,24 +58,31 @@ _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003,
 
 @dataclass(frozen=True)
 class GpsPosition:
-    """Where the camera was: WGS 84 latitude and longitude, degrees; altitude, m above sea, or None."""
+    """Where the camera was: WGS 84 latitude and longitude, degrees; altitude, m above sea, or None.
+
+    ``std``: standard deviations of one horizontal coordinate and of the altitude, m, where the receiver says them.
+    """
 
     latitude: float
     longitude: float
     altitude: float | None = None
+    std: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
 class GroundControl:
     """A point whose place is known: its name, the place, and the pixel of an image that shows it.
 
-    ``epsg`` is the code of the coordinate system that the place was given in.
+    ``epsg`` is the code of the coordinate system that the place was given in, ``std`` the standard deviation of one of
+    its coordinates, m, where known; a ``check`` point is compared with the map, and takes no part in it.
     """
 
     name: str
     place: GpsPosition
     epsg: int
     pixel: tuple[float, float]
+    std: float | None = None
+    check: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,7 @@ class Metadata:
     orientation: int = 1
     focal_px: float | None = None  # focal length, pixels, where the file tells it
     gps: GpsPosition | None = None
+    gps_problem: str = ""  # why the position in the file is not used; empty where it is, or where there is none
     attitude: Attitude | None = None
     make: str = ""  # make, model, serial: of the camera; empty where not known
     model: str = ""
@@ -188,6 +196,7 @@ def _metadata(
     orientation = _orientation(exif.get(_ORIENTATION))
     photo = exif.get_ifd(ExifTags.IFD.Exif)
     xmp = xmp_text(info)
+    gps, gps_problem = _gps(exif.get_ifd(ExifTags.IFD.GPSInfo), xmp)
     dpi = info.get("dpi")
     profile, profile_lost = _colour_profile(info.get("icc_profile"))
     return Metadata(
@@ -195,7 +204,8 @@ def _metadata(
         bit_depth=bit_depth,
         orientation=orientation,
         focal_px=_focal_px(photo, xmp, size),
-        gps=_gps(exif.get_ifd(ExifTags.IFD.GPSInfo)),
+        gps=gps,
+        gps_problem=gps_problem,
         attitude=read_attitude(xmp),
         make=_text(exif.get(ExifTags.Base.Make)),
         model=_text(exif.get(ExifTags.Base.Model)),
@@ -292,17 +302,22 @@ def _timestamp(photo: Mapping[int, Any]) -> float | None:
     return None
 
 
-def _gps(tags: dict[int, Any]) -> GpsPosition | None:
-    """Position from the GPS block, or None where it is absent or impossible."""
-    latitude = _degrees(tags.get(ExifTags.GPS.GPSLatitude), _text(tags.get(ExifTags.GPS.GPSLatitudeRef)) == "S")
-    longitude = _degrees(tags.get(ExifTags.GPS.GPSLongitude), _text(tags.get(ExifTags.GPS.GPSLongitudeRef)) == "W")
+def _gps(tags: dict[int, Any], xmp: str) -> tuple[GpsPosition | None, str]:
+    """Position from the GPS block with accuracies of XMP, or None where it is absent or impossible, and why."""
+    sides = [_text(tags.get(tag)).upper()[:1] for tag in (ExifTags.GPS.GPSLatitudeRef, ExifTags.GPS.GPSLongitudeRef)]
+    latitude = _degrees(tags.get(ExifTags.GPS.GPSLatitude), sides[0] == "S")
+    longitude = _degrees(tags.get(ExifTags.GPS.GPSLongitude), sides[1] == "W")
     if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
-        return None
+        return None, ""
     if latitude == longitude == 0.0:  # what receivers write that have no fix
-        return None
+        return None, ""
+    if sides[0] not in ("N", "S") or sides[1] not in ("E", "W"):
+        return None, "its GPS position does not say whether north or south, east or west"
     altitude = finite(tags.get(ExifTags.GPS.GPSAltitude))
     below_sea = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
-    return GpsPosition(latitude, longitude, -altitude if altitude and below_sea else altitude)
+    along, across, up = (xmp_number(xmp, f"RtkStd{name}") for name in ("Lat", "Lon", "Hgt"))
+    std = None if not (along and across and up) else (math.hypot(along, across) / math.sqrt(2.0), up)
+    return GpsPosition(latitude, longitude, -altitude if altitude and below_sea else altitude, std), ""
 
 
 def _degrees(value: Any, negative: bool) -> float | None:

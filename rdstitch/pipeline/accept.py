@@ -210,9 +210,10 @@ def _aligned_anew(
     """The registration with another alignment, and why images are not in it."""
     known = {k: message.text for k, message in reasons.items()}
     number = {path: k for k, path in enumerate(paths)}
-    known |= {number[m.images[0]]: m.text for m in registration.left_out if m.images[0] in number}
+    again = [message for message in registration.left_out if message.images[0] in number]  # the others were not read
+    known |= {number[m.images[0]]: m.text for m in again}
     unused = explain_unaligned(aligned.alignment, paths, registration.keypoints, known)
-    dropped = (*registration.alignment.messages, *registration.left_out)
+    dropped = (*registration.alignment.messages, *again)
     whole = [message for message in registration.messages if message not in dropped]
     messages = (*aligned.alignment.messages, *whole, *unused)
     return replace(registration, alignment=aligned.alignment, messages=messages)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rdstitch.compositing import CompositeOptions
-from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
+from rdstitch.errors import ArgumentError, InputError, PartialResultError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.inputs.find import found_images
@@ -19,7 +19,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.opening import check_readable
-from rdstitch.pipeline.compose import compose_images, plainly_viewed, write_page
+from rdstitch.pipeline.compose import check_world_files, compose_images, image_files, plainly_viewed, write_page
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.straighten import turned_anew
@@ -40,7 +40,7 @@ from rdstitch.sidecar.write import (
 )
 from rdstitch.system.file_access import canonical_name, canonical_text
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import Outputs, check_output, json_bytes
+from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
 from rdstitch.system.progress import Progress, silent
 
 
@@ -236,7 +236,7 @@ def apply(
     given = as_inputs(images, channel_order)
     with found_images(given, output=output, every=every, topic=topic) as listed, Outputs(overwrite) as outputs:
         if output is not None:
-            _check_outputs(Path(output), overwrite, listed.files, saved.path)
+            check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
         chosen, matched = _match(saved, listed.frames, match)
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
@@ -246,6 +246,8 @@ def apply(
             corrected, said = with_flat_field(list(used.values()), flat_field)
             used = dict(zip(used, corrected, strict=True))
             doubts += said
+        if output is not None:
+            check_world_files([output], list(used.values()), overwrite)
         placed, said = turned_anew(_placed(saved, used), options, saved.composite)
         doubts += said
         composed = compose_images(
@@ -254,7 +256,6 @@ def apply(
             options,
             StitchOptions(workers=workers).threads,
             progress,
-            overwrite=overwrite,
             outputs=outputs,
             dry_run=dry_run,
         )
@@ -310,15 +311,6 @@ def _used(
         first = next(iter(left_out.values()))
         raise InputError(f"{saved.path}: none of its images can be used; {first.images[0]}: {first.text}")
     return dict(zip(used, with_masks(list(used.values()), mask), strict=True))
-
-
-def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sidecar: Path) -> None:
-    """Find out before long work whether the image and its sidecar can be written."""
-    beside = Path(f"{output}.json")
-    if beside.exists() and beside.samefile(sidecar):
-        raise OutputError(f"{output}: its sidecar is the one that is applied; choose another name")
-    check_output(output, overwrite, inputs)
-    check_output(beside, overwrite, inputs, suffixes=())
 
 
 def _match(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) -> tuple[list[Frame | None], str]:

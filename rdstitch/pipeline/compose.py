@@ -18,10 +18,11 @@ from rdstitch.compositing import (
     compose_to_file,
     plan_composite,
 )
+from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.tiles import Block, BlockRunner, OutputStrip
-from rdstitch.errors import OutputError
+from rdstitch.compositing.upright import Corners
 from rdstitch.executors import in_order
-from rdstitch.export.georeference import Georeference, world_file_paths
+from rdstitch.export.georeference import Georeference, has_place, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space
@@ -33,7 +34,7 @@ from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.results.stitch_result import OutputImage, StitchResult
 from rdstitch.system.cache import Cache, Stored
-from rdstitch.system.outputs import Outputs, check_output, text_bytes
+from rdstitch.system.outputs import Outputs, check_outputs, text_bytes
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.system.progress import Progress
 from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
@@ -57,7 +58,6 @@ def compose_images(
     threads: int,
     progress: Progress,
     *,
-    overwrite: bool,
     outputs: Outputs,
     elsewhere: BlockRunner | None = None,
     dry_run: bool = False,
@@ -69,8 +69,6 @@ def compose_images(
     output : path or None
         File that the image is written to, a strip at a time, with colour profile and EXIF of the first image, and
         with its place on the Earth where three images have a GPS position; without it the image is made in memory.
-    overwrite : bool
-        Replace an existing world file.
     outputs : Outputs
         Where the files are staged.
     elsewhere : callable, optional
@@ -79,8 +77,10 @@ def compose_images(
         Only plan.
     """
     return_freed_memory()
-    world_files = _files_beside(output, placed, overwrite)
+    world_files = world_file_paths(output) if output is not None and placed.has_place else ()
     canvas, place, reason = plan_on_map(placed, options)
+    if options.rectangle is not None:
+        canvas = replace(canvas, cropped_to=_box_of_rectangle(placed, options.rectangle, canvas))
     notes = [*_masked(placed), *place_messages(place, reason, placed)]
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
@@ -148,6 +148,19 @@ def _planned(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) ->
     return plan_composite(placed.cameras, canvas, options, channels, size, masked=masked)
 
 
+def _box_of_rectangle(placed: PlacedImages, corners: Corners, canvas: Canvas) -> Box | None:
+    """Where the rectangle that the user has named lies on the canvas; None where its corners have no place there."""
+    index = placed.reference
+    if index is None:
+        return None
+    places = canvas.place(placed.cameras[index], placed.homographies[index], np.reshape(corners, (4, 2)))
+    if not np.isfinite(places).all():
+        return None
+    low = np.clip(np.rint(places.min(axis=0)), 0, canvas.size).astype(int)
+    high = np.clip(np.rint(places.max(axis=0)) + 1, 0, canvas.size).astype(int)
+    return (*low.tolist(), *high.tolist()) if (high > low).all() else None
+
+
 def _masked(placed: PlacedImages) -> list[Message]:
     """What was left out of every image."""
     if placed.static is None:
@@ -157,20 +170,16 @@ def _masked(placed: PlacedImages) -> list[Message]:
     return [Message(text, severity="detail")]
 
 
-def _files_beside(output: str | Path | None, placed: PlacedImages, overwrite: bool) -> tuple[Path, ...]:
-    """The world files that will be written; they and the viewer's page must not exist, or be replaceable."""
-    if output is None:
-        return ()
-    world_files = tuple(map(Path, world_file_paths(output))) if placed.has_place else ()
+def image_files(output: str | Path) -> list[Path]:
+    """An image and what always belongs to it: the sidecar, and the page of a Deep Zoom image."""
     page = viewer_path(output)
-    for file in world_files:
-        check_output(file, overwrite, suffixes=())
-    if page is not None:
-        try:
-            check_output(page, overwrite, suffixes=())
-        except OutputError as error:
-            raise OutputError(f"{error} (it becomes the page that shows {output})") from error
-    return world_files
+    return [Path(output), Path(f"{output}.json"), *([] if page is None else [page])]
+
+
+def check_world_files(outputs: Iterable[str | Path], sources: Sequence[Source], overwrite: bool) -> None:
+    """Find out before long work whether the files that place images on the Earth can be written, if there will be."""
+    if has_place([source.metadata.gps for source in sources]) or any(source.control for source in sources):
+        check_outputs([file for output in outputs for file in world_file_paths(output)], overwrite)
 
 
 def _write_world_files(outputs: Outputs, paths: Sequence[Path], place: Georeference) -> None:

@@ -18,7 +18,7 @@ from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.inputs.frame import Frame, Image, as_inputs
-from rdstitch.inputs.measurements import timestamps_of
+from rdstitch.inputs.measurements import time_of, timestamps_of
 from rdstitch.inputs.selection import is_selected, with_masks
 from rdstitch.inputs.source import Source
 from rdstitch.io.write import write_image
@@ -42,22 +42,12 @@ class FollowedPoses:
     ----------
     height : float
         Of the first keyframe above the plane, in the unit that positions shall have.
-    timestamps : path, optional
-        File of time stamps, see :func:`rdstitch.inputs.measurements.timestamps_of`.
     frame : str
         "enu" or "camera", see :mod:`rdstitch.export.trajectory_files`.
     """
 
     height: float = 1.0
-    timestamps: str | Path | None = None
     frame: TrajectoryFrame = "enu"
-
-    def timestamp(self, source: Source) -> float:
-        """Of a frame, s; NaN where nothing is known of it, or not yet."""
-        try:
-            return float(timestamps_of([source], self.timestamps)[0])
-        except InputError:  # the table may grow as the frames do; at the end it must be whole
-            return math.nan
 
     def fields(self, pose: CameraPose | None) -> dict[str, float | None]:
         """x, y, yaw and height."""
@@ -167,10 +157,10 @@ def follow(
     numbers = count()
     unread: dict[Path, int] = {}  # numbers of frames that come again
     for arrived in frames:
-        if not is_selected(arrived, options.exclude, options.include_only):
-            continue
         number = unread.pop(arrived.path, -1)
         number = next(numbers) if number < 0 else number
+        if not is_selected(arrived, options.exclude, options.include_only):
+            continue
         frame = arrived if arrived.number is not None else replace(arrived, number=number)
         source, image, reason = tracker.read(frame)
         if (image is None or (source is not None and source.guard.messages)) and comes_again(arrived):
@@ -252,6 +242,8 @@ class Tracker:
     def read(self, frame: Frame) -> tuple[Source | None, PreparedImage | None, str]:
         """The frame as a source, and as it is tracked; or why it is not."""
         options, features = self._options, self._detection
+        if options.timestamps is not None and (time := time_of(frame, options.timestamps)) is not None:
+            frame = replace(frame, timestamp=time)
         sources, unread = read_frames([frame], options, skip_bad=True)
         if not sources:
             return None, None, unread[0].text
@@ -269,7 +261,7 @@ class Tracker:
         label = Pose(frame.path.name, frame.number or 0, math.nan, None, reason, self._poses)
         if source is None or image is None:
             return [label]
-        label = replace(label, name=source.name, timestamp=self._poses.timestamp(source))
+        label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))
         camera = at_working_size(source.camera, self._detection.limits[1])
         results = self._frames.add(image, camera)
         self._labels[results[-1].number] = label

@@ -28,17 +28,19 @@ def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
 
 
 def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas, Georeference | None, str]:
-    """The canvas with its place on the Earth, or why it has none."""
+    """The canvas with its place on the Earth, and why it has none, or what contradicts it."""
     canvas = plan(placed, options)
-    if placed.turned:
+    place: Georeference | None
+    if options.georeference == "off":
+        place, reason = None, ""
+    elif placed.turned:
         place, reason = None, "the camera turned on the spot"
-    elif placed.place is not None and options.epsg in (None, placed.place.crs.epsg):
+    elif placed.place is not None:
         place, reason = placed.place.after(canvas.matrix), ""
+        if options.epsg is not None:
+            place = place.in_system(Crs(options.epsg), np.concatenate(canvas.footprints))
     else:
-        names = [source.name for source in placed.sources]
-        to_output = canvas.matrix @ placed.homographies
-        control = [source.control for source in placed.sources]
-        place, reason = georeference(placed.positions, placed.cameras, to_output, names, options.epsg, control)
+        place, reason = georeference(placed.located(canvas), options.epsg, force=options.georeference == "force")
     if place is None:
         if options.gsd is not None:
             raise ArgumentError(f"gsd needs a georeferenced output: {reason}; leave it out")
@@ -53,7 +55,7 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
         if (rotate, scale) == (options.rotate, options.scale)
         else plan(placed, replace(options, rotate=rotate, scale=scale, gsd=None))
     )
-    return laid, moved(place, canvas, laid), ""
+    return laid, moved(place, canvas, laid), reason
 
 
 def moved(place: Georeference | None, one: Canvas, other: Canvas) -> Georeference | None:
@@ -63,16 +65,26 @@ def moved(place: Georeference | None, one: Canvas, other: Canvas) -> Georeferenc
 
 def place_messages(place: Georeference | None, reason: str, placed: PlacedImages) -> list[Message]:
     """What the user should know of the place; nothing where hardly an image has a position."""
+    lost = [source for source in placed.sources if source.metadata.gps_problem]
+    messages = [
+        Message(f"{each.metadata.gps_problem}, and was not used; give --positions", (str(each.path),)) for each in lost
+    ]
     if place is None:
-        return [Message(f"not georeferenced: {reason}")] if placed.has_place else []
-    messages = [Message(place.summary, severity="note")]
+        known = reason and placed.has_place
+        return [*messages, Message(f"not georeferenced: {reason}")] if known else messages
+    messages += [Message(reason)] if reason else []
+    messages.append(Message(place.summary, severity="note"))
+    if place.assumption:
+        messages.append(Message(place.assumption))
+    if place.checks:
+        messages.append(Message(place.check_summary, severity="note"))
     if place.rejected:
         names = [name for name, _ in place.rejected]
         more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
         off = max(away for _, away in place.rejected)
         messages.append(
             Message(
-                f"{place.source} that the images contradict, by up to {off:.0f} m, were not used: "
+                f"{place.source} that the images contradict, by up to {off:.3g} m, were not used: "
                 f"{', '.join(names[:MAX_NAMED])}{more}"
             )
         )

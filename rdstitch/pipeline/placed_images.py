@@ -15,7 +15,7 @@ from rdstitch.compositing.canvas import NearPart
 from rdstitch.compositing.source_images import Displacement, PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.errors import ArgumentError
-from rdstitch.export.georeference import Georeference, has_place
+from rdstitch.export.georeference import Georeference, Located, has_place
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
@@ -110,6 +110,17 @@ class PlacedImages:
     def has_place(self) -> bool:
         """Whether enough is known for a place of the output on the Earth to be expected."""
         return has_place(self.positions) or (not self.turned and any(source.control for source in self.sources))
+
+    def located(self, canvas: Canvas) -> Located:
+        """The images on a canvas with what is known of where they are."""
+        return Located(
+            self.positions,
+            self.cameras,
+            canvas.matrix @ self.homographies,
+            [source.name for source in self.sources],
+            [source.metadata.nadir for source in self.sources],
+            [source.control for source in self.sources],
+        )
 
     def images(self, near: Sequence[NearPart | None]) -> list[PlacedImage]:
         """As the compositor takes them, with only the near parts of those that are not drawn whole."""

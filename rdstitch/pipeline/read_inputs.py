@@ -1,15 +1,16 @@
 """From frames and options to the images that are registered."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import natural_key
-from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.measurements import with_attitudes
 from rdstitch.inputs.positions import with_ground_control, with_positions
+from rdstitch.inputs.rosbag import camera_in_bag, is_bag
 from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.flat_field import read_flat_field
@@ -27,6 +28,19 @@ def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
     if len(frames) > EXHAUSTIVE_UP_TO or any(frame.image is not None for frame in frames):
         return frames
     return sorted(frames, key=lambda frame: (natural_key(frame.path), frame.number or 0))
+
+
+def with_camera_in_bag(inputs: Iterable[Named], options: StitchOptions) -> tuple[StitchOptions, list[Message]]:
+    """Options with the calibration that a ROS bag has of its camera, where no lens is given; and that it is used."""
+    named = [Path(item) for item in inputs if not isinstance(item, Frame)]
+    if options.known_distortion is not None or len(named) != 1 or not is_bag(named[0]):
+        return options, []
+    found = camera_in_bag(named[0], options.topic)
+    if found is None:
+        return options, []
+    text = f"the calibration in the bag, {found[1]}, is used; --camera FILE takes another one"
+    note = Message(text, (str(named[0]),), "note")
+    return replace(options, camera=found[0].camera, lens="auto", solver="auto"), [note]
 
 
 def read_frames(
@@ -60,7 +74,7 @@ def read_inputs(
         raise ArgumentError(f"{twice}stitching needs two different images or more; name at least one more")
     sources = with_attitudes(with_masks(sources, options.mask), options.attitude)
     sources = with_positions(sources, options.positions, options.composite.epsg, options.positions_offset)
-    sources = with_ground_control(sources, options.gcp)
+    sources = with_ground_control(with_ground_control(sources, options.gcp), options.check_points, check=True)
     return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), unread
 
 

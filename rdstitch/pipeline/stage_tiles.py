@@ -23,6 +23,8 @@ from rdstitch.io.reduction import mean_of_channels
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.pipeline.compose import check_world_files, image_files
+from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
 from rdstitch.results.messages import Message, names_of, shortened
@@ -34,7 +36,7 @@ from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from
 from rdstitch.stage.register_tiles import TileRegistration, evidence, places_table, register_tiles
 from rdstitch.stage.tile_options import TileOptions
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import Outputs, check_distinct, check_output, text_bytes
+from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, text_bytes
 from rdstitch.system.progress import Progress, silent
 
 
@@ -46,7 +48,7 @@ def tiles(
     *,
     positions_file: str | Path | None = None,
     progress: Progress = silent,
-    beside: Callable[[Outputs, StitchResult], None] | None = None,
+    beside: FilesBeside = NOTHING_BESIDE,
 ) -> StitchResult:
     """Stitch tiles taken on a stage, whose places are roughly known.
 
@@ -76,7 +78,7 @@ def tiles(
         workers=options.workers,
     )
     with found_images(as_inputs(inputs), output=output, topic=options.topic) as listed:
-        registration, tiled = _registered(listed, output, positions_file, options, progress)
+        registration, tiled = _registered(listed, output, positions_file, options, progress, beside)
         with Outputs(options.overwrite) as outputs, stitch.executor(len(registration.sources)) as executor:
             _write_beside(outputs, positions_file, options, registration, tiled)
             local = no_local_alignment("tiles on a stage")
@@ -102,7 +104,7 @@ def place_tiles(
     """
     options = options or TileOptions()
     with found_images(as_inputs(inputs), topic=options.topic) as listed:
-        registration, tiled = _registered(listed, None, positions_file, options, progress)
+        registration, tiled = _registered(listed, None, positions_file, options, progress, NOTHING_BESIDE)
     with Outputs(options.overwrite) as outputs:
         _write_beside(outputs, positions_file, options, registration, tiled)
     return tiled, registration
@@ -114,14 +116,16 @@ def _registered(
     positions_file: str | Path | None,
     options: TileOptions,
     progress: Progress,
+    beside: FilesBeside,
 ) -> tuple[Registration, TileRegistration]:
     """The places of all tiles, once it is clear that everything can be written."""
-    _check_outputs(output, positions_file, options, listed.files)
+    _check_outputs(output, positions_file, options, beside, listed)
     guard = InputGuard(options.strict)
     limit = options.composite.max_memory
     sources, unread = read_sources(listed.frames, skip_bad=not options.strict, guard=guard, max_memory=limit)
     if len(sources) < 2:
         raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
+    check_world_files([] if output is None else [output], sources, options.overwrite)
     check_size(sources)
     sources, illumination = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
@@ -149,16 +153,18 @@ def _write_beside(
 
 
 def _check_outputs(
-    output: str | Path | None, positions_file: str | Path | None, options: TileOptions, inputs: Sequence[str | Path]
+    output: str | Path | None,
+    positions_file: str | Path | None,
+    options: TileOptions,
+    beside: FilesBeside,
+    listed: FoundImages,
 ) -> None:
     """Find out before long work whether everything can be written."""
     named = [options.positions, None if options.flat_field in ("auto", "off") else options.flat_field]
-    inputs = [*inputs, *(file for file in named if file is not None)]
-    written = [] if output is None else [output, f"{output}.json"]
-    written += [file for file in (positions_file, options.save_flat_field) if file is not None]
-    for file in written:
-        check_output(file, options.overwrite, inputs, **({} if file == output else {"suffixes": ()}))
-    check_distinct(written)
+    written = [] if output is None else image_files(check_suffix(output))
+    written += [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
+    written += beside.files(frame.name for frame in listed.frames)
+    check_outputs(written, options.overwrite, [*listed.files, *(file for file in named if file is not None)])
 
 
 def _plane(sources: Sequence[Source], channel: int | None, index: int) -> NDArray[Any]:

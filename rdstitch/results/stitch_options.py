@@ -14,6 +14,7 @@ from rdstitch.executors import LOCAL, open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import ChannelOrder
+from rdstitch.inputs.rosbag import camera_in
 from rdstitch.local_alignment import MAX_CELLS, LocalAlignmentMode
 from rdstitch.robust import SOLVERS, EstimationOptions
 from rdstitch.system.machine import processor_count
@@ -50,7 +51,7 @@ class StitchOptions:
         Probability that no better model of a pair was missed.
     max_iterations : int
         Samples per pair.
-    camera : Camera, optional
+    camera : Camera, or path of a camera file or of a ROS bag with camera_info, optional
         Known camera: its λ is kept, its focal length trusted.
     distortion : float, optional
         Known λ, in the half-diagonal frame; it is kept.
@@ -62,6 +63,9 @@ class StitchOptions:
         Measured tilt of each image: CSV of name, psi, theta, degrees; or "xmp".
     attitude_std : float
         Standard deviation of these tilts, radians; 0: exact.
+    timestamps : path, optional
+        Times of the images, see :func:`rdstitch.inputs.measurements.with_times`; otherwise those of the video, the bag,
+        or EXIF.
     positions : path, optional
         Positions of the images instead of those of EXIF; see :mod:`rdstitch.inputs.positions`. Their x and y are in the
         system of ``composite.epsg``.
@@ -69,6 +73,8 @@ class StitchOptions:
         Seconds to add to the images' times for those of a GPX track, which are in UTC.
     gcp : path, optional
         Ground control points, as OpenDroneMap's ``gcp_list.txt``: they alone place the output on the Earth.
+    check_points : path, optional
+        Points in the same format that are compared with the map, and take no part in it.
     mask : path, optional
         Image, or folder of them, that is dark where the images do not count.
     channel_order : str
@@ -123,15 +129,17 @@ class StitchOptions:
     threshold: float = 3.0
     confidence: float = 0.999
     max_iterations: int = 10000
-    camera: Camera | None = None
+    camera: Camera | None = None  # a path, given instead, is read
     distortion: float | None = None
     focal: float | None = None
     tilt: tuple[float, float] | None = None
     attitude: str | Path | None = None
     attitude_std: float = math.radians(1.0)
+    timestamps: str | Path | None = None
     positions: str | Path | None = None
     positions_offset: float = 0.0
     gcp: str | Path | None = None
+    check_points: str | Path | None = None
     mask: str | Path | None = None
     channel_order: ChannelOrder = "bgr"
     exclude: tuple[str, ...] = ()
@@ -152,10 +160,13 @@ class StitchOptions:
     dry_run: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("cache", "save_camera"):
+        for name, convert in (("cache", Path), ("save_camera", Path), ("camera", camera_in)):
             # Text is as good as a path, as it is for images.
-            if isinstance(given := getattr(self, name), str):
-                object.__setattr__(self, name, Path(given))
+            if isinstance(given := getattr(self, name), str | Path):
+                object.__setattr__(self, name, convert(given))
+        for name, angles in (("tilt", self.tilt or ()), ("attitude_std", (self.attitude_std,))):
+            if any(abs(angle) > math.pi / 2 for angle in angles):
+                raise ArgumentError(f"{name} is in radians, and at most pi/2, not {angles}; use math.radians")
         if self.solver not in SOLVERS:
             raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
         if self.model not in ("auto", *MODELS):
@@ -207,7 +218,16 @@ class StitchOptions:
     @property
     def files(self) -> list[Path]:
         """The files that are read besides the images, none of which may be written over."""
-        named = (self.mask, self.attitude, self.positions, self.gcp, self.lightglue_model, self.features.aliked_model)
+        named = (
+            self.mask,
+            self.attitude,
+            self.timestamps,
+            self.positions,
+            self.gcp,
+            self.check_points,
+            self.lightglue_model,
+            self.features.aliked_model,
+        )
         given = [Path(file) for file in named if file is not None]
         return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
 

@@ -1,9 +1,10 @@
 """What stitching gives: the image, in memory or in a file, and everything that was estimated for it."""
 
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,6 +141,10 @@ class StitchResult(OutputImage):
     def messages(self) -> tuple[Message, ...]:
         """What the user should know: failed checks, warnings, and every image that is not in the result."""
         return self.registration.messages
+
+    def with_messages(self, messages: Iterable[Message]) -> Self:
+        """The same with more to know about it."""
+        return replace(self, registration=self.registration.with_messages(messages))
 
     @property
     def image_order(self) -> ChannelOrder:

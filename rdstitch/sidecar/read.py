@@ -5,6 +5,7 @@ earlier versions did not have has a default.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -68,7 +69,9 @@ class GeoreferenceRecord(Struct, kw_only=True):
     positions: Count = 0
     positions_used: Count = 0
     rms_m: NonNegative = 0.0
+    std_m: NonNegative | None = None
     residuals: list[ResidualRecord] = []
+    check_points: list[ResidualRecord] = []
 
     def __post_init__(self) -> None:
         if self.crs is not None and (self.pixel_to_map is None or not any(self.pixel_to_map[0][:2])):
@@ -365,14 +368,21 @@ def _place(output: OutputRecord) -> Georeference | None:
         complex(east, north),
         record.rms_m,
         record.source,
-        tuple(
-            Residual(
-                item.name,
-                math.inf if item.east_m is None else item.east_m,
-                math.inf if item.north_m is None else item.north_m,
-                item.used,
-            )
-            for item in record.residuals
-        ),
+        _residuals(record.residuals),
+        record.std_m,
+        math.hypot(a, b) / (record.gsd_m or math.hypot(a, b)),
+        checks=_residuals(record.check_points),
     )
     return place.after(np.linalg.inv(output.plane_to_output).astype(np.float64))
+
+
+def _residuals(records: Sequence[ResidualRecord]) -> tuple[Residual, ...]:
+    return tuple(
+        Residual(
+            item.name,
+            math.inf if item.east_m is None else item.east_m,
+            math.inf if item.north_m is None else item.north_m,
+            item.used,
+        )
+        for item in records
+    )

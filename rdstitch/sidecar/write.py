@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import platform
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas
 from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
-from rdstitch.export.georeference import Georeference
+from rdstitch.export.georeference import Georeference, Residual
 from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.results.registration import Registration
@@ -139,11 +140,14 @@ def georeference_fields(place: Georeference | None, reason: str) -> dict[str, An
         "positions": len(place.residuals),
         "positions_used": place.used,
         "rms_m": place.rms,
-        "residuals": [
-            {"name": residual.name, "east_m": residual.east, "north_m": residual.north, "used": residual.used}
-            for residual in place.residuals
-        ],
+        "std_m": place.std,
+        "residuals": _residuals(place.residuals),
+        "check_points": _residuals(place.checks),
     }
+
+
+def _residuals(residuals: Sequence[Residual]) -> list[dict[str, Any]]:
+    return [{"name": one.name, "east_m": one.east, "north_m": one.north, "used": one.used} for one in residuals]
 
 
 def to_output(canvas: Canvas, homography: FloatArray) -> FloatArray | None:
@@ -197,6 +201,7 @@ def lens_fields(camera: Camera) -> dict[str, Any]:
         "image_circle_px": camera.image_circle,
         "lambda": camera.nearest_distortion,
         "coefficients": camera.coefficients,
+        "lens_model": None if camera.lens_model is None else dataclasses.asdict(camera.lens_model),
         "focal_px": camera.focal,
         "focal_source": camera.focal_source,
     }

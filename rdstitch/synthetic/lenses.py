@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera_files.lens_models import LensModel
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera, border_of
+from rdstitch.geometry.lens_model import LensModel
 
 _FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]] = {
     "equidistant": (lambda angle: angle, lambda r: r),

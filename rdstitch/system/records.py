@@ -50,8 +50,9 @@ def parse_yaml(text: str, file: str) -> Any:
     if len(text) > _MAX_YAML:
         raise InputError(f"{file}: is too large for a camera file")
     try:
-        # OpenCV's directive has a colon where the standard has a space.
-        return _checked(yaml.load(re.sub(r"^%YAML:.*", "", text), Loader), file)
+        # OpenCV's directive has a colon where the standard has a space; ROS prints one document after the other.
+        first = next(yaml.load_all(re.sub(r"^%YAML:.*", "", text), Loader), None)
+        return _checked(first, file)
     except yaml.MarkedYAMLError as error:
         line = 0 if error.problem_mark is None else error.problem_mark.line + 1
         raise InputError(f"{file}: line {line}: is not YAML: {error.problem}; no camera file?") from error

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 import rdstitch
 from rdstitch.arrays import FloatArray
-from rdstitch.camera_files.lens_models import LensModel
 from rdstitch.errors import RdstitchError
+from rdstitch.geometry.lens_model import LensModel
 
 BOARDS = {
     "fisheye_chess": (15, 9),

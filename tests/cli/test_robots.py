@@ -16,6 +16,7 @@ from PIL import ExifTags, Image
 import rdstitch
 from examples.judging.trajectories import compare_trajectories
 from rdstitch.camera_files import load_camera
+from rdstitch.camera_files.lens_models import nearest_model
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image
 from rdstitch.synthetic import Photometry, Sequence, drive_poses, ground, sequence_over
@@ -92,8 +93,35 @@ def test_without_times_numbers_stand_for_them_and_that_is_said(
     assert np.loadtxt(output)[:, 0].tolist() == [0.0, 1.0, 2.0]
 
 
-def _write_bag(folder: Path, frames: list[Path], version: int, kind: str) -> Path:
-    """A bag with the frames on /camera at 2 Hz from 1000 s on."""
+def test_what_cannot_be_read_keeps_its_time_and_is_counted(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    (folder := tmp_path / "drive").mkdir()
+    good = [frame.read_bytes() for frame in frames]
+    for number, content in enumerate([good[0], b"", good[1], b"broken", good[2]]):
+        (folder / f"{number}.png").write_bytes(content)
+    Image.fromarray(np.full((300, 400), 90, np.uint8)).save(folder / "5.png")
+    (tmp_path / "times.txt").write_text("".join(f"{100 + k}\n" for k in range(6)), encoding="utf-8")
+    known = ("--timestamps", tmp_path / "times.txt", "--focal", "380", *CACHED)
+    done = rdstitch("trajectory", folder, "-o", tmp_path / "path.csv", *known)
+    assert [row["timestamp"] for row in _rows(tmp_path / "path.csv")] == ["100.000000", "102.000000", "104.000000"]
+    assert "3 of 6 images" in done.made
+    for name in ("1.png", "3.png", "5.png"):
+        assert name in done.err
+
+
+def test_two_videos_of_one_name_are_two(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    videos = [tmp_path / name / "drive.avi" for name in "ab"]
+    for video, part in zip(videos, (frames[:2], frames[2:]), strict=True):
+        video.parent.mkdir()
+        write_video(video, (read_image(frame).pixels for frame in part))
+    rdstitch("trajectory", *videos, "-o", tmp_path / "path.csv", "--focal", "380", *CACHED)
+    assert [row["name"] for row in _rows(tmp_path / "path.csv")] == [f"drive_00000{k}.png" for k in (0, 1, 0)]
+
+
+def _write_bag(folder: Path, frames: list[Path], version: int, kind: str, focal: float = 0.0) -> Path:
+    """A bag with the frames on /camera at 2 Hz from 1000 s on; with the camera's calibration if it has a focal length.
+
+    That has the division model's lens as ROS's rational polynomial.
+    """
     typesys = pytest.importorskip("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if version == 1 else typesys.Stores.LATEST)
     time_type, header_type = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
@@ -118,7 +146,20 @@ def _write_bag(folder: Path, frames: list[Path], version: int, kind: str) -> Pat
             message = _message(store.types[name], header, frame, kind)
             data = (store.serialize_ros1 if version == 1 else store.serialize_cdr)(message, name)
             writer.write(connection, 10**12 + number, data)
+        if focal:
+            message = _camera_info(store, header, Camera((400, 300), DISTORTION, focal=focal))
+            connection = writer.add_connection("/camera_info", message.__msgtype__, typestore=store)
+            writer.write(connection, 10**12, store.serialize_cdr(message, message.__msgtype__))
     return path
+
+
+def _camera_info(store: Any, header: Any, camera: Camera) -> Any:
+    lens, _ = nearest_model(camera, "rational")
+    k = np.array([camera.focal, 0.0, camera.center[0], 0.0, camera.focal, camera.center[1], 0.0, 0.0, 1.0])
+    none = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False)
+    of_lens = {"distortion_model": "rational_polynomial", "d": np.array(lens.coefficients), "k": k}
+    other = {"r": np.eye(3).ravel(), "p": np.zeros(12), "binning_x": 0, "binning_y": 0, "roi": none}
+    return store.types["sensor_msgs/msg/CameraInfo"](header=header, height=300, width=400, **of_lens, **other)
 
 
 def _message(message: Any, header: Any, frame: Path, kind: str) -> Any:
@@ -152,6 +193,16 @@ def test_a_bag_is_as_good_as_its_frames(
     assert abs(float(done.out) - DISTORTION) < 0.01
     assert [row["timestamp"] for row in _rows(output)] == ["1000.000000", "1000.500000", "1001.000000"]
     rdstitch("mosaic", bag, "--topic", "/other", "-o", tmp_path / "out.png", *CACHED, status=3, told="/camera")
+
+
+def test_the_calibration_in_a_bag_is_used(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    bag = _write_bag(tmp_path, frames, 2, "bgr8", focal=380.0)
+    done = rdstitch("trajectory", bag, "-o", tmp_path / "path.csv", *CACHED)
+    assert "/camera_info" in done.err
+    assert float(done.out) == pytest.approx(DISTORTION, abs=0.01)
+    assert "(given)" in done.made
+    same = rdstitch("trajectory", *frames, "--camera", bag, "-o", tmp_path / "files.csv", *CACHED)
+    assert same.out == done.out
 
 
 def test_what_is_no_bag_is_named(rdstitch: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
 from rdstitch_cli.option_texts import option
 from rdstitch_cli.parameter_types import RealNumber, WholeNumber
-from rdstitch_cli.stitching import FilesBeside, composite_fields, report_registration, summarize
+from rdstitch_cli.stitching import composite_fields, files_beside, report_registration, summarize
 from rdstitch_cli.terminal import Reporter
 
 
@@ -68,19 +68,15 @@ def tiles(
     if output is None and positions_only is None:
         raise click.UsageError("nothing to write: give --output or --positions-only")
     paths = options.resolve(inputs)
-    beside = FilesBeside(reporter, paths, given, output)
+    beside = files_beside(reporter, given)
     composite = CompositeOptions(exposure="none", seam="none", **composite_fields(given))
     chosen = TileOptions(overlap=overlap / 100.0, composite=composite, **given)
     if output is None:
-        with beside.explaining():
-            _, registration = place_tiles(paths, positions_only, chosen, progress=beside.progress)
+        _, registration = place_tiles(paths, positions_only, chosen, progress=beside.timer)
         report_registration(registration, reporter)
         reporter.made(f"{positions_only}: {registration.summary}")
         return
-    with beside.explaining():
-        result = recipe(
-            paths, output, chosen, positions_file=positions_only, progress=beside.progress, beside=beside.stage
-        )
+    result = recipe(paths, output, chosen, positions_file=positions_only, progress=beside.timer, beside=beside)
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:
         reporter.made(result.summary)

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 @option("--format", ("csv", "tum", "kitti"), "csv", of="trajectory", dest="layout")
 @option("--frame", ("enu", "camera"), of="trajectory")
 @option("--height", RealNumber(), 1.0)
-@option("--timestamps", options.IMAGE)
 @option("--plot", options.IMAGE)
 @options.overwrite
 @options.every_frame
@@ -47,7 +46,6 @@ def trajectory(
     layout: Literal["csv", "tum", "kitti"],
     frame: Literal["enu", "camera"] | None,
     height: float,
-    timestamps: Path | None,
     plot: Path | None,
     every: int | None,
     following: bool,
@@ -68,7 +66,7 @@ def trajectory(
     with ExitStack() as stack:
         stitch = stitch_options(reporter, **given)
         if following:
-            printed = FollowedPoses(height, timestamps, frame or frame_of(layout))
+            printed = FollowedPoses(height, frame or frame_of(layout))
             watched: dict[str, Any] = {"output": output, "plot": plot, "every": every, "idle": idle, "poses": printed}
             arrived = live.followed(inputs, stitch, reporter, **watched)
             paths: Sequence[Named] = stack.enter_context(arrived)
@@ -76,7 +74,6 @@ def trajectory(
             paths = options.resolve(inputs)
         how: dict[str, Any] = {
             "layout": layout,
-            "timestamps": timestamps,
             "plot": plot,
             "height": height,
             "frame": frame,

@@ -17,10 +17,10 @@ import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import export_note, load_camera, read_camera_file, save_camera
-from rdstitch.camera_files.lens_models import LensModel
 from rdstitch.camera_files.polynomials import fitted_polynomial
 from rdstitch.errors import InputError, OutputError
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.lens_model import LensModel
 from rdstitch.system.records import parse_yaml
 
 OPENCV = ["c.yml", "c.yaml", "opencv.json", "left.opencv.json", "a.fisheye.yml"]

@@ -14,9 +14,9 @@ from PIL import ExifTags, Image
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, OutputError
-from rdstitch.export.georeference import Georeference, georeference
+from rdstitch.export.georeference import Georeference, Located, georeference
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.crs import Crs, epsg_of, utm
+from rdstitch.geometry.crs import Crs, NamedSystem, utm
 from rdstitch.geometry.radial_homography import from_plane
 from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition, GroundControl
@@ -25,6 +25,7 @@ from rdstitch.pipeline.recipes import mosaic
 from rdstitch.pipeline.result_files import poses_table
 from rdstitch.report import report_page
 from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.synthetic.poses import Poses
 from tests.cli.running import flight, transfers
 
 
@@ -52,19 +53,23 @@ METRES_PER_TEXEL = 0.05
 
 @pytest.fixture(scope="module")
 def located(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], FloatArray]:
-    """A flight with positions in its EXIF, and where the middles of its images are: easting and northing, m."""
+    """A flight, tilted by 3.3 degrees, with the positions of its cameras in EXIF; and where the middles of its images
+    are on the ground: easting and northing, m.
+    """
     sequence, folder = flight(4, 3, 2), tmp_path_factory.mktemp("located")
     middles = np.concatenate([sequence.to_plane(k, np.array([[199.5, 149.5]])) for k in range(len(sequence))])
-    east, north = middles[:, 0] * METRES_PER_TEXEL, -middles[:, 1] * METRES_PER_TEXEL
-    # Degrees of latitude and longitude at 33 degrees on the ellipsoid.
-    latitude, longitude = -33.0 + north / 110_903.9, 18.5 + east / 93_453.2
+
+    def on_map(places: FloatArray) -> FloatArray:
+        return np.array([268_000.0, 6_346_000.0]) + places * (METRES_PER_TEXEL, -METRES_PER_TEXEL)
+
+    latitude, longitude = Crs(32734).geographic(on_map(sequence.poses.position)).T
     paths = sequence.write(folder, "f{}.jpg")
     for path, phi, lam in zip(paths, latitude, longitude, strict=True):
         with Image.open(path) as image:
             exif = image.getexif()
             exif[ExifTags.IFD.GPSInfo] = {1: "S", 2: _degrees(phi), 3: "E", 4: _degrees(lam)}
             image.save(path, exif=exif, quality=95)
-    return paths, utm(latitude, longitude, -34)
+    return paths, on_map(middles)
 
 
 @pytest.fixture(scope="module")
@@ -193,36 +198,45 @@ def test_files_beside_are_not_replaced_unasked(
     assert "UTM_Zone_34S" in somebodys.read_text(encoding="ascii")
 
 
-def _row(count: int) -> tuple[list[GpsPosition | None], list[Camera], FloatArray, list[str]]:
+def _row(count: int) -> Located:
     """Positions 7 m apart along a parallel, and images that lie along a curve."""
     to_output = np.stack([np.array([[250.0, 0, 300 * k], [0, 250.0, 4 * k**2], [0, 0, 1]]) for k in range(count)])
-    return (
+    return Located(
         [GpsPosition(50.0, 8.0 + 1e-4 * k) for k in range(count)],
         [Camera((400, 300))] * count,
         to_output,
         [f"{k}.jpg" for k in range(count)],
+        [None] * count,
+        [()] * count,
     )
 
 
 def test_positions_that_do_not_fit_are_refused() -> None:
-    straight, lens, to_output, names = _row(8)
-    place, reason = georeference(straight, lens, to_output, names)
+    row = _row(8)
+    place, reason = georeference(row)
     assert place is not None
     assert reason == ""
-    mixed = [straight[k] for k in (4, 0, 7, 2, 5, 1, 6, 3)]
-    place, reason = georeference(mixed, lens, to_output, names)
+    assert "the image centres" in place.assumption
+    mixed = replace(row, positions=[row.positions[k] for k in (4, 0, 7, 2, 5, 1, 6, 3)])
+    place, reason = georeference(mixed)
     assert place is None
-    assert "GPS positions are" in reason
-    place, reason = georeference([*straight[:2], *[None] * 6], lens, to_output, names)
+    assert "the GPS positions contradict the images" in reason
+    place, again = georeference(mixed, force=True)
+    assert place is not None
+    assert again.partition(";")[0] == reason.partition(";")[0]
+    place, reason = georeference(replace(row, positions=[*row.positions[:2], *[None] * 6]))
     assert place is None
     assert reason == "2 of 8 images have a GPS position, and 3 are needed"
+    place, reason = georeference(replace(row, positions=[row.positions[0]] * 8))
+    assert (place, reason) == (None, "all images have the same GPS position")
 
 
 @pytest.mark.parametrize(("wrong", "off"), [(GpsPosition(0.0, 1e-9), 5e6), (GpsPosition(50.0027, 8.0004), 300.0)])
 def test_one_bad_position_of_eight_is_named_and_left_out(wrong: GpsPosition, off: float) -> None:
-    straight, lens, to_output, names = _row(8)
-    whole, _ = georeference([*straight[:4], None, *straight[5:]], lens, to_output, names)
-    place, _ = georeference([*straight[:4], wrong, *straight[5:]], lens, to_output, names)
+    row = _row(8)
+    before, after = row.positions[:4], row.positions[5:]
+    whole, _ = georeference(replace(row, positions=[*before, None, *after]))
+    place, _ = georeference(replace(row, positions=[*before, wrong, *after]))
     assert (place.used, len(place.residuals)) == (7, 8)
     ((name, away),) = place.rejected
     assert name == "4.jpg"
@@ -233,18 +247,18 @@ def test_one_bad_position_of_eight_is_named_and_left_out(wrong: GpsPosition, off
 
 def test_control_points_place_the_output_instead_of_positions() -> None:
     """A point in two images counts once; one that is 2 m off is named; the system is that of the list."""
-    straight, lens, to_output, names = _row(8)
+    row = _row(8)
     truth = Georeference(Crs(32632), 0.05 * np.exp(0.2j), complex(448_000.0, 5_500_000.0), 0.0)
-    control: list[list[GroundControl]] = [[] for _ in names]
+    control: list[list[GroundControl]] = [[] for _ in row.names]
     for number, (x, y) in enumerate(
         [(40.0, 90.0), (330.0, -80.0), (900.0, 70.0), (1000.0, 10.0), (1500.0, 130.0), (2100.0, 90.0)]
     ):
         ((east, north),) = truth.to_map([(x, y)]) + (2.0 if number == 4 else 0.0)
         latitude, longitude = Crs(32632).geographic([(east, north)])[0]
         for image in range(int(x // 300), int(x // 300) + 1 + (number == 1)):
-            u, v = from_plane(lens[image], to_output[image], np.array([(x, y)]))[0]
+            u, v = from_plane(row.cameras[image], row.to_output[image], np.array([(x, y)]))[0]
             control[image].append(GroundControl(f"P{number}", GpsPosition(latitude, longitude), 32632, (u, v)))
-    place, _ = georeference(straight, lens, to_output, names, control=control)
+    place, _ = georeference(replace(row, control=control))
     assert (place.crs, place.source, place.used) == (Crs(32632), "ground control points", 5)
     assert [name for name, _ in place.rejected] == ["P4"]
     assert place.rejected[0][1] == pytest.approx(2.0 * 2**0.5, rel=0.01)
@@ -253,9 +267,7 @@ def test_control_points_place_the_output_instead_of_positions() -> None:
     )
     assert max(r.off for r in place.residuals if r.used) < 0.01
     few = [points if k < 2 else [] for k, points in enumerate(control)]
-    assert georeference(straight, lens, to_output, names, control=few)[1] == (
-        "2 ground control points are in the images, and 3 are needed"
-    )
+    assert georeference(replace(row, control=few))[1] == ("2 ground control points are in the images, and 3 are needed")
 
 
 def test_utm_back_to_degrees() -> None:
@@ -275,11 +287,104 @@ def test_utm_back_to_degrees() -> None:
         ("+proj=utm +zone=10 +ellps=WGS84 +datum=WGS84 +units=m +no_defs", 32610),
         ("+proj=utm +zone=10 +south +datum=WGS84", 32710),
         ("+proj=longlat +datum=WGS84 +no_defs", 4326),
-        ("name,lat,lon", None),
+        ("+proj=utm +zone=10 +datum=WGS84 +units=us-ft", None),
+        ("+proj=utm +zone=10 +ellps=intl +towgs84=-84,-107,-120,0,0,0,0", None),
+        ("+proj=longlat +ellps=bessel", None),
     ],
 )
 def test_coordinate_systems_of_opendronemap(text: str, epsg: int | None) -> None:
-    assert epsg_of(text) == epsg
+    assert NamedSystem.named_by(text).epsg == epsg
+    assert NamedSystem.named_by("name,lat,lon") is None
+
+
+def test_units_and_datum_of_proj_count() -> None:
+    place = np.array([[561_039.1578, 4_302_036.9052]])
+    right = Crs(32629).geographic(place)
+    feet = NamedSystem.named_by("+proj=utm +zone=29 +datum=WGS84 +units=us-ft +no_defs")
+    np.testing.assert_allclose(feet.geographic(place * 3937 / 1200), right, atol=1e-8)
+    datum = NamedSystem.named_by("+proj=utm +zone=29 +ellps=intl +towgs84=-84,-107,-120,0,0,0,0 +units=m +no_defs")
+    np.testing.assert_allclose(datum.geographic([[561_158.7783, 4_302_250.3225]]), right, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("latitude", "longitude", "epsg"),
+    [
+        (-17.0, [179.9, -179.9, 179.95, -179.95], 32701),
+        (66.9, [179.9, -179.8, -179.9, 179.95], 32701 - 100),
+        (0.0001, [-0.001, 0.001, 0.001, -0.0005], 32631),
+        (-0.0001, [5.99, 6.02, 6.01, 6.0], 32732),
+        (60.4, [5.3, 5.4, 5.3, 5.3], 32632),
+        (78.2, [15.6, 15.7, 15.6, 15.6], 32633),
+        (85.0, [100.0, 100.1, 100.0, 100.1], 32661),
+        (-84.0, [-170.0, 170.0, 179.0, -179.0], 32761),
+    ],
+)
+def test_the_map_of_places_all_round_the_world(latitude: float, longitude: list[float], epsg: int) -> None:
+    """Its zone, and coordinates as PROJ has them, there and back."""
+    assert Crs.nearest([latitude] * 4, longitude) == Crs(epsg)
+    own = Crs(epsg).project([latitude] * 4, longitude)
+    proj = rasterio.warp.transform("EPSG:4326", f"EPSG:{epsg}", longitude, [latitude] * 4)
+    np.testing.assert_allclose(own, np.transpose(proj), atol=0.002)
+    back = Crs(epsg).geographic(own)
+    np.testing.assert_allclose(back, np.transpose([[latitude] * 4, longitude]), atol=1e-7)
+
+
+def test_the_ground_sample_distance_is_that_on_the_ground() -> None:
+    row = _row(8)
+    utm_map, web = (georeference(row, epsg)[0] for epsg in (32632, 3857))
+    assert web.gsd == pytest.approx(utm_map.gsd, rel=0.005)
+    assert abs(web.scale) == pytest.approx(utm_map.gsd / np.cos(np.radians(50.0)), rel=0.005)
+    other = utm_map.in_system(Crs(3857), [(0.0, 0.0), (2000.0, 100.0), (0.0, 300.0)])
+    np.testing.assert_allclose(other.to_map([(1000.0, 0.0)]), web.to_map([(1000.0, 0.0)]), atol=0.02)
+    assert other.gsd == pytest.approx(web.gsd, rel=0.002)
+
+
+def _survey(
+    seed: int, tilt: tuple[float, float], yaw: float, std: float, slope: float = 0.0, altitude_std: float | None = None
+) -> tuple[Located, Georeference]:
+    """20 cameras 40 m up, of one tilt and yaws within ``yaw``, and the right place of their output."""
+    rng = np.random.default_rng(seed)
+    camera = Camera((480, 360), focal=400.0, focal_source="estimate", focal_std=0.4, tilt=tilt, tilt_std=(1e-4, 1e-4))
+    truth = Georeference(Crs(32733), 0.1 * np.exp(0.3j), complex(500_000.0, 7_000_000.0), 0.0)
+    across, along = np.meshgrid(np.arange(5) * 150.0, np.arange(4) * 150.0)
+    feet = np.stack([across.ravel(), along.ravel()], axis=1) + rng.normal(0.0, 10.0, (20, 2))
+    heights = rng.normal(400.0, 8.0, 20)
+    poses = Poses.of(feet, heights, rng.uniform(-yaw, yaw, 20), tilt)
+    to_rays = np.diag([camera.scale / 400.0, camera.scale / 400.0, 1.0])
+    to_output = np.asarray(np.linalg.inv(poses.from_plane()) @ to_rays, dtype=np.float64)
+    # The ground falls by this slope towards the right of the output: cameras lean over it.
+    places = truth.to_map(feet) + (truth.pixel_to_map[:, :1] * heights * slope).T + rng.normal(0.0, std, (20, 2))
+    degrees = truth.crs.geographic(places)
+    up = 100.0 + 0.1 * heights - 0.1 * slope * feet[:, 0]
+    altitude = up if altitude_std is None else up + rng.normal(0.0, altitude_std, 20)
+    known = altitude.tolist() if altitude_std is not None else [None] * 20
+    positions = [GpsPosition(y, x, above) for (y, x), above in zip(degrees.tolist(), known, strict=True)]
+    names = [f"{k}.jpg" for k in range(20)]
+    return Located(positions, [camera] * 20, to_output, names, [None] * 20, [()] * 20), truth
+
+
+@pytest.mark.parametrize(("yaw", "slope", "altitude_std"), [(0.0, 0.0, None), (3.0, 0.0, 3.0), (0.0, 0.05, 0.03)])
+def test_positions_are_those_of_cameras(yaw: float, slope: float, altitude_std: float | None) -> None:
+    """Image centres are 5.6 m from what is below a camera pitched by 8 degrees, and those of sloping ground 2 m."""
+    located, truth = _survey(1, (-0.14, 0.0), yaw, 0.02, slope, altitude_std)
+    place, _ = georeference(located)
+    corners = [(-100.0, -100.0), (700.0, 600.0), (300.0, 300.0)]
+    assert np.hypot(*(place.to_map(corners) - truth.to_map(corners)).T).max() < 0.1
+    assert place.rms < 0.04
+    assert not place.assumption
+    assert "GPS agree with the map to 0.0" in place.summary
+
+
+@pytest.mark.parametrize("std", [0.02, 3.0])
+def test_the_error_of_the_map_is_as_large_as_told(std: float) -> None:
+    middle_of_field = [(300.0, 225.0)]
+    errors = []
+    for seed in range(40):
+        located, truth = _survey(seed, (-0.05, 0.03), 3.0, std, altitude_std=2 * std)
+        place, _ = georeference(located)
+        errors.append((place.to_map(middle_of_field) - truth.to_map(middle_of_field)) / place.std)
+    assert 0.4 < np.mean(np.square(errors)) < 2.0
+    assert np.abs(errors).max() < 5.0
 
 
 def test_positions_and_control_points_from_files(

@@ -182,3 +182,56 @@ def test_wrong_control_points_are_named(tmp_path: Path, text: str, message: str)
     with pytest.raises(InputError) as caught:
         with_ground_control(_sources(), tmp_path / "gcp")
     assert message in str(caught.value)
+
+
+def test_subtitles_of_a_video_are_a_track(tmp_path: Path) -> None:
+    """As DJI writes them, newer and older; images have their places by their times."""
+    new = "[latitude: 10.0] [longitude: 179.999] [rel_alt: 1.3 abs_alt: 100.0] </font>"
+    old = "GPS(-179.999,10.002,19) BAROMETER:1.9"
+    text = f"1\n00:00:00,000 --> 00:00:00,033\n{new}\n\n2\n00:00:20,000 --> 00:00:20,033\n{old}\n"
+    one, two, three = _read(tmp_path, text, offset=-START + 10.0)
+    assert (one.latitude, abs(one.longitude)) == pytest.approx((10.001, 180.0))
+    assert (two.latitude, two.longitude) == pytest.approx((10.002, -179.999))
+    assert three is None
+
+
+def test_events_of_a_receiver_have_positions_with_accuracies(tmp_path: Path) -> None:
+    lines = [
+        f"{k}\t435237.6{k}\t[2107]\t   -4,N\t  -16,E\t 194,V\t22.6{k},Lat\t-113.8{k},Lon\t76.412,Ellh\t"
+        "0.012, 0.016, 0.029\t50,Q"
+        for k in (1, 2, 3)
+    ]
+    (tmp_path / "t.MRK").write_text("\n".join(lines), encoding="utf-8")
+    numbers = zip(_sources(), (3, 1, 9), strict=True)
+    named = [replace(source, path=Path(f"DJI_20230101_000{k}_V.JPG")) for source, k in numbers]
+    one, two, three = (s.metadata.gps for s in with_positions(named, tmp_path / "t.MRK"))
+    assert (one.latitude, one.longitude, one.altitude) == (22.63, -113.83, 76.412)
+    assert one.std == pytest.approx((0.0141421, 0.029), abs=1e-6)
+    assert two.latitude == 22.61
+    assert three is None
+    with pytest.raises(InputError, match="has events 1 to 3, which the numbers at the end of the names"):
+        with_positions(_sources(), tmp_path / "t.MRK")
+
+
+def test_names_in_other_case_and_accuracies_in_tables(tmp_path: Path) -> None:
+    header = "name,lat,lon,RtkStdLat,RtkStdLon,RtkStdHgt"
+    one, two, _ = _read(tmp_path, f"{header}\nA.JPG,1,2,0.03,0.04,0.05\nb.jpg,1,3,,,\n")
+    assert one.std == pytest.approx((0.05 / 2**0.5, 0.05))
+    assert two == GpsPosition(1.0, 3.0)
+    geo = "EPSG:4326\na.jpg 2 1 50 0 0 0 0.02 0.04\nb.jpg 3 1\n"
+    assert _read(tmp_path, geo)[0].std == (0.02, 0.04)
+
+
+def test_a_side_that_is_not_told_is_not_guessed(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not say whether north or south, east or west"):
+        _read(tmp_path, 'name,GPSLatitude,GPSLongitude\na.jpg,"48 deg 51\' 29.60""","2 deg 17\' 40.20"" W"\n')
+
+
+def test_control_points_of_images_with_spaces_in_other_case_and_to_check(tmp_path: Path) -> None:
+    sources = [replace(source, path=Path(f"my {source.name}")) for source in _sources()]
+    (tmp_path / "gcp.txt").write_text(
+        "EPSG:32632\n500000 5000000 0 10 20 My A.JPG corner one\n500010 5000000 0 30 20 my b.jpg\n", encoding="utf-8"
+    )
+    read = with_ground_control(with_ground_control(sources, tmp_path / "gcp.txt"), tmp_path / "gcp.txt", check=True)
+    assert [(point.name, point.check) for point in read[0].control] == [("corner one", False), ("corner one", True)]
+    assert read[1].control[0].name == "500010 5000000"

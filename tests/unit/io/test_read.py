@@ -135,15 +135,26 @@ class TestMetadata:
         xmp = (
             '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GimbalYawDegree="+31.5" '
             'drone-dji:GimbalPitchDegree="-89.90" drone-dji:FlightYawDegree="1">'
-            "<drone-dji:GimbalRollDegree>+0.25</drone-dji:GimbalRollDegree></rdf:Description></x:xmpmeta>"
+            "<drone-dji:GimbalRollDegree>+0.25</drone-dji:GimbalRollDegree><drone-dji:RtkStdLon>0.03</drone-dji:RtkStdLon>"
+            "<drone-dji:RtkStdLat>0.04</drone-dji:RtkStdLat><drone-dji:RtkStdHgt>0.06</drone-dji:RtkStdHgt>"
+            "</rdf:Description></x:xmpmeta>"
         )
         Image.new("L", (8, 8)).save(tmp_path / "a.jpg", exif=exif, xmp=xmp.encode())
         metadata = read_metadata(tmp_path / "a.jpg")
         assert (metadata.gps.latitude, metadata.gps.longitude) == pytest.approx((-33.51, -70.25))
         assert metadata.gps.altitude == -12.5
+        assert metadata.gps.std == pytest.approx((0.05 / 2**0.5, 0.06))
         assert (metadata.attitude.yaw, metadata.attitude.pitch, metadata.attitude.roll) == (31.5, -89.9, 0.25)
         assert metadata.attitude.source == "dji-gimbal"
         assert (metadata.make, metadata.model) == ("Maker", "Model")
+
+    def test_a_hemisphere_that_is_not_told_is_not_guessed(self, tmp_path: Path) -> None:
+        exif = Image.Exif()
+        exif[0x8825] = {2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0)}
+        Image.new("L", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
+        metadata = read_metadata(tmp_path / "a.jpg")
+        assert metadata.gps is None
+        assert "whether north or south" in metadata.gps_problem
 
     def test_real_drone_image(self, shared_data: Callable[[str], Path]) -> None:
         (path,) = (p for p in shared_data("textures_cc0").iterdir() if p.suffix == ".JPG")

@@ -87,3 +87,20 @@ def test_a_tilt_of_the_wrong_sign_is_not_used(tilt: tuple[float, float], right: 
     assert (found.messages == ()) == right
     assert found.tilt == pytest.approx((0.05, -0.03), abs=0.002)
     assert right or "they show 2.8" in found.messages[0].text
+
+
+@pytest.mark.parametrize(
+    ("factor", "right", "tilt_given"), [(1.15, False, False), (0.85, False, True), (1.01, True, False)]
+)
+def test_a_focal_length_that_the_images_contradict_is_not_used(factor: float, right: bool, tilt_given: bool) -> None:
+    tilt = (math.radians(8.0), math.radians(-5.0))
+    rng = np.random.default_rng(3)
+    given = scene(grid(4, 3, (0.4, 0.3), 0.25, rng), tilt=tilt, rng=rng, per_link=80)
+    true = given.cameras[0].with_focal().focal
+    told = [camera.with_focal(factor * true, "option") for camera in given.cameras]
+    alignment = align(told, given.links, AlignmentOptions(lens="division", tilt=tilt if tilt_given else None))
+    found = [message for message in alignment.messages if message.code == "focal-contradicted"]
+    assert bool(found) is not right
+    assert abs(math.log(alignment.cameras[0].focal / true)) < 4.0 * alignment.length_std
+    if tilt_given or right:
+        assert alignment.length_std < 0.012

@@ -1,8 +1,9 @@
-"""Whether given attitudes, or a given tilt, are those that the images show.
+"""Whether given attitudes, a given tilt or a given focal length are those that the images show.
 
 The images are aligned without them, and show the tilt of each up to a covariance. Attitudes that need more scatter
 than they are said to have are compared with the same angles of other signs and in the other order, and with none at
-all, each with the scatter that makes it most likely.
+all, each with the scatter that makes it most likely. A focal length that gives way to the images is compared with the
+one that they show by themselves.
 """
 
 import math
@@ -14,8 +15,10 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA, PlanarModel
+from rdstitch.alignment.priors import CameraPriors
 from rdstitch.alignment.select import select_model
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.geometry.camera import Camera
 from rdstitch.results.messages import Message
 
 _MAX_IMAGES = 60
@@ -29,6 +32,9 @@ _SCATTERS = np.append(0.0, np.radians(np.geomspace(0.01, 45.0, 60)))
 
 _EXACT = math.radians(0.01)
 """Nothing is mounted more exactly."""
+
+_STRAINED = 2.0
+"""Standard deviations of a given focal length by which it must have given way to be looked at again."""
 
 _FREE_MOUNT = 1.0
 """Standard deviation, radians, of a tilt of the mount of which nothing is known."""
@@ -81,6 +87,27 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
         better = f"with {_named(_SIGNED_ORDERS[best])} they would fit to {error:.2g} degrees"
         text += better if related else "no signs and no order of psi and theta make them fit"
     return without, Message(text, code="attitudes-contradicted")
+
+
+def is_strained(priors: CameraPriors, fit: Fit) -> bool:
+    """Whether a focal length that the user gave gave way to the images by more than is likely."""
+    if priors.focal_source not in ("option", "file") or not isinstance(fit.model, PlanarModel):
+        return False
+    moved = float(fit.adjusted.parameters.shared[-1]) - priors.log_focal
+    return abs(moved) > _STRAINED * priors.log_focal_std
+
+
+def check_focal(given: Camera, fit: Fit, covariance: FloatArray | None) -> Message | None:
+    """What the user should know of a focal length that was given, by a fit without it; None where that agrees."""
+    if not isinstance(fit.model, PlanarModel) or covariance is None or given.focal is None:
+        return None
+    place = fit.model.shared_names.index("log_focal")
+    focal, std = math.exp(float(fit.adjusted.parameters.shared[-1])) * given.scale, math.sqrt(covariance[place, place])
+    odds = math.log(focal / given.focal) ** 2 / (2.0 * (std**2 + given.focal_log_std**2))
+    if odds < _LOG_ODDS:
+        return None
+    text = f"the images contradict the given focal length of {given.focal:.1f} pixels, which is not used: "
+    return Message(f"{text}they show {focal:.1f} ± {std * focal:.1f}", code="focal-contradicted")
 
 
 def _named(change: FloatArray) -> str:

@@ -1,0 +1,111 @@
+"""Where images were taken by what moved the camera: a GPX track, a video's subtitles, a receiver's list of events."""
+
+import math
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from rdstitch.errors import InputError
+from rdstitch.inputs.measurements import timestamps_of
+from rdstitch.inputs.source import Source
+from rdstitch.io.metadata import GpsPosition
+from rdstitch.system.records import parse_xml
+
+_EVENT = re.compile(
+    r"\s*(\d+)\s+[\d.]+\s+\[\d+\].*?(-?[\d.]+),\s*Lat\s+(-?[\d.]+),\s*Lon\s+(-?[\d.]+),\s*Ellh\s+([\d.]+),\s*([\d.]+),"
+    r"\s*([\d.]+)"
+)
+_SEQUENCE = re.compile(r"_(\d{4})(?:_[A-Z]+)?$", re.IGNORECASE)
+_SUBTITLE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+_IN_SUBTITLE = re.compile(
+    r"lat\w*\s*:\s*(?P<lat>-?[\d.]+).*?lon\w*\s*:\s*(?P<lon>-?[\d.]+)(?:.*?abs_alt\s*:\s*(?P<alt>-?[\d.]+))?"
+    r"|GPS\s*\((?P<lon2>-?[\d.]+),\s*(?P<lat2>-?[\d.]+)",
+    re.IGNORECASE | re.DOTALL,
+)
+
+
+def by_events(sources: Sequence[Source], text: str, file: str) -> list[GpsPosition | None]:
+    """Positions of DJI's ``.MRK``: events by their number, which the names of images end with.
+
+    They are those of the middle of the sensor; the offsets of the antenna are in them.
+    """
+    events: dict[int, GpsPosition] = {}
+    for line in text.splitlines():
+        if match := _EVENT.match(line):
+            number, latitude, longitude, height, *std = (float(value) for value in match.groups())
+            accuracy = (math.hypot(std[0], std[1]) / math.sqrt(2.0), std[2])
+            events[int(number)] = GpsPosition(latitude, longitude, height, accuracy if min(std) > 0.0 else None)
+    if not events:
+        raise InputError(f"{file}: has no events of a DJI .MRK file")
+    numbers = [_SEQUENCE.search(Path(source.name).stem) for source in sources]
+    places = [None if number is None else events.get(int(number[1])) for number in numbers]
+    if sum(place is not None for place in places) * 2 < len(places):
+        raise InputError(
+            f"{file}: has events {min(events)} to {max(events)}, which the numbers at the end of the names, as of "
+            f"{sources[0].name}, are not; give a CSV file with name,lat,lon"
+        )
+    return places
+
+
+def subtitle_points(text: str) -> list[tuple[float, float, float, float]]:
+    """Seconds since the video began, latitude, longitude and altitude in the subtitles of a DJI video."""
+    starts = list(_SUBTITLE.finditer(text))
+    points = []
+    for start, end in zip(starts, [*(s.start() for s in starts[1:]), len(text)], strict=False):
+        if place := _IN_SUBTITLE.search(text, start.end(), end):
+            hours, minutes, seconds, milliseconds = (float(part) for part in start.groups())
+            latitude, longitude = (float(place[k] or place[f"{k}2"]) for k in ("lat", "lon"))
+            if latitude or longitude:  # 0, 0 is what is written without a fix
+                time = 3600.0 * hours + 60.0 * minutes + seconds + milliseconds / 1000.0
+                points.append((time, latitude, longitude, float(place["alt"] or "nan")))
+    return points
+
+
+def track_points(text: str, file: str) -> list[tuple[float, float, float, float]]:
+    """Seconds since 1970, latitude, longitude and altitude of the points of a GPX track."""
+    points = []
+    for item in parse_xml(text, file).iter():
+        time = item.findtext("time")
+        if item.tag not in ("trkpt", "rtept", "wpt") or time is None:
+            continue
+        try:
+            moment = datetime.fromisoformat(time.strip())
+            values = (float(item.get("lat", "")), float(item.get("lon", "")), float(item.findtext("ele") or "nan"))
+        except ValueError as error:
+            raise InputError(f"{file}: a point of the track at {time!r} cannot be read: {error}") from error
+        points.append(((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp(), *values))
+    return points
+
+
+def on_track(
+    sources: Sequence[Source], points: Sequence[tuple[float, float, float, float]], file: str, offset: float
+) -> list[GpsPosition | None]:
+    """Where the images are on a track, straight from point to point."""
+    if not points:
+        raise InputError(f"{file}: has no points with a time; give a GPX track or the subtitles (.SRT) of the video")
+    seconds, latitude, longitude, altitude = np.array(sorted(points)).T
+    times = timestamps_of(sources) + offset
+    if not ((times >= seconds[0]) & (times <= seconds[-1])).any():
+        taken = f"from {_moment(np.nanmin(times))} to {_moment(np.nanmax(times))}" if np.isfinite(times).any() else ""
+        raise InputError(
+            f"{file}: the track goes from {_moment(seconds[0])} to {_moment(seconds[-1])} UTC, the images "
+            f"{f'were taken {taken}; give --positions-offset' if taken else 'have no time'}"
+        )
+    known = (latitude, np.unwrap(longitude, period=360.0), altitude)
+    rows = np.stack([np.interp(times, seconds, values, left=np.nan, right=np.nan) for values in known], axis=1)
+    return [
+        None if math.isnan(y) else GpsPosition(y, (x + 180.0) % 360.0 - 180.0, None if math.isnan(z) else z)
+        for y, x, z in rows.tolist()
+    ]
+
+
+def _moment(seconds: float) -> str:
+    return str(np.datetime64(int(seconds), "s"))
+
+
+def is_list_of_events(text: str) -> bool:
+    """Check for DJI's ``.MRK``."""
+    return _EVENT.match(text) is not None

@@ -1,0 +1,41 @@
+"""Times belong to what was named, whatever of it is left out."""
+
+from pathlib import Path
+
+import pytest
+
+from rdstitch.errors import InputError
+from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.measurements import with_times
+
+
+def times(folder: Path, count: int) -> Path:
+    file = folder / "times.txt"
+    file.write_text("".join(f"{100 + k}\n" for k in range(count)), encoding="utf-8")
+    return file
+
+
+def test_one_time_a_line_is_for_each_file_in_order(tmp_path: Path) -> None:
+    frames = [Frame(Path(f"f{k}.png")) for k in range(5)]
+    assert [frame.timestamp for frame in with_times(frames, times(tmp_path, 5))] == [100, 101, 102, 103, 104]
+    for count in (4, 6, 80):
+        with pytest.raises(InputError, match=f"has {count} times for 5 images"):
+            with_times(frames, times(tmp_path, count))
+
+
+@pytest.mark.parametrize(("numbers", "counts"), [((0, 2, 4), (5, 6)), ((0, 1, 2), (3,)), ((0, 3, 4), (5, 9))])
+def test_those_of_a_video_are_for_all_of_its_frames(
+    tmp_path: Path, numbers: tuple[int, ...], counts: tuple[int, ...]
+) -> None:
+    frames = [Frame(Path(f"v_{k}.png"), k) for k in numbers]
+    for count in counts:
+        timed = with_times(frames, times(tmp_path, count))
+        assert [frame.timestamp for frame in timed] == [100 + k for k in numbers]
+    for count in (numbers[-1], *([counts[-1] + 1] if numbers[1] < 3 else [])):
+        with pytest.raises(InputError, match="times"):
+            with_times(frames, times(tmp_path, count))
+
+
+def test_two_videos_have_one_time_after_the_other(tmp_path: Path) -> None:
+    frames = [Frame(Path(f"{name}/v_{k}.png"), k) for name in "ab" for k in range(2)]
+    assert [frame.timestamp for frame in with_times(frames, times(tmp_path, 4))] == [100, 101, 102, 103]
