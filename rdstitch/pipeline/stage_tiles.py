@@ -1,7 +1,7 @@
 """Tiles on a stage: from files whose places are roughly known to one image, or to a table of places."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.result import LinkFit, ReliefTest
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Correspondences
 from rdstitch.geometry.radial_homography import RadialHomography
@@ -23,21 +24,33 @@ from rdstitch.io.reduction import mean_of_channels
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.pipeline.choose_layout import lay_out
 from rdstitch.pipeline.compose import check_world_files, image_files
 from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside
-from rdstitch.pipeline.read_inputs import check_size, with_flat_field
+from rdstitch.pipeline.read_inputs import NO_FLAT_FIELD, check_size, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
-from rdstitch.results.messages import Message, names_of, shortened
+from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import StitchResult
+from rdstitch.stage.axes import with_axes_shown
+from rdstitch.stage.correlation import coarse_tile
+from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
-from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table, oriented
-from rdstitch.stage.register_tiles import TileRegistration, evidence, places_table, register_tiles
+from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table
+from rdstitch.stage.register_tiles import (
+    TileRegistration,
+    coarse_factor,
+    places_table,
+    register_tiles,
+    search_radius,
+)
 from rdstitch.stage.tile_options import TileOptions
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, text_bytes
 from rdstitch.system.progress import Progress, silent
+
+_COMPARED = 32  # overlaps by which a flat field is judged
 
 
 @one_opencv_thread()
@@ -71,7 +84,7 @@ def tiles(
     """
     options = options or TileOptions()
     stitch = StitchOptions(
-        distortion=options.distortion,
+        distortion=None if options.distortion == "auto" else options.distortion,
         composite=options.composite,
         overwrite=options.overwrite,
         dry_run=options.dry_run,
@@ -81,8 +94,9 @@ def tiles(
         registration, tiled = _registered(listed, output, positions_file, options, progress, beside)
         with Outputs(options.overwrite) as outputs, stitch.executor(len(registration.sources)) as executor:
             _write_beside(outputs, positions_file, options, registration, tiled)
-            local = no_local_alignment("tiles on a stage")
-            return compose_registration(registration, local, executor, output, stitch, progress, beside, outputs)
+            chosen = lay_out(registration, no_local_alignment("tiles on a stage"), stitch.composite)
+            chosen = replace(chosen, layout=replace(chosen.layout, photographs=False))
+            return compose_registration(chosen, executor, output, stitch, progress, beside, outputs)
 
 
 @one_opencv_thread()
@@ -129,11 +143,28 @@ def _registered(
     check_size(sources)
     sources, illumination = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
-    grid = _grid(sources, options, read)
+    told = _grid(sources, options)
+    search, factor = search_radius(told, options.search), coarse_factor(told)
+    grid, shown = with_axes_shown(told, lambda index: coarse_tile(read(index), factor), factor, search)
+    said = [Message(f"{told.source} contradicted: {shown}", code="grid-as-shown")] if shown else []
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
-    tiled = register_tiles(grid, read, search=options.search, distortion=options.distortion, progress=progress)
-    return _registration(sources, tiled).with_messages([*unread, *listed.messages, *illumination]), tiled
+    tiled = register_tiles(grid, read, search=search, distortion=options.distortion, progress=progress)
+    if options.flat_field == "auto" and sources[0].flat_field is not None and not _overlaps_show(sources, tiled):
+        sources, illumination = [replace(source, flat_field=None) for source in sources], [NO_FLAT_FIELD]
+    return _registration(sources, tiled).with_messages([*unread, *listed.messages, *illumination, *said]), tiled
+
+
+def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
+    """Check whether overlaps are more alike with the flat field, which was found without them, than without."""
+    field = sources[0].flat_field
+    assert field is not None
+    raw = [replace(source, flat_field=None) for source in sources]
+    pairs = tiled.links.tiles[tiled.adjustment.weights > 0.5]
+    chosen = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _COMPARED)).astype(np.intp))]
+    places = tiled.adjustment.places
+    compared = ((raw[a].read().pixels, raw[b].read().pixels, places[b] - places[a]) for a, b in chosen.tolist())
+    return agrees_with_overlaps(field, compared)
 
 
 def _write_beside(
@@ -179,7 +210,7 @@ def _plane(sources: Sequence[Source], channel: int | None, index: int) -> NDArra
     return np.ascontiguousarray(pixels[..., channel])
 
 
-def _grid(sources: Sequence[Source], options: TileOptions, read: Callable[[int], NDArray[Any]]) -> TileGrid:
+def _grid(sources: Sequence[Source], options: TileOptions) -> TileGrid:
     """Where the tiles should be."""
     size = sources[0].camera.image_size
     names = [source.name for source in sources]
@@ -187,10 +218,8 @@ def _grid(sources: Sequence[Source], options: TileOptions, read: Callable[[int],
         grid = grid_from_names(names, options.grid, options.overlap, size)
         return replace(grid, pixel_size=options.pixel_size or sources[0].metadata.pixel_size)
     if options.positions is not None:
-        grid = grid_from_table(names, options.positions, size, options.pixel_size or sources[0].metadata.pixel_size)
-    else:
-        grid = grid_from_files([source.path for source in sources], size, options.pixel_size)
-    return oriented(grid, partial(evidence, read=read, search=options.search))
+        return grid_from_table(names, options.positions, size, options.pixel_size or sources[0].metadata.pixel_size)
+    return grid_from_files([source.path for source in sources], size, options.pixel_size)
 
 
 def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registration:
@@ -263,22 +292,36 @@ def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registr
 
 def _messages(sources: Sequence[Source], tiled: TileRegistration) -> tuple[Message, ...]:
     """What the user should know of the places."""
-    stage = tiled.adjustment.stage
+    fitted = tiled.adjustment
+
+    def named(tiles: Iterable[int]) -> str:
+        return shortened(names_of([str(sources[k].path) for k in tiles]))
+
     messages = []
-    alone = np.flatnonzero(~tiled.linked)
-    if len(alone):
-        paths = [str(sources[k].path) for k in alone.tolist()]
-        named = shortened(names_of(paths))
+    if len(alone := np.flatnonzero(~tiled.linked)):
         who = "1 tile has its place" if len(alone) == 1 else f"{len(alone)} tiles have their places"
-        text = f"{who} from the stage alone, ± {stage.std:.1f} pixels, since no neighbour shows the same: {named}"
+        text = (
+            f"{who} from the stage alone, ± {_rms(tiled.stds[alone]):.1f} pixels, since no neighbour shows the same: "
+            f"{named(alone)}"
+        )
         messages.append(Message(text, severity="note", code="nominal-places"))
     if len(tiled.groups) > 1:
         others = [k for group in tiled.groups[1:] for k in group]
-        paths = [str(sources[k].path) for k in others]
-        named = shortened(names_of(paths))
         text = (
             f"tiles form {len(tiled.groups)} groups that only the stage holds together, ± "
-            f"{max(stage.std, stage.row_std, stage.column_std):.1f} pixels: {named} have no link to the largest"
+            f"{_rms(tiled.stds[others]):.1f} pixels: {named(others)} have no link to the largest"
         )
         messages.append(Message(text, code="nominal-places"))
+    if len(astray := np.flatnonzero(tiled.linked & (tiled.off_stage > max(tiled.search, 5.0 * fitted.stage.std)))):
+        off = ", ".join(f"{value:.0f}" for value in tiled.off_stage[astray][:MAX_NAMED])
+        messages.append(Message(f"not where the stage was sent, {off} pixels off by what they show: {named(astray)}"))
+    if fitted.distortion != 0.0:
+        text = (
+            f"the lens, λ = {fitted.distortion:.4f}, is corrected by resampling; --lambda 0 keeps the measured samples"
+        )
+        messages.append(Message(text, severity="note"))
     return tuple(messages)
+
+
+def _rms(values: FloatArray) -> float:
+    return math.sqrt(float((values**2).mean()))

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,8 +39,8 @@ def grid_from_names(names: Sequence[str], pattern: str, overlap: float, size: tu
     """Places by rows and columns in file names."""
     if pattern.count("{row}") != 1 or pattern.count("{col}") != 1:
         raise ArgumentError(f"the grid '{pattern}' must have {{row}} and {{col}} once each, as in 'r{{row}}c{{col}}'")
-    if not 0.0 <= overlap < 1.0:
-        raise ArgumentError(f"tiles overlap by 0 to less than 100 %, not {100 * overlap:g} %")
+    if not 0.0 <= overlap < 100.0:
+        raise ArgumentError(f"tiles overlap by 0 to less than 100 %, not {overlap:g} %")
     expression = re.escape(pattern).replace(r"\{row\}", r"(?P<row>\d+)").replace(r"\{col\}", r"(?P<col>\d+)")
     wanted = re.compile(expression.replace(r"\*", ".*"))
     cells = []
@@ -53,7 +53,7 @@ def grid_from_names(names: Sequence[str], pattern: str, overlap: float, size: tu
         twice = next(cell for cell in cells if cells.count(cell) > 1)
         raise ArgumentError(f"several tiles are row {twice[1]}, column {twice[0]}; name those of one channel only")
     places = np.array(cells, dtype=np.float64) - np.min(cells, axis=0)
-    return TileGrid(places * np.array(size) * (1.0 - overlap), size, None, f"file names, {100 * overlap:g} % overlap")
+    return TileGrid(places * np.array(size) * (1.0 - overlap / 100.0), size, None, f"file names, {overlap:g} % overlap")
 
 
 def grid_from_table(
@@ -137,31 +137,3 @@ def _grid(positions: Sequence[StagePosition], size: tuple[int, int], pixel_size:
             raise InputError(f"{source}: gives micrometres, but no file says how large a pixel is; add --pixel-size UM")
         places *= unit / pixel_size
     return TileGrid(places - places.min(axis=0), size, pixel_size, source)
-
-
-ORIENTATIONS: tuple[tuple[tuple[int, int], tuple[int, int]], ...] = (
-    ((1, 0), (0, 1)),
-    ((1, 0), (0, -1)),
-    ((-1, 0), (0, 1)),
-    ((-1, 0), (0, -1)),
-    ((0, 1), (1, 0)),
-    ((0, 1), (-1, 0)),
-    ((0, -1), (1, 0)),
-    ((0, -1), (-1, 0)),
-)
-"""Orientations of a stage's axes in the image: rows are x and y of the image in axes of the stage."""
-
-
-# factor of evidence that other axes must have: of two where one is right, the pairs along it agree in both
-_CLEARLY = 1.2
-
-
-def oriented(grid: TileGrid, evidence: Callable[[TileGrid], float]) -> TileGrid:
-    """The grid with the axes of the stage as the tiles show them; unchanged unless others are shown clearly better."""
-    best, most = grid, _CLEARLY * evidence(grid)
-    for matrix in ORIENTATIONS[1:]:
-        places = grid.places @ np.array(matrix, dtype=np.float64).T
-        turned = TileGrid(places - places.min(axis=0), grid.size, grid.pixel_size, grid.source)
-        if (shown := evidence(turned)) > most:
-            best, most = turned, shown
-    return best

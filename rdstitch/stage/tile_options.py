@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
@@ -24,7 +25,7 @@ class TileOptions:
     grid : str, optional
         Part of the file names with ``{row}`` and ``{col}``.
     overlap : float
-        Share of a tile that its neighbours show too, with ``grid``.
+        Per cent of a tile that its neighbours show too, with ``grid``.
     pixel_size : float, optional
         Micrometres.
     search : float, optional
@@ -35,8 +36,8 @@ class TileOptions:
         "auto": from the tiles themselves; "off"; or an image file, whose second page, if it has one, is the dark field.
     save_flat_field : path, optional
         TIFF file to write the flat field and the dark field to.
-    distortion : float, optional
-        λ where it is known.
+    distortion : float or "auto", optional
+        λ where it is known; "auto": estimated. Otherwise 0, unless pairs along rows and along columns show the same.
     composite : CompositeOptions
         How the image is composed; by default each of its samples is one of a tile.
     overwrite : bool
@@ -53,13 +54,13 @@ class TileOptions:
 
     positions: str | Path | None = None
     grid: str | None = None
-    overlap: float = 0.1
+    overlap: float = 10.0
     pixel_size: float | None = None
     search: float | None = None
     channel: int | None = None
     flat_field: str | Path = "auto"
     save_flat_field: str | Path | None = None
-    distortion: float | None = None
+    distortion: float | Literal["auto"] | None = None
     composite: CompositeOptions = field(default_factory=measured_samples)
     overwrite: bool = False
     strict: bool = False

@@ -1,16 +1,20 @@
 """``rdstitch tiles``: tiles from a motorised stage become one image, or a table of places."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from rdstitch.errors import PartialResultError
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
 from rdstitch_cli.option_texts import option
-from rdstitch_cli.parameter_types import RealNumber, WholeNumber
+from rdstitch_cli.parameter_types import LENS, RealNumber, WholeNumber
 from rdstitch_cli.stitching import composite_fields, files_beside, report_registration, summarize
 from rdstitch_cli.terminal import Reporter
+
+if TYPE_CHECKING:
+    from rdstitch.stage import TileRegistration
 
 
 @command(
@@ -34,7 +38,7 @@ from rdstitch_cli.terminal import Reporter
 @option("--channel", WholeNumber(0))
 @options.flat_field
 @option("--save-flat-field", options.IMAGE)
-@options.distortion
+@option("--lambda", LENS, dest="distortion")
 @options.cut
 @options.crop
 @options.interpolation
@@ -70,13 +74,25 @@ def tiles(
     paths = options.resolve(inputs)
     beside = files_beside(reporter, given)
     composite = CompositeOptions(exposure="none", seam="none", **composite_fields(given))
-    chosen = TileOptions(overlap=overlap / 100.0, composite=composite, **given)
+    chosen = TileOptions(overlap=overlap, composite=composite, **given)
     if output is None:
-        _, registration = place_tiles(paths, positions_only, chosen, progress=beside.timer)
+        tiled, registration = place_tiles(paths, positions_only, chosen, progress=beside.timer)
         report_registration(registration, reporter)
         reporter.made(f"{positions_only}: {registration.summary}")
+        _check_placed(tiled)
         return
     result = recipe(paths, output, chosen, positions_file=positions_only, progress=beside.timer, beside=beside)
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:
         reporter.made(result.summary)
+    _check_placed(result.registration.tiles)
+
+
+def _check_placed(tiled: "TileRegistration | None") -> None:
+    """End with the status of a partial result where most tiles lie where the stage was told to go, right or wrong."""
+    if tiled is not None and tiled.mostly_nominal:
+        alone = len(tiled.grid) - int(tiled.linked.sum())
+        raise PartialResultError(
+            f"{alone} of {len(tiled.grid)} tiles have their places from the stage alone: they show nothing, or "
+            f"the places ({tiled.grid.source}) or the overlap are wrong; what could be placed is written"
+        )
