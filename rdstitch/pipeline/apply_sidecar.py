@@ -38,6 +38,7 @@ from rdstitch.sidecar.write import (
     to_output,
     versions,
 )
+from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.system.file_access import canonical_name, canonical_text
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
@@ -234,13 +235,20 @@ def apply(
     if strict and doubts:
         raise InputError(doubts[0].text)
     given = as_inputs(images, channel_order)
+    if saved.content.get("stage") is not None:
+        given = with_position_folders(given)
     with found_images(given, output=output, every=every, topic=topic) as listed, Outputs(overwrite) as outputs:
         if output is not None:
             check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
-        chosen, matched = _match(saved, listed.frames, match)
+        frames, notes = listed.frames, list[Message]()
+        if (stage := saved.content.get("stage")) is not None:
+            frames, _, notes = tile_frames(frames, stage["z"], stage["time"])
+        chosen, matched = _match(saved, frames, match)
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
         used = _used(saved, sources, left_out, mask, strict=strict)
+        if stage is not None and stage["pixel_um"] is not None:
+            used = {k: replace(s, metadata=replace(s.metadata, pixel_size=stage["pixel_um"])) for k, s in used.items()}
         if flat_field != "off":
             check_size(list(used.values()))
             corrected, said = with_flat_field(list(used.values()), flat_field)
@@ -266,7 +274,7 @@ def apply(
             left_out=left_out,
             placed=placed,
             composite_options=options,
-            messages=(*doubts, *listed.messages, *guard.messages, *composed.messages),
+            messages=(*doubts, *listed.messages, *notes, *guard.messages, *composed.messages),
             channel_order=channel_order,
             **composed.output_fields,
         )
@@ -279,7 +287,19 @@ def apply(
 
 
 def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImages:
-    """The images at the places that the sidecar has for them."""
+    """The images at the places that the sidecar has for them.
+
+    Those of a stage keep the frame of all its tiles, so that channels lie on each other whichever tiles they lack.
+    """
+    on_stage = saved.content.get("stage") is not None
+    frame = None
+    if on_stage:
+        every = {
+            index: image for index, image in enumerate(saved.images) if image.camera and image.to_plane is not None
+        }
+        cameras = [used[index].camera if index in used else image.camera for index, image in every.items()]
+        homographies = np.array([image.to_plane for image in every.values()], dtype=np.float64)
+        frame = [camera for camera in cameras if camera], homographies, [list(every).index(index) for index in used]
     return PlacedImages(
         list(used.values()),
         [source.camera for source in used.values()],
@@ -291,7 +311,8 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImage
         ],
         saved.turned,
         saved.place,
-        whole=saved.content.get("stage") is not None,
+        whole=on_stage,
+        frame=frame,
         orientation=saved.orientation,
     )
 

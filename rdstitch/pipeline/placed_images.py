@@ -82,6 +82,8 @@ class PlacedImages:
     turned: bool = False
     place: Georeference | None = None  # of the plane, where it is known from an earlier run
     whole: bool = False  # whether nothing of them can be static: tiles on a stage, whose ground may be black
+    # cameras and homographies of all images that the canvas has room for, and which of them are there; None: these
+    frame: tuple[Sequence[Camera], FloatArray, Sequence[int]] | None = None
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
 
@@ -201,4 +203,10 @@ def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canv
             f"the {options.projection} projection is for images taken by turning on the spot; these were not, "
             "leave out --projection"
         )
-    return replace(plan_canvas(placed.cameras, placed.homographies, **how), orientation=placed.orientation)
+    if placed.frame is None:
+        return replace(plan_canvas(placed.cameras, placed.homographies, **how), orientation=placed.orientation)
+    cameras, homographies, there = placed.frame
+    how |= {"names": None, "reference": there[placed.reference or 0]}
+    canvas = plan_canvas(cameras, homographies, **how)
+    footprints, near = tuple(canvas.footprints[k] for k in there), tuple(canvas.near[k] for k in there)
+    return replace(canvas, footprints=footprints, near=near, orientation=placed.orientation)
