@@ -10,3 +10,9 @@ ProjectionName = Literal["auto", "plane", "cylinder", "sphere", "mercator", "pan
 
 FEATURES: tuple[str, ...] = get_args(FeatureName)
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
+
+Purpose = Literal["pano", "mosaic", "calibrate", "trajectory"]
+"""The recipe that a registration is for. In "pano" every image must be readable, and a turn on the spot is taken where
+a plane explains the images as well; for "calibrate" images of a repeated pattern may be off by whole periods of it, and
+doubts about their places do not matter; for "trajectory" poses must be metric, so that the freest model is that of
+planar motion with small tilts."""

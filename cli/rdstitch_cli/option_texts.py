@@ -72,7 +72,7 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 * --every auto|N: Every N-th frame of a video or ROS bag; auto: frames that show new ground.
 * --exclude NAME: Exclude the image of this name, or all that match a pattern like 'img_49*'; repeatable.
 --include-only NAME: Use only the images of this name or pattern; repeatable.
---match: Assign images by name (the suffix may differ), by order, or by order if no name matches.
+--match: Assign images by name (suffix and band may differ), by order, or (auto) by name, time or GPS position.
 --topic NAME: Image topic of a ROS bag.
 --timestamps FILE: Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; otherwise those of
     the video, bag or EXIF.
@@ -102,6 +102,8 @@ tiles --lambda L|auto: Known λ (half-diagonal frame), or auto: estimate it; oth
 * --gsd M: Ground sample distance, metres; instead of --scale.
 --crs: Coordinate system of the map, and of x and y in --positions; otherwise UTM on WGS 84. All but UTM need
     rasterio.
+--like FILE: Grid of the output: coordinate system, pixels and extent of this GeoTIFF file.
+--extent: Extent of the output on the map, metres.
 --georeference: Place the output where positions or control points agree with the images, also where these contradict
     them (force), or never.
 --north-up/--no-north-up: Turn north up where three images or more have a GPS position that fits.  [default: north up]

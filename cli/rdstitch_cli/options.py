@@ -18,6 +18,7 @@ from rdstitch_cli.parameter_types import (
     BYTES,
     CORNERS,
     EPSG,
+    EXTENT,
     LINES,
     FileOr,
     RealNumber,
@@ -168,6 +169,8 @@ compositing = together(
     option("--north-up/--no-north-up", default=True),
     option("--gsd", RealNumber()),
     option("--crs", EPSG, dest="epsg"),
+    option("--like", IMAGE, callback=lambda _context, _option, value: None if value is None else str(value)),
+    option("--extent", EXTENT),
     option("--georeference", ("auto", "force", "off"), "auto"),
 )
 

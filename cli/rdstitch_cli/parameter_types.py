@@ -159,13 +159,14 @@ def _lens(text: str) -> float | str:
     return value
 
 
-ANGLES, ANGLE, BYTES, EPSG, CORNERS, LINES, LENS = (
+ANGLES, ANGLE, BYTES, EPSG, EXTENT, CORNERS, LINES, LENS = (
     Parsed(name, parse)
     for name, parse in (
         ("PSI,THETA", _angles),
         ("DEG", _angle),
         ("SIZE", _bytes),
         ("EPSG:N", _epsg),
+        ("W,S,E,N", partial(_pixels, count=4)),
         ("X1,Y1,…,X4,Y4", partial(_pixels, count=8)),
         ("off|auto|LINES", _lines),
         ("L|auto", _lens),

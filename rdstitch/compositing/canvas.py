@@ -167,8 +167,15 @@ class Canvas:
         low, high = np.floor(outline.min(axis=0)), np.ceil(outline.max(axis=0)) + 1
         shifts = self._shifts(float(low[0]), float(high[0]))
         low[0], high[0] = low[0] + min(shifts), high[0] + max(shifts)
-        x0, y0 = (max(0, int(v)) for v in low)
-        return x0, y0, min(width, int(high[0])), min(height, int(high[1]))
+        # Of an image beyond a grid that was given there is one pixel, in which it is not.
+        x0, y0 = (min(max(0, int(v)), side - 1) for v, side in zip(low, (width, height), strict=True))
+        return x0, y0, max(x0 + 1, min(width, int(high[0]))), max(y0 + 1, min(height, int(high[1])))
+
+    def on_grid(self, matrix: FloatArray, size: tuple[int, int]) -> "Canvas":
+        """The same plane on other pixels, which images may lie beyond."""
+        change = matrix @ np.linalg.inv(self.matrix)
+        outlines = tuple(outline @ change[:2, :2].T + change[:2, 2] for outline in self.footprints)
+        return replace(self, size=size, matrix=matrix, footprints=outlines)
 
     def areas(self) -> list[int]:
         """Of the bounds of every image, as if it had only one place on the canvas, square pixels."""

@@ -129,6 +129,12 @@ class Georeference:
             scale = complex(abs(scale))
         return replace(self, scale=scale, origin=self.origin - scale * complex(change[0, 2], -change[1, 2]))
 
+    def in_pixels(self, other: "Georeference") -> FloatArray:
+        """Similarity (3, 3) from pixels of another output on the same map to pixels of this one."""
+        factor, shift = other.scale / self.scale, (other.origin - self.origin) / self.scale
+        a, b = factor.real, factor.imag
+        return np.array([[a, b, shift.real], [-b, a, -shift.imag], [0.0, 0.0, 1.0]])
+
     def in_system(self, crs: Crs, pixels: ArrayLike) -> "Georeference":
         """The same place in another coordinate system, nearest at some pixels (N, 2) of the output."""
         if crs == self.crs:

@@ -118,5 +118,5 @@ def array_as_image(name: str, array: NDArray[Any], channel_order: ChannelOrder) 
     if array.ndim == 3 and channels <= 2:
         samples = samples[..., 0]
     samples = in_order(np.array(samples, dtype=np.float32 if array.dtype.kind == "f" else array.dtype), channel_order)
-    metadata = Metadata((array.shape[1], array.shape[0]), bit_depth=8 * array.dtype.itemsize)
+    metadata = Metadata((array.shape[1], array.shape[0]), bit_depth=8 * array.dtype.itemsize, channels=channels)
     return as_image(Path(name), samples, None if alpha is None else alpha.copy(), metadata)

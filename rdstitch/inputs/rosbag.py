@@ -18,9 +18,10 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.keyframes import Wanted, wanted_frames
 from rdstitch.io.video import write_frame
+from rdstitch.system.file_access import read_beginning
 
 _SUFFIXES = (".bag", ".db3", ".mcap")
-_DESCRIPTION = "metadata.yaml"
+_DESCRIPTION, _KEY, _HEADER = "metadata.yaml", b"rosbag2_bagfile_information", 4096
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TYPES = {
@@ -45,8 +46,13 @@ _TO_BGR = {
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag: a file by its suffix, or a folder that ROS 2 wrote."""
-    return path.suffix.lower() in _SUFFIXES or (path.is_dir() and (path / _DESCRIPTION).is_file())
+    """Whether a path is a bag: a file by its suffix, or a folder that ROS 2 wrote, by what it says of itself."""
+    if path.suffix.lower() in _SUFFIXES or not path.is_dir():
+        return path.suffix.lower() in _SUFFIXES
+    try:
+        return _KEY in read_beginning(path / _DESCRIPTION, _HEADER)
+    except OSError:
+        return False
 
 
 @contextmanager
@@ -156,10 +162,8 @@ class _Messages:
         bits = 8
         for connection, _, data in self.reader.messages(connections=self.connections):
             message = self.reader.deserialize(data, connection.msgtype)
-            if connection.msgtype == _COMPRESSED:
-                yield _grey_of_compressed(message.data)
-                continue
-            pixels = _pixels(self.path, message)
+            compressed = connection.msgtype == _COMPRESSED
+            pixels = _grey_of_compressed(message.data) if compressed else _pixels(self.path, message)
             if pixels.dtype != np.uint8:
                 # Sensors of 10 or 12 bits leave the highest ones empty.
                 bits = max(bits, int(pixels.max()).bit_length())
@@ -185,12 +189,13 @@ class _Messages:
             yield Frame(file, number, stamp or time_ns * 1e-9)
 
 
-def _grey_of_compressed(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A JPEG or PNG image, (H, W); black where it cannot be decoded. OpenCV's decoders write on standard error."""
+def _grey_of_compressed(data: NDArray[np.uint8]) -> NDArray[Any]:
+    """A JPEG or PNG image, (H, W), of 8 or 16 bits; black where it cannot be decoded."""
     try:
+        # Not by OpenCV, whose decoders write on standard error.
         with Image.open(BytesIO(data.tobytes()), formats=("JPEG", "PNG")) as image:
             deep = image.mode.startswith("I")
-            return (np.asarray(image) >> 8).astype(np.uint8) if deep else np.asarray(image.convert("L"))
+            return np.asarray(image).astype(np.uint16) if deep else np.asarray(image.convert("L"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return np.zeros((1, 1), np.uint8)
 

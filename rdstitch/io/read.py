@@ -17,11 +17,11 @@ from PIL import Image
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turned
 from rdstitch.io.colour import without_inks
-from rdstitch.io.metadata import Metadata, metadata_of, read_metadata, read_ome
+from rdstitch.io.metadata import Metadata, is_grey_palette, metadata_of, read_metadata, read_ome
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image, read_raw
 from rdstitch.io.read_tiff import read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
-from rdstitch.system.file_access import open_regular
+from rdstitch.system.file_access import open_regular, read_beginning
 from rdstitch.system.late_imports import tifffile
 from rdstitch.system.opencv_state import silent_opencv
 
@@ -48,8 +48,7 @@ def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) 
     if min(size) < _MIN_JPEG_SIDE:
         return None, ""
     width, height = reduced_size(size, factor)
-    with open_regular(file) as stream:
-        data = stream.read()
+    data = read_beginning(file, _most_bytes(size))
     try:
         samples = simplejpeg.decode_jpeg(
             data, "GRAY" if grey else "RGB", min_height=height, min_width=width, strict=True
@@ -58,6 +57,11 @@ def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) 
         return None, "" if _is_padding(str(error), data) else str(error)
     whole: NDArray[Any] = np.asarray(samples)[..., 0] if grey else np.asarray(samples)
     return (whole if whole.shape[:2] == (height, width) else None), ""
+
+
+def _most_bytes(size: tuple[int, int]) -> int:
+    """How much of a file an image can take, with what stands before it; a video may follow, or a hole without end."""
+    return 2**26 + 16 * size[0] * size[1]
 
 
 def _is_padding(complaint: str, data: bytes) -> bool:
@@ -120,7 +124,7 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
             with opened_image(file) as opened:
                 metadata = metadata or metadata_of(opened)
                 if magic == PNG_MAGIC and metadata.bit_depth == 16 and opened.mode not in _GREY_16:
-                    samples, alpha = _split(_read_16_bit_png(file))
+                    samples, alpha = _split(_read_16_bit_png(file, opened.size))
                 else:
                     factor, decoded = _decoders_share(opened, metadata, reduction), None
                     if opened.format in _JPEG and opened.mode in ("L", "RGB"):
@@ -159,7 +163,7 @@ def from_pillow(image: Image.Image, factor: int = 1) -> tuple[Pixels, Pixels | N
         return _samples(image), None
     transparent = "A" in image.getbands() or "transparency" in image.info or image.mode in ("La", "RGBa")
     image = without_inks(image)
-    grey = image.mode in ("1", "L", "LA", "La") or (image.mode == "P" and _is_grey(image))
+    grey = image.mode in ("1", "L", "LA", "La") or (image.mode == "P" and is_grey_palette(image))
     mode = "RGBA" if transparent else "L" if grey else "RGB"
     samples = _samples(image if image.mode == mode else image.convert(mode))
     if not transparent:
@@ -179,16 +183,9 @@ def _samples(image: Image.Image) -> Pixels:
     return samples
 
 
-def _is_grey(image: Image.Image) -> bool:
-    """Check whether a palette holds shades of grey only."""
-    palette = np.array(image.getpalette("RGB") or [], dtype=np.uint8).reshape(-1, 3)
-    return bool((palette == palette[:, :1]).all())
-
-
-def _read_16_bit_png(file: Path) -> Pixels:
+def _read_16_bit_png(file: Path, size: tuple[int, int]) -> Pixels:
     """16-bit colour, which Pillow would cut to 8 bit; damage is found by the checksums, which OpenCV tolerates."""
-    with open_regular(file) as stream:
-        data = memoryview(stream.read())
+    data = memoryview(read_beginning(file, _most_bytes(size)))
     position, kind = len(PNG_MAGIC), b""
     kept = [data[:position]]
     while kind != b"IEND":

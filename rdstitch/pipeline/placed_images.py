@@ -82,10 +82,10 @@ class PlacedImages:
     turned: bool = False
     place: Georeference | None = None  # of the plane, where it is known from an earlier run
     whole: bool = False  # whether nothing of them can be static: tiles on a stage, whose ground may be black
-    # cameras and homographies of all images that the canvas has room for, and which of them are there; None: these
-    frame: tuple[Sequence[Camera], FloatArray, Sequence[int]] | None = None
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
+    # pixels that the output is made on, as of an earlier run: from the plane (3, 3), their size, and their place
+    grid: tuple[FloatArray, tuple[int, int], Georeference | None] | None = None
 
     @classmethod
     def of(cls, registration: Registration, displacements: Sequence[Displacement | None] | None) -> Self:
@@ -150,7 +150,16 @@ class PlacedImages:
                 for reader, camera in zip(read, self.cameras, strict=True)
             ]
         return [
-            PlacedImage(reader, camera, matrix, reader, source.metadata.exposure, displacement, str(source.path))
+            PlacedImage(
+                reader,
+                camera,
+                matrix,
+                reader,
+                source.metadata.exposure,
+                displacement,
+                str(source.path),
+                source.metadata.channels in (3, 4),
+            )
             for reader, camera, matrix, source, displacement in zip(
                 read,
                 self.cameras,
@@ -179,6 +188,8 @@ def _read_near(read: Callable[..., DecodedImage], part: NearPart, reduction: int
 def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
     """The canvas of the images, no larger than ``options.max_size``."""
     canvas = _plan(placed, options, options.scale)
+    if placed.grid is not None:
+        return canvas.on_grid(*placed.grid[:2])
     if options.max_size is None or max(canvas.size) <= options.max_size:
         return canvas
     # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.
@@ -203,10 +214,4 @@ def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canv
             f"the {options.projection} projection is for images taken by turning on the spot; these were not, "
             "leave out --projection"
         )
-    if placed.frame is None:
-        return replace(plan_canvas(placed.cameras, placed.homographies, **how), orientation=placed.orientation)
-    cameras, homographies, there = placed.frame
-    how |= {"names": None, "reference": there[placed.reference or 0]}
-    canvas = plan_canvas(cameras, homographies, **how)
-    footprints, near = tuple(canvas.footprints[k] for k in there), tuple(canvas.near[k] for k in there)
-    return replace(canvas, footprints=footprints, near=near, orientation=placed.orientation)
+    return replace(plan_canvas(placed.cameras, placed.homographies, **how), orientation=placed.orientation)

@@ -111,6 +111,7 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
     shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
     if shown.field is None:
         return list(sources), [NO_FLAT_FIELD]
-    dark = ", ".join(f"{d:.0f} ± {e:.0f}" if e > 0 else "0" for d, e in zip(shown.dark, shown.dark_error, strict=True))
+    levels = zip(shown.dark, shown.dark_error, strict=True)
+    dark = ", ".join(f"{level:.0f} ± {error:.0f}" if error > 0.0 else "not shown" for level, error in levels)
     text = f"flat field: {shown.shading:.0%} less light where it is darkest, ± {shown.error:.1%}; dark level {dark}"
     return [replace(source, flat_field=shown.field) for source in sources], [Message(text, severity="note")]

@@ -30,6 +30,7 @@ from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.pipeline.choose_layout import lay_out
 from rdstitch.pipeline.compose import check_world_files, image_files
 from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside
 from rdstitch.pipeline.read_inputs import NO_FLAT_FIELD, with_flat_field
@@ -111,8 +112,9 @@ def tiles(
         registration, tiled = _registered(listed, output, positions_file, options, progress, beside)
         with Outputs(options.overwrite) as outputs, stitch.executor(len(registration.sources)) as executor:
             _write_beside(outputs, positions_file, options, registration, tiled)
-            local = no_local_alignment("tiles on a stage")
-            return compose_registration(registration, local, executor, output, stitch, progress, beside, outputs)
+            chosen = lay_out(registration, no_local_alignment("tiles on a stage"), stitch.composite)
+            chosen = replace(chosen, layout=replace(chosen.layout, photographs=False))
+            return compose_registration(chosen, executor, output, stitch, progress, beside, outputs)
 
 
 @one_opencv_thread()

@@ -456,6 +456,19 @@ def test_four_coefficients_of_usual_lenses_need_no_mark(tmp_path: Path, name: st
     assert found == load_camera(marked)
 
 
+@pytest.mark.parametrize("reference", ["[*{0},*{0},*{0},*{0}]", "{{<<: [*{0},*{0},*{0},*{0}]}}"])
+def test_a_few_lines_of_yaml_do_not_become_millions(tmp_path: Path, reference: str) -> None:
+    """4 to the power of 30 objects: without end where each is visited."""
+    lines = ["a0: &a0 {x: [1]}", *(f"a{k + 1}: &a{k + 1} {reference.format(f'a{k}')}" for k in range(30))]
+    (tmp_path / "laugh.yaml").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"laugh\.yaml"):
+        load_camera(tmp_path / "laugh.yaml")
+
+
+def test_an_alias_is_what_it_stands_for() -> None:
+    assert parse_yaml("a: &one [1.0, 2.0]\nb: *one\n", "c.yaml") == {"a": [1.0, 2.0], "b": [1.0, 2.0]}
+
+
 def test_yaml_may_be_written_in_any_style(tmp_path: Path) -> None:
     usual = load_camera(_opencv_file(tmp_path / "c.yml", (900.0, 900.0), [-0.2, 0.05, 0.0, 0.0, 0.0], (1280, 960)))
     rows = "\n".join(f"    - {value}" for value in ("9e2", "0", "641.", "0", "9e+02", "478.", "0", "0", "1"))
