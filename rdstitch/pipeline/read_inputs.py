@@ -105,10 +105,10 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         field = read_flat_field(wanted, sources[0].camera.image_size, channels)
         return [replace(source, flat_field=field) for source in sources], []
-    if len(sources) < LEAST_TILES:
+    shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
+    if shown.field is None and len(sources) < LEAST_TILES:
         text = f"{len(sources)} tiles are too few to show their flat field, and samples stay as they are"
         return list(sources), [Message(text, severity="note", code="flat-field")]
-    shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
     if shown.field is None:
         return list(sources), [NO_FLAT_FIELD]
     levels = zip(shown.dark, shown.dark_error, strict=True)

@@ -91,6 +91,8 @@ def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
 
 def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
     """Estimate the flat field and the dark level of tiles."""
+    if count < LEAST_TILES:
+        return Illumination(None, math.inf, 0.0, np.zeros(1), np.zeros(1))
     first = read(0)
     shown = _Statistics(read(index) for index in range(count))
     channels = shown.ground.shape[3]
