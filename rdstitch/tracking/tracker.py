@@ -6,6 +6,7 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from importlib import import_module
 from typing import Any
 
 import cv2
@@ -22,10 +23,10 @@ from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
-from rdstitch.system.late_imports import import_late_modules
 from rdstitch.tracking.metric_plane import MetricPlane, SeenPair, chained, tilt_of
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 
+_ALIGNMENT_IMPORTS = "scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial"
 _WINDOW = 48  # keyframes that are aligned together
 _KEPT = 200  # older keyframes at the most, among which a lost frame looks for its place
 _PARTNERS = 2  # last keyframes that a frame is matched with
@@ -164,7 +165,8 @@ class Tracker:
         self._first_executor = executor
         if not options.patient:
             self._first_executor = ThreadPoolExecutor(1)
-            import_late_modules()
+            for name in _ALIGNMENT_IMPORTS:  # now: nothing that follows should wait for them
+                import_module(name)
         self._count, self._map, self._lost = 0, 0, 0
         self._flow = CornerFlow()
         self._model = options.alignment.model
