@@ -273,7 +273,9 @@ def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip]) -> None:
             levels.append(level)
         size = layout.metadata.pixel_size
         units = {} if size is None else {"PhysicalSizeX": size, "PhysicalSizeY": size}
-        names = {key + "Unit": "µm" for key in units}
+        names: dict[str, Any] = {key + "Unit": "µm" for key in units}
+        if apart and len(layout.metadata.channel_names) == layout.channels:
+            names["Channel"] = {"Name": list(layout.metadata.channel_names)}
         identity = uuid.uuid5(uuid.NAMESPACE_OID, f"rdstitch {layout.size} {layout.channels} {layout.dtype}")
         total = sum(level.nbytes for level in levels)
         with tifffile.TiffWriter(path, ome=True, bigtiff=total > 2**31) as tiff:
