@@ -15,6 +15,7 @@ from rdstitch_cli.terminal import Reporter
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
     from rdstitch.pipeline.follow import FollowedPoses
+    from rdstitch.pipeline.output_plan import FilesBeside
     from rdstitch.results.registration import Registration
     from rdstitch.results.stitch_options import StitchOptions
 
@@ -31,36 +32,34 @@ def followed(
     refresh: float | None = None,
     plot: Path | None = None,
     poses: "FollowedPoses | None" = None,
+    beside: "FilesBeside | None" = None,
 ) -> Iterator[list["Named"]]:
     """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe.
 
     ``refresh`` is None where no image is made; ``plot`` will be written at the end too. ``poses`` says how poses are
     printed: as the file that is written at the end has them.
     """
-    from rdstitch.camera_files import CAMERA_SUFFIXES
+    from rdstitch.camera_files import format_of
     from rdstitch.inputs.arrivals import Arrivals
+    from rdstitch.pipeline.compose import image_files
     from rdstitch.pipeline.follow import follow as follow_frames
+    from rdstitch.pipeline.output_plan import NOTHING_BESIDE
     from rdstitch.system.file_access import file_state
-    from rdstitch.system.outputs import TemporaryFolder, check_output
+    from rdstitch.system.outputs import TemporaryFolder, check_outputs, check_suffix
 
     if len(inputs) != 1:
         raise click.UsageError("--follow takes one input: a folder, a video, the index of a camera, a stream or -")
     source = Path(inputs[0])
     if source.is_dir() and output.resolve().parent == source.resolve():
         raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
-    # Before hours of frames, not after them.
     preview = output.with_suffix(".preview.jpg") if refresh else None
-    others = [preview, plot]
-    if refresh is None:
-        others.append(output)
-    else:
-        check_output(output, stitch.overwrite)
-        others.append(Path(f"{output}.json"))
-    for other in others:
-        if other is not None:
-            check_output(other, stitch.overwrite, [source], suffixes=())
+    # Before hours of frames, not after them.
+    planned = [output] if refresh is None else image_files(check_suffix(output))
     if stitch.save_camera is not None:
-        check_output(stitch.save_camera, stitch.overwrite, suffixes=CAMERA_SUFFIXES)
+        format_of(stitch.save_camera, stitch.camera_format)
+        planned.append(stitch.save_camera)
+    planned += [file for file in (preview, plot) if file is not None]
+    check_outputs([*planned, *(beside or NOTHING_BESIDE).files([])], stitch.overwrite, [source])
     before = file_state(preview) if preview else None
     with TemporaryFolder() as folder:
         arrivals = Arrivals(

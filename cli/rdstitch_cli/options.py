@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args
 import click
 from click.core import ParameterSource
 
-from rdstitch.choices import FEATURES, LensName, ModelName, ProjectionName, SolverName
+from rdstitch.choices import FEATURES, CameraFormat, LensName, ModelName, ProjectionName, SolverName
 from rdstitch_cli.option_texts import TEXTS, option
 from rdstitch_cli.parameter_types import (
     ANGLE,
@@ -18,6 +18,7 @@ from rdstitch_cli.parameter_types import (
     BYTES,
     CORNERS,
     EPSG,
+    EXTENT,
     LINES,
     FileOr,
     RealNumber,
@@ -168,8 +169,12 @@ compositing = together(
     option("--north-up/--no-north-up", default=True),
     option("--gsd", RealNumber()),
     option("--crs", EPSG, dest="epsg"),
+    option("--like", IMAGE, callback=lambda _context, _option, value: None if value is None else str(value)),
+    option("--extent", EXTENT),
     option("--georeference", ("auto", "force", "off"), "auto"),
 )
+
+camera_format = option("--camera-format", get_args(CameraFormat), "auto")
 
 # What every command that registers images takes, and what those take that also compose them.
 registration = together(overwrite, known, estimation, report, trust)
@@ -185,6 +190,7 @@ stitching = together(
     option("--whole-layers", bool),
     option("--hugin-project", IMAGE),
     option("--save-camera", IMAGE),
+    camera_format,
     registration,
     as_json("the sidecar"),
     verbosity,

@@ -148,15 +148,28 @@ def _lines(text: str) -> str | tuple[tuple[float, ...], ...]:
     return text if text in ("off", "auto") else tuple(_pixels(line, 4) for line in text.split(";"))
 
 
-ANGLES, ANGLE, BYTES, EPSG, CORNERS, LINES = (
+def _lens(text: str) -> float | str:
+    """λ, or that it is to be estimated."""
+    try:
+        value = text if text == "auto" else float(text)
+    except ValueError:
+        value = math.nan
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("is neither auto nor a number")
+    return value
+
+
+ANGLES, ANGLE, BYTES, EPSG, EXTENT, CORNERS, LINES, LENS = (
     Parsed(name, parse)
     for name, parse in (
         ("PSI,THETA", _angles),
         ("DEG", _angle),
         ("SIZE", _bytes),
         ("EPSG:N", _epsg),
+        ("W,S,E,N", partial(_pixels, count=4)),
         ("X1,Y1,…,X4,Y4", partial(_pixels, count=8)),
         ("off|auto|LINES", _lines),
+        ("L|auto", _lens),
     )
 )
 

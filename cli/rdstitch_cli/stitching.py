@@ -3,8 +3,7 @@
 import math
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -20,10 +19,10 @@ if TYPE_CHECKING:
     from rdstitch.choices import SolverName
     from rdstitch.compositing import CompositePlan
     from rdstitch.geometry.camera import Camera
+    from rdstitch.pipeline.output_plan import FilesBeside
     from rdstitch.results.registration import Registration
     from rdstitch.results.stitch_options import StitchOptions
     from rdstitch.results.stitch_result import StitchResult
-    from rdstitch.system.outputs import Outputs
 
 
 def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
@@ -118,76 +117,14 @@ def _check_written(read: Iterable[Path | None]) -> None:
             check_not_read([context.params[name]], files)
 
 
-class FilesBeside:
-    """What is written beside a result: report, layers, project of Hugin, poses; and the stages that a report times."""
+def files_beside(reporter: Reporter, given: dict[str, Any]) -> "FilesBeside":
+    """Take the options of what is written beside a result out of a command's flags."""
+    from rdstitch.pipeline.output_plan import FilesBeside
+    from rdstitch.system.progress import StageTimer
 
-    def __init__(
-        self, reporter: Reporter, inputs: Sequence[Path], given: dict[str, Any], output: Path | None = None
-    ) -> None:
-        """Take their options out of a command's flags, and find out before long work whether they can be written."""
-        from rdstitch.system.outputs import check_distinct, check_output
-        from rdstitch.system.progress import StageTimer
-
-        self._reporter, self.progress = reporter, StageTimer(reporter)
-        self._report, self._layers = given.pop("report", None), given.pop("layers", None)
-        self._project, self._poses = given.pop("hugin_project", None), given.pop("poses", None)
-        self._whole_layers, self._frame = given.pop("whole_layers", False), given.pop("frame", "enu")
-        names = [self._project, self._poses, output, None if output is None else f"{output}.json"]
-        if self._report is not None:
-            from rdstitch.viewer import viewer_path
-
-            check_output(self._report, given["overwrite"], inputs, suffixes=(".html", ".htm"))
-            names += [self._report, None if output is None else viewer_path(output)]
-        for file in (self._project, self._poses):
-            if file is not None:
-                check_output(file, given["overwrite"], inputs, suffixes=())
-        check_distinct(name for name in names if name is not None)
-        if self._whole_layers and self._layers is None:
-            raise click.UsageError("--whole-layers goes with --layers DIR")
-        if self._layers is not None:
-            from rdstitch.pipeline.result_files import make_folder
-
-            make_folder(self._layers)
-
-    @contextmanager
-    def explaining(self) -> Iterator[None]:
-        """Run a recipe; a result that is refused is reported, so that one can see why."""
-        from rdstitch.verification.verdict import RefusedError
-
-        try:
-            yield
-        except RefusedError as refused:
-            from rdstitch.system.outputs import Outputs
-
-            with Outputs(overwrite=True) as outputs:
-                self.stage(outputs, refused.registration)
-            raise
-
-    def stage(self, outputs: "Outputs", result: "StitchResult | Registration") -> None:
-        """Stage the files that are wanted, to be published with what else the recipe writes."""
-        from rdstitch.results.stitch_result import StitchResult
-        from rdstitch.system.outputs import text_bytes
-
-        def attempt(place: Path, write: Callable[[], object]) -> None:
-            for message in outputs.attempt(place, write):
-                self._reporter.warn(str(message))
-
-        if (report := self._report) is not None:
-            from rdstitch.report import write_report
-
-            command = shlex.join(["rdstitch", *sys.argv[1:]])
-            attempt(report, lambda: write_report(report, result, self.progress.stages, command, outputs=outputs))
-        project, poses, layers = self._project, self._poses, self._layers
-        if isinstance(result, StitchResult) and (project or poses or layers):
-            from rdstitch.pipeline.result_files import poses_table, project_of_hugin, write_layers
-
-            if project is not None and result.plan is None:
-                attempt(project, lambda: outputs.write(project, text_bytes(project_of_hugin(result))))
-            if poses is not None and result.plan is None:
-                attempt(poses, lambda: outputs.write(poses, text_bytes(poses_table(result, self._frame))))
-            if layers is not None:
-                how = {"whole": self._whole_layers, "overwrite": result.options.overwrite, "outputs": outputs}
-                attempt(layers, lambda: write_layers(result, layers, **how))
+    fields = FilesBeside.__dataclass_fields__.keys() & given.keys()
+    wanted: dict[str, Any] = {name: given.pop(name) for name in fields}
+    return FilesBeside(**wanted, command=shlex.join(["rdstitch", *sys.argv[1:]]), timer=StageTimer(reporter))
 
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:
@@ -195,6 +132,12 @@ def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = Fal
     from rdstitch.sidecar.write import sidecar
 
     report_registration(result.registration, reporter, partial(sidecar, result) if as_json else None)
+    places, broken = len(result.seams.places), int(result.seams.broken.sum())
+    reporter.log(f"seams hold at {places - broken} of {places} places")
+    for one in result.seams.breaks:
+        first, second = (result.registration.used_names[k] for k in one.images)
+        x, y = one.position
+        reporter.log(f"broken over {one.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}")
     if result.plan is not None and not as_json:
         show_plan(result.plan)
 

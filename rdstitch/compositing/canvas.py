@@ -56,6 +56,11 @@ class NearPart:
         kept = border[: last + 1][inside[: last + 1]]
         return np.concatenate([kept, measured[np.isfinite(measured).all(axis=1)]])
 
+    def shows(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Which measured pixels (K, 2) are drawn."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self._value(self.camera.normalize(self.camera.undistort(points))) > 0.0)
+
     def masked(self, image: DecodedImage) -> DecodedImage:
         """The image, whole or reduced, with the rest transparent."""
         height, width = image.pixels.shape[:2]
@@ -156,6 +161,7 @@ class Canvas:
     near: tuple[NearPart | None, ...] = ()  # what of each image is drawn; None for all of it, empty for all of all
     # (3, 3): what the registered images were turned by before, as it is recorded; None where they were not
     orientation: FloatArray | None = None
+    cropped_to: Box | None = None  # what a crop leaves, instead of the largest part without holes
 
     def box(self, index: int) -> Box:
         """Bounds (x0, y0, x1, y1) of an image, whole pixels inside the canvas, end exclusive.
@@ -166,8 +172,15 @@ class Canvas:
         low, high = np.floor(outline.min(axis=0)), np.ceil(outline.max(axis=0)) + 1
         shifts = self._shifts(float(low[0]), float(high[0]))
         low[0], high[0] = low[0] + min(shifts), high[0] + max(shifts)
-        x0, y0 = (max(0, int(v)) for v in low)
-        return x0, y0, min(width, int(high[0])), min(height, int(high[1]))
+        # Of an image beyond a grid that was given there is one pixel, in which it is not.
+        x0, y0 = (min(max(0, int(v)), side - 1) for v, side in zip(low, (width, height), strict=True))
+        return x0, y0, max(x0 + 1, min(width, int(high[0]))), max(y0 + 1, min(height, int(high[1])))
+
+    def on_grid(self, matrix: FloatArray, size: tuple[int, int]) -> "Canvas":
+        """The same plane on other pixels, which images may lie beyond."""
+        change = matrix @ np.linalg.inv(self.matrix)
+        outlines = tuple(outline @ change[:2, :2].T + change[:2, 2] for outline in self.footprints)
+        return replace(self, size=size, matrix=matrix, footprints=outlines)
 
     def areas(self) -> list[int]:
         """Of the bounds of every image, as if it had only one place on the canvas, square pixels."""
@@ -199,12 +212,29 @@ class Canvas:
         places: FloatArray = self.projection.project(directions) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
         return places
 
+    def cut_away(self, cameras: Sequence[Camera], homographies: FloatArray) -> float:
+        """Share of what the images show that has no place here, because it would be stretched too much."""
+        drawn = []
+        for k, (camera, matrix) in enumerate(zip(cameras, homographies, strict=True)):
+            points = points_over(camera.image_size, _PROBES)
+            part, places = self.near[k] if self.near else None, self.place(camera, matrix, points)
+            with np.errstate(invalid="ignore"):
+                beside = (places < -1.0) | (places > np.array(self.size))
+                inside = np.isfinite(places).all(axis=1) & ~beside[:, 1 if self.period else 0 :].any(axis=1)
+            drawn.append(inside if part is None else inside & part.shows(points))
+        return 1.0 - float(np.mean(drawn))
+
     def cropped(self, box: Box) -> "Canvas":
         """The part (x0, y0, x1, y1) of this canvas as a canvas of its own."""
         x0, y0, x1, y1 = box
         shift = np.array([[1.0, 0.0, -x0], [0.0, 1.0, -y0], [0.0, 0.0, 1.0]])
         footprints = tuple(outline - (x0, y0) for outline in self.footprints)
-        return replace(self, size=(x1 - x0, y1 - y0), matrix=shift @ self.matrix, footprints=footprints)
+        wanted = None
+        if self.cropped_to is not None:
+            left, top, right, bottom = self.cropped_to
+            wanted = left - x0, top - y0, right - x0, bottom - y0
+        size = x1 - x0, y1 - y0
+        return replace(self, size=size, matrix=shift @ self.matrix, footprints=footprints, cropped_to=wanted)
 
     def widened(self, margin: int) -> "Canvas":
         """The same with ``margin`` pixels more on the left and on the right."""

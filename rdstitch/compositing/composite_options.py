@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_origin, get_type_hints
 
 from rdstitch.choices import ProjectionName
-from rdstitch.compositing.upright import UprightOptions
+from rdstitch.compositing.upright_options import UprightOptions
 from rdstitch.errors import ArgumentError
 
 ExposureMethod = Literal["none", "gain", "blocks", "balanced"]
@@ -32,8 +32,8 @@ class CompositeOptions(UprightOptions):
         "multiband" hides the seam over a width that suits each size of detail, "feather" averages over a
         strip along the seam (without seams: over the whole overlap), "none" cuts.
     crop : str
-        "none"; "auto" cuts to the largest upright rectangle without holes, where that keeps a fair part of the
-        image.
+        "none"; "auto" cuts to ``rectangle``, or without one to the largest upright rectangle without holes, where that
+        keeps a fair part of the output.
     projection : str
         How images taken by turning on the spot are laid out: "plane", "cylinder", "sphere" (equirectangular),
         "mercator", "panini", "stereographic", or "auto": the plane up to a view of 90 degrees, the cylinder for what
@@ -55,6 +55,11 @@ class CompositeOptions(UprightOptions):
         Metres on the map that a pixel takes, instead of ``scale``; the output must be georeferenced.
     epsg : int, optional
         Code of the map's coordinate system; None: UTM (UPS near the poles) on WGS 84. Others need the extra ``crs``.
+    like : path, optional
+        GeoTIFF file whose grid the output has: coordinate system, pixels and extent.
+    extent : tuple of 4 floats, optional
+        West, south, east and north of the output, metres on the map; on the pixels of ``like``, else from the
+        north-west corner on.
     georeference : str
         "auto" places the output where positions or control points agree with the images, "force" also where these
         contradict them, "off" never.
@@ -92,6 +97,8 @@ class CompositeOptions(UprightOptions):
     north_up: bool = True
     gsd: float | None = None
     epsg: int | None = None
+    like: str | None = None
+    extent: tuple[float, float, float, float] | None = None
     georeference: Literal["auto", "force", "off"] = "auto"
     max_memory: int | None = None
     interpolation: Interpolation = "cubic"
@@ -122,6 +129,12 @@ class CompositeOptions(UprightOptions):
             raise ArgumentError(f"gsd must be metres, more than 0, not {self.gsd}")
         if self.gsd is not None and self.scale != 1.0:
             raise ArgumentError("scale and gsd both say how large the output is; leave one of them out")
+        if self.like is not None and (self.gsd, self.epsg, self.scale, self.rotate) != (None, None, 1.0, 0.0):
+            raise ArgumentError("like says the size of pixels and the map; leave out gsd, crs, scale and rotate")
+        if (self.like or self.extent) and (self.crop != "none" or self.max_size is not None):
+            raise ArgumentError("like and extent say how large the output is; leave out crop and max_size")
+        if self.extent is not None and not (self.extent[0] < self.extent[2] and self.extent[1] < self.extent[3]):
+            raise ArgumentError(f"extent must be west, south, east and north, not {self.extent}")
         if self.max_memory is not None and self.max_memory <= 0:
             raise ArgumentError(f"max_memory must be positive, not {self.max_memory}")
         if not 0 <= self.background <= 255:

@@ -185,9 +185,9 @@ _VISIBLE = 0.004  # log units, a grey level of a light sample: differences below
 _ROUNDS = 6
 # A model with more freedom must explain the data better by this share to be taken.
 _MIN_RELATIVE_GAIN = 0.05
-# The brightest thousandth may be brightened to where compression leaves half of its contrast; beyond, images follow
-# their own brightness.
-_BRIGHTEST_SHARE, _MAX_WHITE = 0.999, KNEE + math.sqrt(2.0) * (1.0 - KNEE)
+# The brightest thousandth may be brightened to where compression leaves three quarters of its contrast; beyond, images
+# follow their own brightness.
+_BRIGHTEST_SHARE, _MAX_WHITE = 0.999, KNEE + (1.0 - KNEE) / math.sqrt(0.75)
 _MEDIAN_SAMPLES = 10_000  # of all images together
 # Residual, as a share of the right side, and decimals that are kept: both far below a grey level.
 _TOLERANCE, _MAX_STEPS, _DECIMALS = 1e-4, 3000, 5

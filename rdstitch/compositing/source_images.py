@@ -41,6 +41,7 @@ class PlacedImage:
     # what local alignment adds to its measured pixels; see :class:`rdstitch.compositing.warp.Warp`
     displacement: Displacement | None = None
     path: str = ""  # what messages call it; its number if empty
+    coloured: bool = False  # whether its file says that it has colours, so that grey ones beside it get them
 
 
 BoolImage = NDArray[np.bool_]
@@ -233,18 +234,25 @@ class ImageReader:
         # Channels, sample type and name of the image that was read first.
         self._samples: tuple[tuple[int, ...], np.dtype[Any], str] | None = None
         self._masked: dict[int, bool] = {}
+        self._coloured = any(image.coloured for image in images)
 
     def part(self, images: Sequence[int]) -> "ImageReader":
         """A reader of some of the images, which knows of them what this one does."""
         part = ImageReader([self._images[index] for index in images])
-        part._samples = self._samples
+        part._samples, part._coloured = self._samples, self._coloured
         part._masked = {new: self._masked[old] for new, old in enumerate(images) if old in self._masked}
         return part
 
     def prepared(self, index: int, shrink: float) -> LoadedImage:
         """Read image ``index``, no larger than needed, for an output that shrinks it so much."""
-        reduction = self._reduction(index, shrink)
-        return prepare_image(self(index, reduction), shrink, reduction)
+        return self.prepared_twice(index, shrink, shrink)[0]
+
+    def prepared_twice(self, index: int, shrink: float, finer: float) -> tuple[LoadedImage, LoadedImage]:
+        """Read image ``index`` once for two outputs, of which the second shrinks it less."""
+        reduction = self._reduction(index, finer)
+        image = self(index, reduction)
+        coarse = prepare_image(image, shrink, reduction)
+        return coarse, coarse if finer == shrink else prepare_image(image, finer, reduction)
 
     def nbytes(self, index: int, shrink: float) -> int:
         """Memory that image ``index`` takes at most when it is prepared for such an output, if it was read before."""
@@ -268,7 +276,8 @@ class ImageReader:
             raise InputError(f"image {index + 1} has {width} x {height} pixels, but its camera has {expected}")
         called = placed.path or f"image {index + 1}"
         if self._samples is None:
-            self._samples = image.pixels.shape[2:], image.pixels.dtype, Path(called).name
+            colours = (3,) if self._coloured and image.pixels.ndim == 2 else image.pixels.shape[2:]
+            self._samples = colours, image.pixels.dtype, Path(called).name
         channels, dtype, first = self._samples
         pixels = image.pixels
         if pixels.ndim == 2 and channels == (3,):

@@ -1,8 +1,9 @@
 """What belongs to the camera and not to the plane: a black border, a robot's own body, a pasted banner or caption.
 
-It is at the same place in every image. Black is seen at once. Texture that stays has the same corners in all
-images, whereas those of the plane are at other places in each. Edges do not count: a rail along the motion stays too.
-Nor do even areas, but those beside them along the border belong to them: the band and the scale bar of a caption.
+It is at the same place in every image. A border has the lowest level, whichever that is, in all of them, from the edge
+of the image to where they show something else. Texture that stays has the same corners in all images, whereas those of
+the plane are at other places in each. Edges do not count: a rail along the motion stays too. Nor do even areas, but
+those beside them along the border belong to them: the band and the scale bar of a caption.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,8 @@ from rdstitch.io.reduction import mean_of_channels
 MIN_IMAGES = 4
 """Fewer may show the same by chance."""
 
-_BLACK = 0.02  # of the brightest sample, up to which a pixel is black
+_SAME = 0.02  # of the images' contrast, up to which levels are the same
+_CONTRAST = (0.1, 99.9)  # percentiles
 _MIN_AREA = 0.005  # of the image, for a region to count
 _MAX_AREA = 0.6  # of the image: where more than this seems to stay, the images differ too little to say
 _STAYS = 0.5  # agreement of the corners of the images: 1 for what stays, about 0 for what moves
@@ -41,13 +43,13 @@ def static_pixels(images: Sequence[NDArray[np.generic]]) -> BoolArray | None:
     """
     grey = np.stack([mean_of_channels(image.astype(np.float32)) for image in images])
     window = max(3, round(_WINDOW * max(grey.shape[1:])))
-    dark = grey.max(axis=0) <= _BLACK * max(float(grey.max()), 1e-12)
-    black = _regions(dark, at_border=True)
+    low, high = np.percentile(grey, _CONTRAST)
+    same = _SAME * max(float(high - low), 1e-12)
     # What is between the corners of a body belongs to it.
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (window | 1, window | 1))
     closed = cv2.morphologyEx((_agreement(grey, window) > _STAYS).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
-    static = black | _regions(cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel) > 0, at_border=False)
-    static = _with_captions(static, np.ptp(grey, axis=0) <= _BLACK * float(grey.max()), window)
+    static = _border(grey <= low + same, window) | _regions(cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel) > 0)
+    static = _with_captions(static, np.ptp(grey, axis=0) <= same, window)
     share = float(static.mean())
     return static if _MIN_AREA < share < _MAX_AREA else None
 
@@ -96,14 +98,25 @@ def _with_captions(static: BoolArray, same: BoolArray, window: int) -> BoolArray
     return static | (cv2.dilate(captions.astype(np.uint8), np.ones((5, 5), dtype=np.uint8)) > 0)
 
 
-def _regions(candidates: NDArray[np.bool_], *, at_border: bool) -> NDArray[np.bool_]:
-    """The connected regions that are large enough, and reach the border if they must; grown by two pixels."""
+def _border(dark: NDArray[np.bool_], window: int) -> BoolArray:
+    """Regions at the edge that are dark in all images (N, h, w), and end where most of these are not.
+
+    What is dark in all by chance (the ground of a microscope, a shadow) ends where the first of them is not.
+    """
+    found = _regions(np.asarray(dark.all(axis=0)))
+    _, labels = cv2.connectedComponents(found.astype(np.uint8))
+    border = np.zeros_like(found)
+    for label in set(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]).tolist()) - {0}:
+        region = labels == label
+        beyond = cv2.dilate(region.astype(np.uint8), np.ones((window, window), np.uint8)).astype(np.bool_) & ~found
+        if beyond.any() and dark[:, beyond].mean() < 0.5:
+            border |= region
+    return border
+
+
+def _regions(candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The connected regions that are large enough; grown by two pixels."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(candidates.astype(np.uint8))
-    border = set(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]).tolist())
-    large = [
-        k
-        for k in range(1, count)
-        if stats[k, cv2.CC_STAT_AREA] >= _MIN_AREA * candidates.size and (not at_border or k in border)
-    ]
+    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= _MIN_AREA * candidates.size]
     kept = np.isin(labels, large).astype(np.uint8)
     return np.asarray(cv2.dilate(kept, np.ones((5, 5), dtype=np.uint8)), dtype=np.bool_)

@@ -129,6 +129,12 @@ class Georeference:
             scale = complex(abs(scale))
         return replace(self, scale=scale, origin=self.origin - scale * complex(change[0, 2], -change[1, 2]))
 
+    def in_pixels(self, other: "Georeference") -> FloatArray:
+        """Similarity (3, 3) from pixels of another output on the same map to pixels of this one."""
+        factor, shift = other.scale / self.scale, (other.origin - self.origin) / self.scale
+        a, b = factor.real, factor.imag
+        return np.array([[a, b, shift.real], [-b, a, -shift.imag], [0.0, 0.0, 1.0]])
+
     def in_system(self, crs: Crs, pixels: ArrayLike) -> "Georeference":
         """The same place in another coordinate system, nearest at some pixels (N, 2) of the output."""
         if crs == self.crs:
@@ -190,8 +196,9 @@ def world_file_paths(image: str | Path) -> tuple[Path, ...]:
 
 
 def has_place(positions: Sequence[GpsPosition | None]) -> bool:
-    """Check whether enough images have a position for a place to be expected."""
-    return sum(position is not None for position in positions) >= MIN_POSITIONS
+    """Check whether enough places are known; phones give several images the one that they found last."""
+    known = {(position.latitude, position.longitude) for position in positions if position is not None}
+    return len(known) >= MIN_POSITIONS
 
 
 @dataclass(frozen=True)
@@ -294,8 +301,8 @@ def _placed(
     if used.sum() < max(MIN_POSITIONS, len(names) / 2) or not rms < _MAX_ERROR * spread:
         median = float(np.median(np.abs(off)))
         reason = (
-            f"the {source} contradict the images: they are {_metres(median)} off in the median, and spread over "
-            f"{_metres(spread)}"
+            f"the {source} contradict the images: half of them are {_metres(median)} or more from where the images put "
+            f"them, which is much in an area of {_metres(2.0 * spread)}"
         )
         if not force:
             return None, f"{reason}; --georeference force places it nevertheless"

@@ -1,5 +1,6 @@
 """Frames as they arrive: in a folder that grows, by names on standard input, from a video, a camera or a stream."""
 
+import os
 import queue
 import threading
 import time
@@ -178,8 +179,9 @@ class Arrivals:
 def _read_lines(stream: IO[str], read: "queue.Queue[str | None]") -> None:
     """Hand on the lines of a stream, and None at its end."""
     try:
-        for line in stream:
-            read.put(line.rstrip("\r\n"))
+        # As bytes where there are any: names of files need not be UTF-8.
+        for line in getattr(stream, "buffer", stream):
+            read.put(os.fsdecode(line).rstrip("\r\n"))
     except (OSError, ValueError):  # closed while it was read
         pass
     read.put(None)

@@ -1,7 +1,7 @@
 """One image before anything is known of it: a file, a video frame or an array in memory."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -28,6 +28,10 @@ class Frame:
     number: int | None = None  # its number in the video, bag or list of arrays that it comes from, from 0
     timestamp: float | None = None  # when it was taken, s, where its video or bag knows that
     image: DecodedImage | None = None  # the image itself where it is no file
+    # reads it, and what is known of it before, where neither is its file's: a plane of several, an array that is not
+    # in memory
+    load: Callable[[], DecodedImage] | None = None
+    metadata: Metadata | None = None
     # its name among images of which another one has the same file name: with folders, as many as tell them apart
     label: str = ""
 
@@ -80,7 +84,7 @@ def in_order(samples: NDArray[Any], channel_order: ChannelOrder) -> NDArray[Any]
 
 def files_of(frames: Iterable[Frame]) -> list[Path]:
     """The files among the frames, which must not be overwritten."""
-    return [frame.path for frame in frames if frame.image is None]
+    return [frame.path for frame in frames if frame.image is None and frame.load is None]
 
 
 def _as_input(item: Any, index: int, channel_order: ChannelOrder) -> Named:
@@ -114,5 +118,5 @@ def array_as_image(name: str, array: NDArray[Any], channel_order: ChannelOrder) 
     if array.ndim == 3 and channels <= 2:
         samples = samples[..., 0]
     samples = in_order(np.array(samples, dtype=np.float32 if array.dtype.kind == "f" else array.dtype), channel_order)
-    metadata = Metadata((array.shape[1], array.shape[0]), bit_depth=8 * array.dtype.itemsize)
+    metadata = Metadata((array.shape[1], array.shape[0]), bit_depth=8 * array.dtype.itemsize, channels=channels)
     return as_image(Path(name), samples, None if alpha is None else alpha.copy(), metadata)

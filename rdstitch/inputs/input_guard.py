@@ -25,6 +25,7 @@ class InputGuard:
         self._strict = strict
         self._stamps: dict[Path, _Stamp | None] = {}
         self._damaged: dict[Path, str] = {}
+        self.unreadable: dict[Path, str] = {}  # files that were left out, and why
 
     @contextmanager
     def reading(self, path: Path) -> Iterator[None]:
@@ -52,6 +53,13 @@ class InputGuard:
     def messages(self) -> list[Message]:
         """What the user should know of the files."""
         return [Message(self._damaged[path], (str(path),), code="damaged") for path in sorted(self._damaged)]
+
+    @property
+    def complaints(self) -> list[Message]:
+        """The same, and what was left out as unreadable: what may be why a run failed."""
+        reasons = {path: reason.removeprefix(f"{path}: ") for path, reason in self.unreadable.items()}
+        left_out = [Message(reasons[path], (str(path),), "left out") for path in sorted(reasons)]
+        return [*left_out, *self.messages]
 
     def notes_on(self, paths: Iterable[Path]) -> GuardNotes:
         """What was noticed of some files, for the guard of another process."""

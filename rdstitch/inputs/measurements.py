@@ -15,6 +15,7 @@ from rdstitch.geometry.planar_motion import tilt_from_normal, turned_tilt
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import Row, by_image, csv_rows, image_name
+from rdstitch.io.metadata import GpsPosition
 from rdstitch.results.messages import shortened
 from rdstitch.system.file_access import canonical_name, file_state, read_text
 
@@ -140,7 +141,11 @@ def _tilt_of(row: Row) -> tuple[float, float]:
 
 def positions_of(sources: Sequence[Source]) -> FloatArray:
     """Metres east and north (N, 2) of the median of the images' GPS positions; NaN where unknown."""
-    known = [source.metadata.gps for source in sources]
+    return metres_around_median([source.metadata.gps for source in sources])
+
+
+def metres_around_median(known: Sequence[GpsPosition | None]) -> FloatArray:
+    """Metres east and north (N, 2) of the median of positions; NaN where unknown."""
     degrees = [(np.nan, np.nan) if gps is None else (gps.latitude, gps.longitude) for gps in known]
     latitude, longitude = np.radians(np.array(degrees, dtype=np.float64).reshape(-1, 2)).T
     if np.isnan(latitude).all():

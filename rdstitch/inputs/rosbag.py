@@ -5,22 +5,25 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.camera_files import CameraFile, camera_of_content, load_camera
 from rdstitch.errors import InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.keyframes import Wanted, wanted_frames
 from rdstitch.io.video import write_frame
+from rdstitch.system.file_access import read_beginning
+
+if TYPE_CHECKING:
+    from rdstitch.camera_files import CameraFile
 
 _SUFFIXES = (".bag", ".db3", ".mcap")
-_DESCRIPTION = "metadata.yaml"
+_DESCRIPTION, _KEY, _HEADER = "metadata.yaml", b"rosbag2_bagfile_information", 4096
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TYPES = {
@@ -45,8 +48,13 @@ _TO_BGR = {
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag: a file by its suffix, or a folder that ROS 2 wrote."""
-    return path.suffix.lower() in _SUFFIXES or (path.is_dir() and (path / _DESCRIPTION).is_file())
+    """Whether a path is a bag: a file by its suffix, or a folder that ROS 2 wrote, by what it says of itself."""
+    if path.suffix.lower() in _SUFFIXES or not path.is_dir():
+        return path.suffix.lower() in _SUFFIXES
+    try:
+        return _KEY in read_beginning(path / _DESCRIPTION, _HEADER)
+    except OSError:
+        return False
 
 
 @contextmanager
@@ -56,7 +64,7 @@ def opened_bag(path: Path) -> "Iterator[Any]":
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise InputError(f'{path}: reading ROS bags needs the extra ros: pip install "rdstitch[ros]"') from None
+        raise InputError(f"{path}: reading ROS bags needs rosbags: pip install rosbags") from None
     # A bag of ROS 2 is a folder; its files may be named as well.
     bag = path.parent if path.suffix.lower() in (".db3", ".mcap") and (path.parent / _DESCRIPTION).is_file() else path
     try:
@@ -85,12 +93,14 @@ def images_in_bag(path: Path, folder: Path, every: int, topic: str | None = None
         yield from _Messages.of(reader, path, topic).frames(folder, Wanted(every))
 
 
-def camera_in_bag(path: Path, topic: str | None = None) -> tuple[CameraFile, str] | None:
+def camera_in_bag(path: Path, topic: str | None = None) -> "tuple[CameraFile, str] | None":
     """The calibration that the bag has for a topic of images, and its own topic; None where it has none.
 
     That is the one beside the images, ``/camera/camera_info`` for ``/camera/image_raw``, or else the only one. Of
     images that are rectified already (``image_rect``) it is that of the rectified camera.
     """
+    from rdstitch.camera_files import camera_of_content
+
     with opened_bag(path) as reader:
         connections = [c for c in reader.connections if c.msgtype == _CAMERA_INFO]
         images = _chosen_topic(path, _image_topics(reader), topic)
@@ -114,6 +124,8 @@ def camera_in_bag(path: Path, topic: str | None = None) -> tuple[CameraFile, str
 
 def camera_in(path: str | Path) -> Camera:
     """The camera of a camera file, or of a bag that has its calibration."""
+    from rdstitch.camera_files import load_camera
+
     if not is_bag(Path(path)):
         return load_camera(path)
     if (found := camera_in_bag(Path(path))) is None:
@@ -156,10 +168,8 @@ class _Messages:
         bits = 8
         for connection, _, data in self.reader.messages(connections=self.connections):
             message = self.reader.deserialize(data, connection.msgtype)
-            if connection.msgtype == _COMPRESSED:
-                yield _grey_of_compressed(message.data)
-                continue
-            pixels = _pixels(self.path, message)
+            compressed = connection.msgtype == _COMPRESSED
+            pixels = _grey_of_compressed(message.data) if compressed else _pixels(self.path, message)
             if pixels.dtype != np.uint8:
                 # Sensors of 10 or 12 bits leave the highest ones empty.
                 bits = max(bits, int(pixels.max()).bit_length())
@@ -185,12 +195,13 @@ class _Messages:
             yield Frame(file, number, stamp or time_ns * 1e-9)
 
 
-def _grey_of_compressed(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A JPEG or PNG image, (H, W); black where it cannot be decoded. OpenCV's decoders write on standard error."""
+def _grey_of_compressed(data: NDArray[np.uint8]) -> NDArray[Any]:
+    """A JPEG or PNG image, (H, W), of 8 or 16 bits; black where it cannot be decoded."""
     try:
+        # Not by OpenCV, whose decoders write on standard error.
         with Image.open(BytesIO(data.tobytes()), formats=("JPEG", "PNG")) as image:
             deep = image.mode.startswith("I")
-            return (np.asarray(image) >> 8).astype(np.uint8) if deep else np.asarray(image.convert("L"))
+            return np.asarray(image).astype(np.uint16) if deep else np.asarray(image.convert("L"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return np.zeros((1, 1), np.uint8)
 

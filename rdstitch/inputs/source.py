@@ -109,12 +109,17 @@ class Source:
         """What detection at so many 10⁶ pixels needs of it; it is kept for the stages that read it again."""
         reduction = self.reduction(megapixels)
         image = self.read(reduction, keep=True)
-        return View(image.pixels, image.alpha, reduction, self.camera.image_size)
+        # A last band of two or four would be taken for alpha there; here that is apart.
+        bands = image.pixels.shape[2:]
+        pixels = image.pixels[..., :-1] if bands in ((2,), (4,)) else image.pixels
+        return View(pixels, image.alpha, reduction, self.camera.image_size)
 
     def _load(self, reduction: int) -> DecodedImage:
         """The pixels from the file, masked."""
         array = None if self.frame is None else self.frame.image
-        if array is None:
+        if self.frame is not None and self.frame.load is not None:
+            image = reduced(self.frame.load(), reduction)
+        elif array is None:
             with held_in_memory(self.path), self.guard.reading(self.path):
                 image = read_image(self.path, reduction, self.metadata)
         else:
@@ -168,7 +173,7 @@ def read_sources(
         path = frame.path
         try:
             key = path.resolve()
-            metadata = read_metadata(path) if frame.image is None else frame.image.metadata
+            metadata = frame.metadata or (read_metadata(path) if frame.image is None else frame.image.metadata)
             _check_memory(path, metadata, max_memory)
         except (InputError, LimitError, OSError, RuntimeError) as error:
             reason = error if isinstance(error, RdstitchError) else InputError(f"{path}: cannot be read: {error}")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 from xml.etree import ElementTree
 
+import numpy as np
 from PIL import ExifTags, Image
 
 from rdstitch.geometry.camera import is_focal_length
@@ -50,9 +51,12 @@ _OF_WHOM = {
     for name in ("Make", "Model", "Artist", "Copyright", "DateTime", "Software", "ImageDescription", "Orientation")
 }
 # What units of length count.
-_MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
+MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _XMP, _PROFILE, _RESOLUTION, _RESOLUTION_UNIT = 700, 34675, (282, 283), 296
 _INCHES = {2: 1.0, 3: 2.54}  # what pixels per unit are multiplied by
+# How far, as a logarithm, twice the distance of a calibrated middle from the border may be from the width; and how many
+# times as long one tag's focal length may be as another's: crops for video, and what "35 mm equivalent" is taken for.
+_BESIDE, _CONTRADICTION = 0.05, 1.25
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
 
 
@@ -111,6 +115,7 @@ class Metadata:
     profile_lost: str = ""  # why the file's colour profile is not kept; empty where it is, or where there is none
     channels: int = 3  # samples per pixel, with alpha
     pixel_size: float | None = None  # micrometres, where OME-XML says it
+    channel_names: tuple[str, ...] = ()  # where OME-XML or Micro-Manager say them
     planes: bool = False  # whether the channels are those of a microscope, on pages of their own, and no colours
 
     @property
@@ -261,8 +266,15 @@ def _colour_profile(profile: object) -> tuple[bytes, str]:
 
 def _channels(image: Image.Image) -> int:
     """Samples per pixel of what it is decoded to."""
-    palette = image.mode in ("P", "PA")
-    return len(image.getbands()) if not palette else 4 if "transparency" in image.info or image.mode == "PA" else 3
+    if image.mode not in ("P", "PA"):
+        return len(image.getbands())
+    return (1 if is_grey_palette(image) else 3) + ("transparency" in image.info or image.mode == "PA")
+
+
+def is_grey_palette(image: Image.Image) -> bool:
+    """Check whether a palette holds shades of grey only."""
+    palette = np.array(image.getpalette("RGB") or [], dtype=np.uint8).reshape(-1, 3)
+    return bool((palette == palette[:, :1]).all())
 
 
 def _text(value: Any) -> str:
@@ -271,24 +283,23 @@ def _text(value: Any) -> str:
     return text.split("\0")[0].strip()
 
 
-def _focal_px(photo: dict[int, Any], xmp: str, size: tuple[int, int]) -> float | None:
-    """Focal length in pixels, by the most direct tag that has one."""
-    calibrated = xmp_number(xmp, "CalibratedFocalLength")
-    if calibrated and is_focal_length(calibrated, size):
-        return calibrated
+def _focal_px(photo: Mapping[int, Any], xmp: str, size: tuple[int, int]) -> float | None:
+    """Focal length in pixels, by the most direct tag that has one; None where tags contradict one another."""
+    calibrated, middle = (xmp_number(xmp, name) for name in ("CalibratedFocalLength", "CalibratedOpticalCenterX"))
     focal = finite(photo.get(ExifTags.Base.FocalLength))
     resolution = finite(photo.get(ExifTags.Base.FocalPlaneXResolution))
     unit = _MM_PER_RESOLUTION_UNIT.get(photo.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
-    if focal and resolution and unit and focal > 0 and resolution > 0:
-        # The resolution counts pixels of the original; a resized image keeps the tag.
-        original = finite(photo.get(_PIXEL_WIDTH)) or size[0]
-        focal_px = focal * resolution / unit * size[0] / original
-        if is_focal_length(focal_px, size):
-            return focal_px
     equivalent = finite(photo.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    if equivalent and is_focal_length(equivalent, (36, 24)):
-        return equivalent / _DIAGONAL_35MM * math.hypot(*size)
-    return None
+    # Pixels of the original, which a resized image keeps the tags of; it is not read of a middle that is beside it.
+    width = finite(photo.get(_PIXEL_WIDTH)) or size[0]
+    calibrated_width = width if not middle or abs(math.log(2.0 * middle / width)) < _BESIDE else 2.0 * middle
+    found = [
+        calibrated * size[0] / calibrated_width if calibrated else None,
+        focal * resolution / unit * size[0] / width if focal and resolution and unit else None,
+        equivalent / _DIAGONAL_35MM * math.hypot(*size) if equivalent else None,
+    ]
+    known = [value for value in found if value and value > 0.0 and is_focal_length(value, size)]
+    return known[0] if known and max(known) <= _CONTRADICTION * min(known) else None
 
 
 def _timestamp(photo: Mapping[int, Any]) -> float | None:
@@ -401,11 +412,11 @@ def read_ome(text: str | None) -> OmeImage | None:
     counts = [int(pixels.get(f"Size{axis}", 1)) for axis in "CZT"]
     samples = [int(e.get("SamplesPerPixel", 1)) for e in pixels.iter() if e.tag.rpartition("}")[2] == "Channel"]
     apart = len(images) == 1 and counts[1:] == [1, 1] and all(count == 1 for count in samples)
-    size, scale = pixels.get("PhysicalSizeX"), _MICROMETRES.get(pixels.get("PhysicalSizeXUnit", "µm"))
+    size, scale = pixels.get("PhysicalSizeX"), MICROMETRES.get(pixels.get("PhysicalSizeXUnit", "µm"))
     return OmeImage(
         counts[0] if apart else 1,
         float(size) * scale if size and scale else None,
         None if plane is None else (float(plane.attrib["PositionX"]), float(plane.attrib["PositionY"])),
         # What programs write that do not know the unit counts pixels.
-        None if plane is None else _MICROMETRES.get(plane.get("PositionXUnit", "µm")),
+        None if plane is None else MICROMETRES.get(plane.get("PositionXUnit", "µm")),
     )

@@ -34,8 +34,11 @@ _ROWS_AT_A_TIME = 128
 
 
 def channel_count(page: "tifffile.TiffPage") -> int:
-    """Bands of what a page is decoded to, with alpha; three of a palette, which may turn out to be grey."""
-    return 3 if page.photometric in _INDIRECT else int(page.samplesperpixel)
+    """Bands of what a page is decoded to, with alpha."""
+    if page.photometric == _PALETTE:
+        table = np.asarray(page.colormap)
+        return 1 if (table == table[:1]).all() else 3
+    return 3 if page.photometric == _INKS else int(page.samplesperpixel)
 
 
 def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[Pixels, NDArray[np.uint8] | None]:
@@ -79,10 +82,9 @@ def _grey_or_rgb(page: "tifffile.TiffPage", kind: int, colours: Pixels, full: fl
     if kind == _WHITE_IS_ZERO:
         return ~colours if colours.dtype == np.bool_ else full - colours if colours.dtype.kind == "u" else -colours
     if kind == _PALETTE:
-        table = np.asarray(page.colormap).T
+        table = np.asarray(page.colormap).T[:, : channel_count(page)]
         # Some programs write 8 bits where there should be 16.
         table = (table if table.max() <= _OPAQUE else table >> 8).astype(np.uint8)
-        table = table[:, :1] if (table == table[:, :1]).all() else table
         return table[colours[..., 0].astype(np.intp)]
     if kind in (_LAB, _ICC_LAB, _INKS) and not integers:
         raise ValueError(f"photometric interpretation {kind} with samples of type {colours.dtype} is not read")

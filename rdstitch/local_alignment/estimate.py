@@ -1,7 +1,7 @@
 """Whether images are aligned locally, and how: decided by matches that are held out of the fit."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,11 +19,15 @@ MAX_CELLS = 100
 _CELLS = 12
 # Of the grids of all images together: of more than some 800 images the cells are larger, to bound memory.
 _MAX_NODES = 120_000
-# The stiffest fields first: they are taken unless freer ones are better by a share that matters.
-_SLOPES = (0.02, 0.06, 0.2)
+_SLOPES = (0.2, 0.06, 0.02)
 _HELD_OUT = 5  # every fifth match
-# Share by which held-out residuals must get smaller for local alignment to be worth while, and for freer fields.
-_WORTHWHILE, _BETTER = 0.15, 0.03
+# Share by which what a person sees must get less for local alignment to be worth while.
+_WORTHWHILE = 0.15
+# What a person sees of seams: edges that do not go on, as far as this percentile of the held-out residuals. What a
+# person sees of fields: straight edges, of a tenth of the diagonal or more, that are bent up to this percentile: a
+# single one is seen.
+_SEAMS, _BENDS, _EDGE = 75.0, 98.0, 0.1
+_MAX_IMAGES = 24  # whose edges are looked at
 _MIN_MATCHES = 60  # of 60 planes with so many matches and noise, none was bent; with 40, five were
 # Of thousands of images, fields are fitted to a part: each match takes about 600 bytes meanwhile.
 _MAX_MATCHES = 250_000
@@ -65,78 +69,93 @@ def no_local_alignment(reason: str) -> LocalAlignment:
 
 
 def align_locally(
-    matches: Sequence[Match],
+    matches: Iterable[Match],
     cameras: Sequence[Camera],
     homographies: FloatArray,
-    choice: LocalAlignmentMode = "auto",
+    choice: Literal["auto"] | int = "auto",
     *,
+    pairs: int | None = None,
     on_sphere: bool = False,
+    edges: Callable[[int], FloatArray] = lambda image: np.empty((0, 2, 2)),
 ) -> LocalAlignment:
     """Smooth displacement fields that bring matches of overlapping images together.
 
     Parameters
     ----------
-    matches : sequence of Match
+    matches : iterable of Match
         Putative matches of all pairs, right and wrong; ``image1`` and ``image2`` count the cameras.
     homographies : ndarray of shape (N, 3, 3)
         Undistorted coordinates, in half diagonals, to the plane, or to directions.
-    choice : "auto", "off" or int
-        "auto": only where matches that are held out of the fit come nearer by 15 % or more. A number: always, with so
-        many cells along the longer side of an image.
+    choice : "auto" or int
+        "auto": only where matches that are held out of the fit come nearer by more than fields bend what is straight,
+        and by 15 % of their distance or more. A number: always, with so many cells along the longer side of an image.
+    pairs : int, optional
+        How many ``matches`` there are, where these come one by one.
     on_sphere : bool
         Whether the camera turned on the spot, so that ``homographies`` lead to directions.
+    edges : callable
+        Gives the ends of straight edges in an image, (K, 2, 2) measured pixels. It is called where fields may be used.
     """
-    if choice == "off":
-        return no_local_alignment("switched off")
     images = ImagesOnSurface.of(cameras, homographies, on_sphere=on_sphere)
-    # Pair by pair, again and again: together, the matches of thousands of images are what takes memory.
-    lengths = [np.linalg.norm(pair.residual, axis=1) for pair in place_matches(matches, images)]
-    count = sum(map(len, lengths))
-    if count < _MIN_MATCHES:
+    if pairs is None:
+        matches = list(matches)
+        pairs = len(matches)
+    # As many of each pair as all together may have: the matches of thousands of images are what takes memory.
+    placed = PlacedMatches.join(pair.thinned(_MAX_MATCHES // max(pairs, 1)) for pair in place_matches(matches, images))
+    if len(placed) < _MIN_MATCHES:
         return no_local_alignment("there are too few matches")
-    if choice == "auto":
-        most = _OUTLYING * float(np.median(np.concatenate(lengths)))
-        if (agreement := _agreement_of_neighbours(place_matches(matches, images), most)) < _MIN_AGREEMENT:
-            return no_local_alignment(
-                f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only"
-            )
-    share = min(1.0, _MAX_MATCHES / count)
-    placed = PlacedMatches.join(pair.thinned(share) for pair in place_matches(matches, images))
+    if choice == "auto" and (agreement := _agreement_of_neighbours(placed)) < _MIN_AGREEMENT:
+        return no_local_alignment(f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only")
     cells = max(2, min(_CELLS, math.isqrt(_MAX_NODES // len(cameras)))) if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
-    start, before, after = _choose(placed.take(~held_out), placed.take(held_out), images, cells)
+    fitted, tested = placed.take(~held_out), placed.take(held_out)
+    before, off = HeldOut.of(tested.residual), _seen(tested.residual)
+    # The freest finds what is far from the plane; the stiffer ones start from there.
+    tried: list[tuple[float, PlacedFields, FloatArray]] = []
+    for slope in _SLOPES:
+        fields = fit_fields(fitted, images, Stiffness(cells, slope), tried[-1][1] if tried else None)
+        left = fields.explain(tested)[0]
+        tried.append((_seen(left), fields, left))
+    enough = (1.0 - _WORTHWHILE) * off if choice == "auto" else math.inf
+    if min(seen for seen, *_ in tried) <= enough:
+        straight = _long_edges(edges, cameras)
+        tried = [(seen + _bend(fields, straight), fields, left) for seen, fields, left in tried]
+    seen, start, left = min(tried, key=lambda one: one[0])
+    after = HeldOut.of(left)
     text = f"matches held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} pixels with it"
-    if choice == "auto" and after.median > (1.0 - _WORTHWHILE) * before.median:
+    if seen > enough:
         return LocalAlignment((), f"not worth while; {text}", 0, before, after)
-    fields = fit_fields(placed, images, start.stiffness, start).of_images()
-    return LocalAlignment(fields, text, cells, before, after)
+    final = fit_fields(placed, images, start.stiffness, start).of_images()
+    return LocalAlignment(final, text, cells, before, after)
 
 
-def _agreement_of_neighbours(pairs: Iterable[PlacedMatches], most: float) -> float:
+def _agreement_of_neighbours(matches: PlacedMatches) -> float:
     """Correlation of the residuals of each match and the nearest one of the same pair of images, in [-1, 1].
 
-    Residuals that are longer than ``most`` count as if they were so long.
+    Outlying residuals count as if they were shorter.
     """
-    common = total = 0.0
-    for pair in pairs:
-        length = np.linalg.norm(pair.residual, axis=1)
-        residual = pair.residual * np.minimum(1.0, most / np.maximum(length, 1e-12))[:, None]
-        common += float((residual * residual[pair.neighbours]).sum())
-        total += float((residual**2).sum())
-    return common / max(total, 1e-300)
+    length = np.linalg.norm(matches.residual, axis=1)
+    most = _OUTLYING * float(np.median(length))
+    residual = matches.residual * np.minimum(1.0, most / np.maximum(length, 1e-12))[:, None]
+    return float((residual * residual[matches.neighbours]).sum()) / max(float((residual**2).sum()), 1e-300)
 
 
-def _choose(
-    fitted: PlacedMatches, held_out: PlacedMatches, images: ImagesOnSurface, cells: int
-) -> tuple[PlacedFields, HeldOut, HeldOut]:
-    """The fields that held-out matches like best, and the residuals of these without and with them."""
-    tried: list[PlacedFields] = []
-    for slope in reversed(_SLOPES):
-        # What is far from the plane is found by the freest; the stiffer ones start from there.
-        tried.append(fit_fields(fitted, images, Stiffness(cells, slope), tried[-1] if tried else None))
-    stiffest, *freer = [(fields, HeldOut.of(fields.explain(held_out)[0])) for fields in reversed(tried)]
-    best, after = stiffest
-    for fields, residuals in freer:
-        if residuals.median < (1.0 - _BETTER) * after.median:
-            best, after = fields, residuals
-    return best, HeldOut.of(held_out.residual), after
+def _seen(residual: FloatArray) -> float:
+    """Length of residuals (M, D) as a person sees them along a seam."""
+    return float(np.percentile(np.linalg.norm(residual, axis=1), _SEAMS))
+
+
+def _long_edges(edges: Callable[[int], FloatArray], cameras: Sequence[Camera]) -> dict[int, FloatArray]:
+    """Those that a person sees to be straight, of some images."""
+    count, found = len(cameras), {}
+    for k in np.unique(np.linspace(0, count - 1, min(count, _MAX_IMAGES)).astype(np.intp)).tolist():
+        ends = edges(k)
+        found[k] = ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > _EDGE * 2.0 * cameras[k].scale]
+    return found
+
+
+def _bend(fields: PlacedFields, edges: dict[int, FloatArray]) -> float:
+    """How far fields bend edges, as a person sees it; 0 where there are none."""
+    displacement = fields.of_images()
+    bent = np.concatenate([displacement[k].bends(ends) for k, ends in edges.items()])
+    return float(np.percentile(bent, _BENDS)) if len(bent) else 0.0

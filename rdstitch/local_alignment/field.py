@@ -18,6 +18,7 @@ _APRON = 8
 # Nodes beyond the border up to which it is evaluated: who interpolates across the border would find a kink there, and
 # take many times as many places for it.
 _BEYOND = 4
+_EDGE_POINTS = 9  # at which a bent edge is measured
 _PROBES = 4  # of the steepness, along a side of a cell
 
 
@@ -70,6 +71,15 @@ class DisplacementField:
         spacing = (np.array(self.image_size) - 1.0) / (columns - 1, rows - 1)
         across, down = np.diff(moved, axis=1)[:-1] / spacing[0], np.diff(moved, axis=0)[:, :-1] / spacing[1]
         return float(np.linalg.norm(np.stack([across, down], axis=-1), ord=2, axis=(-2, -1)).max())
+
+    def bends(self, edges: FloatArray) -> FloatArray:
+        """How far straight edges with such ends (K, 2, 2) are bent, measured pixels (K,)."""
+        share = np.linspace(0.0, 1.0, _EDGE_POINTS)[:, None, None]
+        moved = self(edges[:, 0] + share * (edges[:, 1] - edges[:, 0]))
+        along = edges[:, 1] - edges[:, 0]
+        normal = np.stack([-along[:, 1], along[:, 0]], axis=-1) / np.linalg.norm(along, axis=1, keepdims=True)
+        off = moved - (moved[0] + share * (moved[-1] - moved[0]))
+        return np.asarray(np.abs((off * normal).sum(axis=-1)).max(axis=0))
 
     @cached_property
     def _coefficients(self) -> list[FloatArray]:

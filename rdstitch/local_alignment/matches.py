@@ -86,7 +86,7 @@ class PlacedMatches:
     @classmethod
     def join(cls, parts: Iterable["PlacedMatches"]) -> Self:
         """All of them, one after the other."""
-        every = list(parts)
+        every = list(parts) or [cls(np.empty((0, 2), np.intp), np.empty((0, 2, 2)), np.empty((0, 2, 2)))]
         return cls(*(np.concatenate([getattr(p, name) for p in every]) for name in ("images", "points", "places")))
 
     @cached_property
@@ -118,9 +118,10 @@ class PlacedMatches:
         apart = self.residual - self.residual[self.neighbours]
         return float(np.median(np.linalg.norm(apart, axis=1)) / np.sqrt(2.0))
 
-    def thinned(self, share: float) -> "PlacedMatches":
-        """About such a share of them, evenly."""
-        return self.take(np.linspace(0, len(self) - 1, round(share * len(self))).astype(np.intp))
+    def thinned(self, most: int) -> "PlacedMatches":
+        """At most about so many of them, evenly, and no fewer than a few."""
+        count = min(len(self), max(most, _MIN_MATCHES))
+        return self if count == len(self) else self.take(np.linspace(0, len(self) - 1, count).astype(np.intp))
 
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "PlacedMatches":
         """A part of them."""

@@ -1,25 +1,27 @@
 """Recomposing from a saved registration: other bands of the same flight, other sizes, other compositing options."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
-from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
+from rdstitch.errors import ArgumentError, InputError, PartialResultError
+from rdstitch.export.georeference import Georeference
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.inputs.find import found_images
-from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs, files_of
+from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.opening import check_readable
-from rdstitch.pipeline.compose import compose_images, plainly_viewed, write_page
+from rdstitch.pipeline.band_lens import BandLens, band_lens
+from rdstitch.pipeline.compose import check_world_files, compose_images, image_files, plainly_viewed, write_page
+from rdstitch.pipeline.counterparts import MatchBy, MatchedBy, counterparts, registered_files
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.straighten import turned_anew
@@ -38,9 +40,9 @@ from rdstitch.sidecar.write import (
     to_output,
     versions,
 )
-from rdstitch.system.file_access import canonical_name, canonical_text
+from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import Outputs, check_output, json_bytes
+from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
 from rdstitch.system.progress import Progress, silent
 
 
@@ -54,7 +56,7 @@ class Recomposition(OutputImage):
     sources : tuple of Source or None
         For each image of the registration the one that took its place, with its camera; None where there is none.
     matched : str
-        "name" or "order".
+        "name", "time", "position" or "order".
     left_out : dict of int to Message
         Images that the registration used and that are not in the output, by their number, with the reason.
     placed : PlacedImages
@@ -68,7 +70,7 @@ class Recomposition(OutputImage):
 
     saved: SavedRegistration
     sources: tuple[Source | None, ...]
-    matched: str
+    matched: MatchedBy
     left_out: Mapping[int, Message]
     placed: PlacedImages
     composite_options: CompositeOptions
@@ -155,7 +157,6 @@ def _resized_std(then: Mapping[str, Any], focal: float | None) -> float | None:
     return std * (focal / former) if std and former and focal else None
 
 
-MatchBy = Literal["auto", "name", "order"]
 _MATCHES = ("auto", "name", "order")
 
 
@@ -192,8 +193,9 @@ def apply(
     composite : CompositeOptions, optional
         Those of the sidecar if not given.
     match : str
-        Which image takes whose place. "name": the one of the same file name, or of the same name before the suffix.
-        "order": the one at the same position of equally many. "auto": by name, or by order where no name is the same.
+        Which image takes whose place. "name": the one of the same file name, of the same name before the suffix, or of
+        the same part that varies (V07_RED.jpg, V07_NIR.jpg). "order": the one at the same position of equally many.
+        "auto": by name, else the one that was taken at the same time, else at the same position.
     mask : path, optional
         Image, or folder of them, that is dark where the images do not count.
     flat_field : str or path
@@ -234,27 +236,45 @@ def apply(
     if strict and doubts:
         raise InputError(doubts[0].text)
     given = as_inputs(images, channel_order)
+    if saved.content.get("stage") is not None:
+        given = with_position_folders(given)
     with found_images(given, output=output, every=every, topic=topic) as listed, Outputs(overwrite) as outputs:
         if output is not None:
-            _check_outputs(Path(output), overwrite, listed.files, saved.path)
-        chosen, matched = _match(saved, listed.frames, match)
+            check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
+        given_frames: Sequence[Frame] = listed.frames
+        if (stage := saved.content.get("stage")) is not None:
+            given_frames, _, said = tile_frames(given_frames, stage["z"], stage["time"])
+            doubts += said
+        chosen, matched, said = counterparts(saved, given_frames, match)
+        doubts += said
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
         used = _used(saved, sources, left_out, mask, strict=strict)
+        if stage is not None and stage["pixel_um"] is not None:
+            used = {k: replace(s, metadata=replace(s.metadata, pixel_size=stage["pixel_um"])) for k, s in used.items()}
         if flat_field != "off":
             check_size(list(used.values()))
             corrected, said = with_flat_field(list(used.values()), flat_field)
             used = dict(zip(used, corrected, strict=True))
             doubts += said
-        placed, said = turned_anew(_placed(saved, used), options, saved.composite)
+        if output is not None:
+            check_world_files([output], list(used.values()), overwrite)
+        frames = {index: frame for index, frame in enumerate(chosen) if index in used and frame is not None}
+        # Channels of a microscope have their places in common, not their content.
+        lens, said = (None, []) if stage is not None else _lens_of_band(saved, frames, used, progress)
         doubts += said
+        if lens is not None:
+            used = {index: replace(source, camera=lens.camera(source.camera)) for index, source in used.items()}
+        placed, said = turned_anew(_placed(saved, used, lens), options, saved.composite)
+        doubts += said
+        if (grid := _same_grid(saved, used, options)) is not None:
+            placed, options = replace(placed, grid=grid), replace(options, crop="none")
         composed = compose_images(
             placed,
             output,
             options,
             StitchOptions(workers=workers).threads,
             progress,
-            overwrite=overwrite,
             outputs=outputs,
             dry_run=dry_run,
         )
@@ -277,12 +297,58 @@ def apply(
         return result
 
 
-def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImages:
-    """The images at the places that the sidecar has for them."""
+_GEOMETRY = (
+    "scale",
+    "max_size",
+    "crop",
+    "projection",
+    "max_stretch",
+    "rotate",
+    "north_up",
+    "gsd",
+    "epsg",
+    "like",
+    "extent",
+    "georeference",
+)
+"""Options of compositing that say which pixels the output has."""
+
+
+def _same_grid(
+    saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions
+) -> tuple[FloatArray, tuple[int, int], Georeference | None] | None:
+    """The pixels of the saved output, where images of the same sizes are to have the same: bands, and dates."""
+    output = saved.content["output"]
+    asked = any(getattr(options, name) != getattr(saved.composite, name) for name in _GEOMETRY)
+    same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
+    if asked or not same_sizes or saved.turned or not options.same_turn(saved.composite) or not output.get("size"):
+        return None
+    width, height = output["size"]
+    return np.array(output["plane_to_output"], dtype=np.float64), (width, height), saved.output_place
+
+
+def _lens_of_band(
+    saved: SavedRegistration, frames: Mapping[int, Frame], used: Mapping[int, Source], progress: Progress
+) -> tuple[BandLens | None, list[Message]]:
+    """The lens that took the given images, where that is another one than took those that were registered."""
+    there = registered_files(saved, frames)
+    pairs: dict[int, tuple[Source, Source]] = {}
+    for index, file in there.items():
+        camera, size = saved.images[index].camera, used[index].camera.image_size
+        if camera is not None and frames[index].number is None and camera.image_size == size:
+            read, _ = read_sources([Frame(file)], skip_bad=True)
+            if read and read[0].metadata.size == size:
+                pairs[index] = replace(read[0], camera=camera), used[index]
+    return band_lens(pairs, lambda done, total: progress("comparing bands", done, total))
+
+
+def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens | None) -> PlacedImages:
+    """The images at the places that the sidecar has for them, or that the lens of a band gives them."""
+    to_registered = np.eye(3) if lens is None else np.linalg.inv(lens.homography)
     return PlacedImages(
         list(used.values()),
         [source.camera for source in used.values()],
-        np.array([saved.images[index].to_plane for index in used], dtype=np.float64),
+        np.array([saved.images[index].to_plane for index in used], dtype=np.float64) @ to_registered,
         list(used).index(saved.reference) if saved.reference in used else None,
         [
             None if field is None else field.resized(source.camera.image_size)
@@ -290,7 +356,8 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImage
         ],
         saved.turned,
         saved.place,
-        saved.orientation,
+        whole=saved.content.get("stage") is not None,
+        orientation=saved.orientation,
     )
 
 
@@ -310,67 +377,6 @@ def _used(
         first = next(iter(left_out.values()))
         raise InputError(f"{saved.path}: none of its images can be used; {first.images[0]}: {first.text}")
     return dict(zip(used, with_masks(list(used.values()), mask), strict=True))
-
-
-def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sidecar: Path) -> None:
-    """Find out before long work whether the image and its sidecar can be written."""
-    beside = Path(f"{output}.json")
-    if beside.exists() and beside.samefile(sidecar):
-        raise OutputError(f"{output}: its sidecar is the one that is applied; choose another name")
-    check_output(output, overwrite, inputs)
-    check_output(beside, overwrite, inputs, suffixes=())
-
-
-def _match(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) -> tuple[list[Frame | None], str]:
-    """For each image of the registration the frame that takes its place, and by what it was found."""
-    # Arrays have no names of their own.
-    if match != "order" and any(frame.image is None for frame in frames):
-        for part in ("name", "stem"):
-            chosen = _by_name(saved, frames, attrgetter(part))
-            if any(frame is not None for frame in chosen):
-                return chosen, "name"
-    if match == "name":
-        wanted = next(image.name for image in saved.images if image.to_plane is not None)
-        raise InputError(f"{saved.path}: none of the given images has a name that is in it, such as {wanted}")
-    return list(_by_order(saved, frames)), "order"
-
-
-def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[Path], str]) -> list[Frame | None]:
-    given: dict[str, list[Frame]] = {}
-    for frame in frames:
-        given.setdefault(canonical_name(key(frame.path)), []).append(frame)
-    chosen: list[Frame | None] = []
-    for image in saved.images:
-        *folders, name = Path(canonical_text(image.name)).parts or ("",)
-        alike = [] if image.to_plane is None else given.get(key(Path(name)), [])
-        if folders:
-            alike = [frame for frame in alike if _folders(frame)[-len(folders) :] == folders]
-        if len(alike) > 1 or (alike and alike[0] in chosen):
-            raise InputError(
-                f"{saved.path}: several images are called {name}; give as many images as it has, in its order, with "
-                "--match order"
-            )
-        chosen.append(alike[0] if alike else None)
-    return chosen
-
-
-def _folders(frame: Frame) -> list[str]:
-    return [canonical_name(part) for part in frame.path.absolute().parent.parts]
-
-
-def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Frame]:
-    if any(image.camera is None for image in saved.images):
-        raise InputError(
-            f"{saved.path}: has images that could not be read, so that the order is lost; give images of the same names"
-        )
-    if len(frames) != len(saved.images):
-        for path in files_of(frames):
-            check_readable(path)
-        raise InputError(
-            f"{saved.path}: has {len(saved.images)} images, but {len(frames)} others were given; give images of "
-            "the same names, or equally many"
-        )
-    return frames
 
 
 def _sources(

@@ -68,7 +68,10 @@ def detect_features(
         errors = [result for result in batch if isinstance(result, InputError)]
         if errors and not skip_bad:
             raise errors[0]
-        results += batch
+        for result in batch:
+            if isinstance(result, InputError):
+                sources[0].guard.unreadable[sources[len(results)].path] = str(result)
+            results.append(result)
         progress("detecting features", len(results), len(sources))
     return DetectedFeatures(
         FeatureStore(

@@ -79,7 +79,8 @@ def _grey_of(task: tuple[Source, float | None]) -> tuple[NDArray[np.float32] | N
 
 def find_circle(grey: NDArray[np.float32]) -> Circle | None:
     """Find the circle outside which an image (h, w) is dark, up to all four corners; None where there is none."""
-    dark = grey <= _DARK * float(np.quantile(grey, 0.95))
+    black = min(float(grey.min()), 0.0)  # of samples with a sign the lowest
+    dark = grey - black <= _DARK * (float(np.quantile(grey, 0.95)) - black)
     height, width = grey.shape
     if not dark[[0, 0, -1, -1], [0, -1, 0, -1]].all():
         return None

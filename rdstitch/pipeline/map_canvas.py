@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, CompositeOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import MIN_POSITIONS, Georeference, georeference, has_place
+from rdstitch.export.map_grid import MapGrid, grid_of_extent, read_grid
 from rdstitch.geometry.crs import Crs
 from rdstitch.inputs.source import Source
 from rdstitch.pipeline.placed_images import PlacedImages, plan
@@ -18,8 +20,15 @@ def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
     """Find out before long work whether what is requested of the map can be had."""
     if options.epsg is not None:
         Crs(options.epsg)
+    if options.like is not None:
+        read_grid(options.like)
     placed = has_place([source.metadata.gps for source in sources]) or any(source.control for source in sources)
-    for name, value in (("gsd", options.gsd), ("crs", options.epsg)):
+    for name, value in (
+        ("gsd", options.gsd),
+        ("crs", options.epsg),
+        ("like", options.like),
+        ("extent", options.extent),
+    ):
         if value is not None and not placed:
             raise ArgumentError(
                 f"{name} needs GPS positions of {MIN_POSITIONS} images, in EXIF or a file, or ground control points; "
@@ -37,14 +46,27 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
         place, reason = None, "the camera turned on the spot"
     elif placed.place is not None:
         place, reason = placed.place.after(canvas.matrix), ""
-        if options.epsg is not None:
-            place = place.in_system(Crs(options.epsg), np.concatenate(canvas.footprints))
+        epsg = options.epsg if options.like is None else read_grid(options.like).place.crs.epsg
+        if epsg is not None:
+            place = place.in_system(Crs(epsg), np.concatenate(canvas.footprints))
     else:
-        place, reason = georeference(placed.located(canvas), options.epsg, force=options.georeference == "force")
+        epsg = options.epsg if options.like is None else read_grid(options.like).place.crs.epsg
+        place, reason = georeference(placed.located(canvas), epsg, force=options.georeference == "force")
     if place is None:
-        if options.gsd is not None:
-            raise ArgumentError(f"gsd needs a georeferenced output: {reason}; leave it out")
+        for name in ("gsd", "like", "extent"):
+            if getattr(options, name) is not None:
+                raise ArgumentError(f"{name} needs a georeferenced output: {reason}; leave it out")
         return canvas, None, reason
+    if placed.grid is not None:
+        return canvas, placed.grid[2], reason
+    if (grid := _grid(options, place)) is not None:
+        on_grid = grid.place.in_pixels(place) @ canvas.matrix
+        laid = canvas.on_grid(on_grid, grid.size)
+        if not any(_overlaps(outline, grid.size) for outline in laid.footprints):
+            raise ArgumentError(f"{'like' if options.like else 'extent'}: none of the images lies there")
+        # As in the file, without rounding.
+        exact = replace(place.after(grid.place.in_pixels(place)), scale=grid.place.scale, origin=grid.place.origin)
+        return laid, exact, reason
     rotate, scale = options.rotate, options.scale
     if options.north_up and not rotate and not options.upright:
         rotate = place.clockwise_deg
@@ -58,9 +80,26 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
     return laid, moved(place, canvas, laid), reason
 
 
+def _grid(options: CompositeOptions, place: Georeference) -> MapGrid | None:
+    """The grid that the options request."""
+    if options.like is None and options.extent is None:
+        return None
+    if options.like is None:
+        assert options.extent is not None
+        return grid_of_extent(place.crs, options.extent, (options.gsd or place.gsd) * place.map_scale)
+    grid = read_grid(options.like)
+    return grid if options.extent is None else grid.within(options.extent)
+
+
+def _overlaps(outline: FloatArray, size: tuple[int, int]) -> bool:
+    return bool((outline.max(axis=0) > 0).all() and (outline.min(axis=0) < size).all())
+
+
 def moved(place: Georeference | None, one: Canvas, other: Canvas) -> Georeference | None:
     """The place of another canvas of the same plane."""
-    return None if place is None else place.after(other.matrix @ np.linalg.inv(one.matrix))
+    if place is None or np.array_equal(one.matrix, other.matrix):  # without rounding: grids are compared
+        return place
+    return place.after(other.matrix @ np.linalg.inv(one.matrix))
 
 
 def place_messages(place: Georeference | None, reason: str, placed: PlacedImages) -> list[Message]:

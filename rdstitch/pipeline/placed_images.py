@@ -16,12 +16,14 @@ from rdstitch.compositing.source_images import Displacement, PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference, Located, has_place
+from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
-from rdstitch.local_alignment import LocalAlignment, LocalAlignmentMode, Match, align_locally
+from rdstitch.local_alignment import LocalAlignment, LocalAlignmentMode, Match, align_locally, no_local_alignment
+from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
 
 _COMPARED, _COMPARED_SIDE = 8, 400
@@ -38,21 +40,30 @@ def align_registration_locally(registration: Registration, choice: LocalAlignmen
     choice : "auto", "off" or int
         See :func:`rdstitch.local_alignment.align_locally`.
     """
+    if choice == "off":
+        return no_local_alignment("switched off")
     alignment = registration.alignment
     position = np.cumsum(alignment.used) - 1
-    matches = [
-        Match(
-            int(position[pair.image1]),
-            int(position[pair.image2]),
-            pair.correspondences.points1,
-            pair.correspondences.points2,
-        )
+    pairs = [
+        pair
         for pair in registration.pairs
         if pair.relation and alignment.used[pair.image1] and alignment.used[pair.image2]
     ]
+
+    def match(pair: PairRegistration) -> Match:
+        found = pair.correspondences
+        return Match(int(position[pair.image1]), int(position[pair.image2]), found.points1, found.points2)
+
     cameras = [camera for camera, used in zip(alignment.cameras, alignment.used, strict=True) if used]
+    used = np.flatnonzero(alignment.used)
     return align_locally(
-        matches, cameras, alignment.homographies[alignment.used], choice, on_sphere=alignment.on_sphere
+        map(match, pairs),
+        cameras,
+        alignment.homographies[alignment.used],
+        choice,
+        pairs=len(pairs),
+        on_sphere=alignment.on_sphere,
+        edges=lambda image: line_segments(registration.sources[used[image]].view(MEGAPIXELS))[0],
     )
 
 
@@ -70,8 +81,11 @@ class PlacedImages:
     # whether the camera turned on the spot, so that the homographies lead to directions, not to a plane
     turned: bool = False
     place: Georeference | None = None  # of the plane, where it is known from an earlier run
+    whole: bool = False  # whether nothing of them can be static: tiles on a stage, whose ground may be black
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
+    # pixels that the output is made on, as of an earlier run: from the plane (3, 3), their size, and their place
+    grid: tuple[FloatArray, tuple[int, int], Georeference | None] | None = None
 
     @classmethod
     def of(cls, registration: Registration, displacements: Sequence[Displacement | None] | None) -> Self:
@@ -85,6 +99,7 @@ class PlacedImages:
             int(np.flatnonzero(used == alignment.reference)[0]),
             displacements,
             alignment.on_sphere,
+            whole=registration.tiles is not None,
         )
 
     @cached_property
@@ -94,7 +109,7 @@ class PlacedImages:
         A few images of the commonest size are compared, reduced; those of other sizes count as a whole.
         """
         size, count = Counter(camera.image_size for camera in self.cameras).most_common(1)[0]
-        if count < MIN_IMAGES:
+        if self.whole or count < MIN_IMAGES:
             return None
         alike = [s for s, camera in zip(self.sources, self.cameras, strict=True) if camera.image_size == size]
         chosen = np.linspace(0, count - 1, min(count, _COMPARED)).astype(np.intp).tolist()
@@ -135,7 +150,16 @@ class PlacedImages:
                 for reader, camera in zip(read, self.cameras, strict=True)
             ]
         return [
-            PlacedImage(reader, camera, matrix, reader, source.metadata.exposure, displacement, str(source.path))
+            PlacedImage(
+                reader,
+                camera,
+                matrix,
+                reader,
+                source.metadata.exposure,
+                displacement,
+                str(source.path),
+                source.metadata.channels in (3, 4),
+            )
             for reader, camera, matrix, source, displacement in zip(
                 read,
                 self.cameras,
@@ -164,6 +188,8 @@ def _read_near(read: Callable[..., DecodedImage], part: NearPart, reduction: int
 def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
     """The canvas of the images, no larger than ``options.max_size``."""
     canvas = _plan(placed, options, options.scale)
+    if placed.grid is not None:
+        return canvas.on_grid(*placed.grid[:2])
     if options.max_size is None or max(canvas.size) <= options.max_size:
         return canvas
     # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.

@@ -19,6 +19,12 @@ from rdstitch.results.messages import Message
 from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.process_memory import return_freed_memory
 
+NO_FLAT_FIELD = Message(
+    "the tiles show no illumination that all have in common, and samples stay as they are",
+    severity="note",
+    code="flat-field",
+)
+
 
 def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
     """Files by their names where every pair is compared, so that the order in which they were named does not show.
@@ -90,7 +96,7 @@ def check_size(sources: Sequence[Source]) -> None:
 def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
     """The tiles, which are read without the illumination that all have; and what there is to say of that."""
     # Imported late: images that are no tiles have no use for it.
-    from rdstitch.stage.estimate_flat_field import estimate_illumination
+    from rdstitch.stage.estimate_flat_field import LEAST_TILES, estimate_illumination
 
     if wanted == "off":
         return list(sources), []
@@ -100,9 +106,12 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
         field = read_flat_field(wanted, sources[0].camera.image_size, channels)
         return [replace(source, flat_field=field) for source in sources], []
     shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
-    if shown.field is None:
-        text = f"{len(sources)} tiles show no illumination that they have in common, and samples stay as they are"
+    if shown.field is None and len(sources) < LEAST_TILES:
+        text = f"{len(sources)} tiles are too few to show their flat field, and samples stay as they are"
         return list(sources), [Message(text, severity="note", code="flat-field")]
-    dark = ", ".join(f"{value:.0f}" for value in shown.dark)
+    if shown.field is None:
+        return list(sources), [NO_FLAT_FIELD]
+    levels = zip(shown.dark, shown.dark_error, strict=True)
+    dark = ", ".join(f"{level:.0f} ± {error:.0f}" if error > 0.0 else "not shown" for level, error in levels)
     text = f"flat field: {shown.shading:.0%} less light where it is darkest, ± {shown.error:.1%}; dark level {dark}"
     return [replace(source, flat_field=shown.field) for source in sources], [Message(text, severity="note")]

@@ -1,6 +1,6 @@
 """The recipes: each reads as the sequence of its stages."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -10,30 +10,30 @@ from typing import Literal
 
 from rdstitch.alignment.frames import stored, turned_alignment
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.errors import RegistrationError
+from rdstitch.choices import Purpose
+from rdstitch.errors import OutputError, RdstitchError, RegistrationError
 from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
 from rdstitch.geometry.exif_orientation import quarter_turn
-from rdstitch.inputs.find import found_images
+from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of, with_times
+from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
-from rdstitch.local_alignment import LocalAlignment
-from rdstitch.pipeline.accept import accept, scale_uncertainty
-from rdstitch.pipeline.aligner import Purpose
-from rdstitch.pipeline.compose import blocks_on, compose_images, viewed_images, write_page
+from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty
+from rdstitch.pipeline.choose_layout import LaidOut, choose_layout
+from rdstitch.pipeline.compose import blocks_on, check_world_files, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
-from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
+from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside, check_run
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag
-from rdstitch.pipeline.register import register, with_frontal_reference
-from rdstitch.pipeline.straighten import turned
-from rdstitch.pipeline.whole_pixels import on_whole_pixels
+from rdstitch.pipeline.register import register
+from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, told_once
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.write import sidecar
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import Outputs, TemporaryFolder, check_distinct, check_output, json_bytes, text_bytes
+from rdstitch.system.outputs import Outputs, TemporaryFolder, check_outputs, json_bytes, text_bytes
 from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.verdict import RefusedError
 
@@ -52,7 +52,7 @@ def pano(
     *,
     every: int | None = None,
     progress: Progress = silent,
-    beside: Callable[[Outputs, StitchResult], None] | None = None,
+    beside: FilesBeside = NOTHING_BESIDE,
 ) -> StitchResult:
     """Stitch a few images that overlap, in any order, in the frame of one of them.
 
@@ -68,8 +68,8 @@ def pano(
         Use every n-th frame of videos and ROS bags; without it those that show new ground.
     progress : callable
         Called with the name of a stage, the number of steps done, and their total.
-    beside : callable, optional
-        Called with the outputs and the result, to stage further files that are published together with the image.
+    beside : FilesBeside
+        What else is written.
 
     Returns
     -------
@@ -99,7 +99,7 @@ def mosaic(
     *,
     every: int | None = None,
     progress: Progress = silent,
-    beside: Callable[[Outputs, StitchResult], None] | None = None,
+    beside: FilesBeside = NOTHING_BESIDE,
 ) -> StitchResult:
     """Stitch a whole sequence on the rectified plane: seen straight from above, metric up to scale.
 
@@ -143,7 +143,7 @@ def mosaic_blocks(
     *,
     every: int | None = None,
     progress: Progress = silent,
-    beside: Callable[[Outputs, StitchResult], None] | None = None,
+    beside: FilesBeside = NOTHING_BESIDE,
 ) -> tuple[StitchResult, ...]:
     """Stitch every block of images that overlap: :func:`mosaic`, and again of what it left out, while that overlaps.
 
@@ -168,33 +168,53 @@ def mosaic_blocks(
     results: list[StitchResult] = []
     refused: list[Message] = []
     given = as_inputs(inputs, options.channel_order)
-    with found_images(given, output=output, every=every, topic=options.topic) as listed, ExitStack() as stack:
-        _check_outputs(output, options, listed.files)
+    options, notes = with_camera_in_bag(given, options)
+    with ExitStack() as stack:
+        listed = stack.enter_context(found_images(given, output=output, every=every, topic=options.topic))
         if options.cache is None:
             # What was found of images and pairs serves the next block.
             options = replace(options, cache=stack.enter_context(TemporaryFolder()))
-        frames = with_times(listed.frames, options.timestamps)
+        # All are published together.
+        outputs = stack.enter_context(Outputs(options.overwrite))
+        listed = replace(
+            listed, frames=list(with_times(listed.frames, options.timestamps)), notes=(*listed.notes, *notes)
+        )
         options = replace(options, timestamps=None)
+        frames = selected(listed.frames, options.exclude, options.include_only)
+        names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
+        further = names[1:]
+        found = replace(listed, outputs=[], notes=())
         while len(frames) > 1 or not results:
-            name = file.with_name(f"{file.stem}-{len(results) + 1}{file.suffix}") if results else file
+            name = names[len(results)]
             try:
-                result = mosaic(frames, name, options, progress=progress, beside=beside)
+                with outputs.together():
+                    result = _stitch_found(found, name, options, progress, beside, outputs, further=further)
                 registration = result.registration
-            except RegistrationError as error:
-                if not results:
+            except RdstitchError as error:
+                if not results or isinstance(error, OutputError):
                     raise
                 if not isinstance(error, RefusedError):
+                    # What is left does not overlap, or cannot be read, which the first block has said.
                     break
                 registration = error.registration
                 refused.append(Message(f"a further block of {registration.alignment.used.sum()} images: {error}"))
             else:
                 results.append(result)
-                options, beside = replace(options, save_camera=None, reference=None), None
             pairs = zip(registration.sources, registration.alignment.used, strict=True)
             used = [source.frame or Frame(source.path) for source, used in pairs if used]
             done = {(frame.path, frame.number) for frame in used}
             frames = [frame for frame in frames if (frame.path, frame.number) not in done]
+            found = replace(found, frames=frames)
+            # These are of the first block, or of its reference image.
+            options, beside, further = _for_further_blocks(options), NOTHING_BESIDE, []
     return (_without_blocks(results[0], results[1:], [*listed.messages, *refused]), *map(_without_blocks, results[1:]))
+
+
+def _for_further_blocks(options: StitchOptions) -> StitchOptions:
+    """Without what is of the first block alone: its camera file, what its reference image shows, patterns of names."""
+    lines = options.composite.straighten if options.composite.straighten in ("off", "auto") else "off"
+    composite = replace(options.composite, rectangle=None, straighten=lines)
+    return replace(options, save_camera=None, reference=None, composite=composite, exclude=(), include_only=())
 
 
 def _without_blocks(
@@ -221,25 +241,46 @@ def _stitch(
     options: StitchOptions,
     every: int | None,
     progress: Progress,
-    beside: Callable[[Outputs, StitchResult], None] | None,
+    beside: FilesBeside,
     *,
     pano: bool,
 ) -> StitchResult:
     """The stages of :func:`mosaic`, and, where every image must be readable and one gives the plane, :func:`pano`."""
     given = as_inputs(inputs, options.channel_order)
     options, notes = with_camera_in_bag(given, options)
-    with found_images(given, output=output, every=every, topic=options.topic) as listed:
-        _check_outputs(output, options, listed.files)
-        frames = in_lasting_order(with_times(listed.frames, options.timestamps))
-        sources, unread = read_inputs(frames, options, skip_bad=not pano)
-        check_map(sources, options.composite)
-        with options.executor(len(sources)) as executor:
-            known = [*unread, *listed.messages, *notes]
-            accepted = _accepted(sources, known, options, executor, progress, "pano" if pano else "mosaic")
-            registration = on_whole_pixels(with_frontal_reference(accepted, options, always=pano))
-            local = align_registration_locally(registration, options.local_alignment)
-            with Outputs(options.overwrite) as outputs:
-                return compose_registration(registration, local, executor, output, options, progress, beside, outputs)
+    with (
+        found_images(given, output=output, every=every, topic=options.topic) as listed,
+        Outputs(options.overwrite) as outputs,
+    ):
+        listed = replace(listed, notes=(*listed.notes, *notes))
+        return _stitch_found(listed, output, options, progress, beside, outputs, pano=pano)
+
+
+def _stitch_found(
+    listed: FoundImages,
+    output: str | Path | None,
+    options: StitchOptions,
+    progress: Progress,
+    beside: FilesBeside,
+    outputs: Outputs,
+    *,
+    pano: bool = False,
+    further: Sequence[Path] = (),
+) -> StitchResult:
+    """The same of images that were found; ``further`` are images that may follow."""
+    images = [] if output is None else [output, *further]
+    frames = in_lasting_order(with_times(listed.frames, options.timestamps))
+    names = [frame.name for frame in selected(frames, options.exclude, options.include_only)]
+    check_run(images, options, beside, listed.files, names)
+    sources, unread = read_inputs(frames, options, skip_bad=not pano)
+    check_world_files(images, sources, options.overwrite)
+    check_map(sources, options.composite)
+    purpose: Purpose = "pano" if pano else "mosaic"
+    with options.executor(len(sources)) as executor:
+        known = [*unread, *listed.messages]
+        accepted = _accepted(sources, known, options, executor, progress, purpose, beside)
+        chosen = choose_layout(accepted, options, aligner_of(accepted, options, purpose), pano=pano)
+        return compose_registration(chosen, executor, output, options, progress, beside, outputs)
 
 
 @one_opencv_thread()
@@ -249,7 +290,7 @@ def calibrate(
     *,
     every: int | None = None,
     progress: Progress = silent,
-    beside: Callable[[Outputs, Registration], None] | None = None,
+    beside: FilesBeside = NOTHING_BESIDE,
 ) -> Registration:
     """Find the lens from images of a plane; the camera is ``result.camera``.
 
@@ -257,8 +298,8 @@ def calibrate(
     ----------
     inputs, options, every, progress
         As for :func:`mosaic`; nothing is composited. ``options.save_camera`` names the file to write.
-    beside : callable, optional
-        Called with the outputs and the result, to stage further files that are published together with the camera.
+    beside : FilesBeside
+        What else is written: a report.
 
     Returns
     -------
@@ -272,16 +313,15 @@ def calibrate(
     """
     options = options or StitchOptions()
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
-        _check_outputs(None, options, listed.files)
+        check_run([], options, beside, listed.files, ())
         sources, unread = read_inputs(with_times(listed.frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages]
-            result = _finished(_accepted(sources, known, options, executor, progress, "calibrate"))
+            accepted = _accepted(sources, known, options, executor, progress, "calibrate", beside)
+            result = _finished(at_full_size(accepted))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
-        if beside is not None:
-            beside(outputs, result)
-    return result
+        return result.with_messages(beside.stage(outputs, result))
 
 
 @one_opencv_thread()
@@ -328,16 +368,14 @@ def trajectory(
     given = as_inputs(inputs, options.channel_order)
     options, notes = with_camera_in_bag(given, options)
     with found_images(given, every=every, topic=options.topic) as listed:
-        files = [file for file in (output, plot) if file is not None]
-        for file in files:
-            check_output(file, options.overwrite, [*listed.files, *options.files], suffixes=())
-        check_distinct(files)
+        files = [Path(file) for file in (output, plot) if file is not None]
+        check_outputs(files, options.overwrite, [*listed.files, *options.files])
         # Numbered as they were named: what is left out leaves a gap.
         frames = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
         sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages, *notes]
-            registration = _accepted(sources, known, options, executor, progress, "trajectory")
+            registration = at_full_size(_accepted(sources, known, options, executor, progress, "trajectory"))
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])
@@ -364,60 +402,49 @@ def _accepted(
     executor: Executor,
     progress: Progress,
     purpose: Purpose,
+    beside: FilesBeside = NOTHING_BESIDE,
 ) -> Registration:
-    """Register and check, with what is known of the inputs already; a failure names those that could not be read."""
+    """Register and check, with what is known of the inputs already; a failure names what could not be read well.
+
+    In pixels of the working size.
+    """
     try:
         registration = register(sources, options, executor, purpose=purpose, progress=progress)
         return accept(registration.with_messages(known), options, purpose)
     except RegistrationError as error:
-        unread = [str(replace(message, code="")) for message in told_once(known) if message.severity == "left out"]
-        error.args = ("; ".join([str(error), *unread]),)
+        unread = [message for message in known if message.severity == "left out"]
+        told = [str(replace(message, code="")) for message in told_once([*unread, *sources[0].guard.complaints])]
+        error.args = ("; ".join([str(error), *told]),)
+        if isinstance(error, RefusedError):
+            beside.explain(error.registration)
         raise
 
 
-def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:
-    """Find out before long work whether everything can be written."""
-    inputs = [*inputs, *options.files]
-    if output is not None:
-        check_output(output, options.overwrite, inputs)
-        check_output(f"{output}.json", options.overwrite, inputs, suffixes=())
-    if options.save_camera is not None:
-        from rdstitch.camera_files import CAMERA_SUFFIXES
-
-        check_output(options.save_camera, options.overwrite, inputs, suffixes=CAMERA_SUFFIXES)
-        check_distinct([options.save_camera, *([] if output is None else [f"{output}.json"])])
-
-
 def compose_registration(
-    registration: Registration,
-    local: LocalAlignment,
+    chosen: LaidOut,
     executor: Executor,
     output: str | Path | None,
     options: StitchOptions,
     progress: Progress,
-    beside: Callable[[Outputs, StitchResult], None] | None,
+    beside: FilesBeside,
     outputs: Outputs,
 ) -> StitchResult:
     """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
-    placed, said = turned(PlacedImages.of(registration, local.fields or None), options.composite)
-    if placed.orientation is not None:
-        homographies = placed.orientation @ registration.alignment.homographies
-        registration = replace(registration, alignment=replace(registration.alignment, homographies=homographies))
+    registration = chosen.registration
     composed = compose_images(
-        placed,
+        chosen.layout,
         output,
         options.composite,
         options.threads,
         progress,
-        overwrite=options.overwrite,
         outputs=outputs,
-        elsewhere=blocks_on(executor, placed.sources, options.cache),
+        elsewhere=blocks_on(executor, chosen.layout.placed.sources, options.cache),
         dry_run=options.dry_run,
     )
     result = StitchResult(
-        registration=_finished(registration).with_messages((*said, *composed.messages)),
+        registration=_finished(registration).with_messages((*chosen.messages, *composed.messages)),
         options=options.for_images(len(registration.sources)),
-        local_alignment=local,
+        local_alignment=chosen.local,
         **composed.output_fields,
     )
     if options.dry_run:
@@ -425,9 +452,8 @@ def compose_registration(
     failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, options, outputs))
     if output is not None:
         failed += write_page(outputs, output, composed, partial(viewed_images, result))
-    result = replace(result, registration=result.registration.with_messages(failed))
-    if beside is not None:
-        beside(outputs, result)
+    result = result.with_messages(failed)
+    result = result.with_messages(beside.stage(outputs, result))
     if output is not None:
         # Last: whoever finds it finds what it belongs to.
         outputs.write(f"{output}.json", json_bytes(sidecar(result)))
@@ -445,4 +471,5 @@ def _save_camera(registration: Registration, options: StitchOptions, outputs: Ou
     if options.save_camera is not None:
         from rdstitch.camera_files import camera_file_text
 
-        outputs.write(options.save_camera, text_bytes(camera_file_text(registration.camera, options.save_camera)))
+        text = camera_file_text(registration.camera, options.save_camera, options.camera_format)
+        outputs.write(options.save_camera, text_bytes(text))

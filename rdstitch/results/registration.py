@@ -103,6 +103,10 @@ class Registration:
         """How many images are in the result, and λ with its standard deviation, in one line."""
         used = int(self.alignment.used.sum())
         images = f"{used} of {used + len(self.left_out)} images"
+        if self.tiles is not None:
+            linked = int(self.tiles.linked.sum())
+            alone = f", {used - linked} by the stage alone" if linked < used else ""
+            images = f"{linked} of {used + len(self.left_out)} images registered{alone}"
         distortion, deviation = self.alignment.distortion, self.alignment.distortion_std
         if not math.isfinite(deviation):
             return f"{images}, λ not observable"

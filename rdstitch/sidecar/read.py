@@ -160,6 +160,13 @@ class ImageRecord(LensRecord, kw_only=True):
     to_output: Matrix | None = None
     displacement: Displacement | None = None
     pose: PoseRecord | None = None
+    timestamp: Annotated[float, Meta(description="s since 1970, by EXIF")] | None = None
+    gps: (
+        Annotated[
+            tuple[float, float, float | None], Meta(description="latitude and longitude, degrees; altitude, m, or null")
+        ]
+        | None
+    ) = None
 
     def __post_init__(self) -> None:
         if self.size is not None:
@@ -236,6 +243,7 @@ class TileRecord(Struct):
     row: Count
     column: Count
     placed_by: Literal["overlap", "stage"]
+    std_px: NonNegative = 0.0
 
 
 class StageRecord(Struct):
@@ -243,11 +251,13 @@ class StageRecord(Struct):
 
     source: str
     pixel_um: _Positive | None
+    z: int | Literal["max"] | None
+    time: int | None
     matrix: tuple[Pair, Pair]
     rows_px: list[Pair]
     columns_px: list[Pair]
-    row_std_px: NonNegative
-    column_std_px: NonNegative
+    row_std_px: NonNegative | None
+    column_std_px: NonNegative | None
     tile_std_px: NonNegative
     tiles: list[TileRecord]
 
@@ -256,7 +266,7 @@ class Applied(Struct):
     """Only in the sidecar of ``apply``: what was applied, and how images found their places."""
 
     sidecar: str
-    matched: Literal["name", "order"]
+    matched: Literal["name", "time", "position", "order"]
 
 
 class SidecarRecord(Struct, kw_only=True):
@@ -313,8 +323,16 @@ class SavedRegistration:
     turned: bool  # whether the camera turned on the spot, so that ``to_plane`` leads to directions
     composite: CompositeOptions  # what the image was composited with
     orientation: FloatArray | None  # (3, 3): what the registered images were turned by to be at ``to_plane``
-    place: Georeference | None  # of the plane, where the output was georeferenced
+    output_place: Georeference | None  # of the output's pixels, where that was georeferenced
     content: dict[str, Any]  # the whole sidecar
+
+    @property
+    def place(self) -> Georeference | None:
+        """Of the plane, where the output was georeferenced."""
+        if self.output_place is None:
+            return None
+        matrix = np.array(self.content["output"]["plane_to_output"], dtype=np.float64)
+        return self.output_place.after(np.linalg.inv(matrix).astype(np.float64))
 
 
 def read_sidecar(path: str | Path) -> SavedRegistration:
@@ -357,12 +375,12 @@ def mismatch_with_image(saved: SavedRegistration) -> str:
 
 
 def _place(output: OutputRecord) -> Georeference | None:
-    """Give where the plane lies on the Earth; versions before did not say."""
+    """Give where the output lies on the Earth; versions before did not say."""
     record = output.georeference
     if record is None or record.crs is None or record.pixel_to_map is None or output.plane_to_output is None:
         return None
     (a, b, east), (_, _, north) = record.pixel_to_map
-    place = Georeference(
+    return Georeference(
         Crs(int(record.crs.removeprefix("EPSG:"))),
         complex(a, b),
         complex(east, north),
@@ -373,7 +391,6 @@ def _place(output: OutputRecord) -> Georeference | None:
         math.hypot(a, b) / (record.gsd_m or math.hypot(a, b)),
         checks=_residuals(record.check_points),
     )
-    return place.after(np.linalg.inv(output.plane_to_output).astype(np.float64))
 
 
 def _residuals(records: Sequence[ResidualRecord]) -> tuple[Residual, ...]:

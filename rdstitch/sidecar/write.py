@@ -16,6 +16,7 @@ from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
 from rdstitch.export.georeference import Georeference, Residual
 from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.source import Source
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
@@ -66,6 +67,20 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
             "cells": local.cells,
             "held_out_px": {"before": local.before, "after": local.after},
         },
+        "seams": {
+            "places": len(result.seams.places),
+            "broken": int(result.seams.broken.sum()),
+            "breaks": [
+                {
+                    "images": [registration.used_names[k] for k in one.images],
+                    "x": one.position[0],
+                    "y": one.position[1],
+                    "length_px": one.length,
+                    "shift_px": one.size,
+                }
+                for one in result.seams.breaks
+            ],
+        },
         "stage": _stage(registration),
         "images": _images(result),
         "pairs": _pairs(result),
@@ -96,6 +111,7 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
             "to_output": to_output(result.canvas, alignment.homographies[index]) if used else None,
             "displacement": displacement(next(fields, None) if used else None),
             "pose": None,
+            **taken_fields(source),
         }
         if used and poses is not None:
             entry["pose"] = {
@@ -112,6 +128,15 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
         for path, reason in reasons.items()
     ]
     return entries + unread
+
+
+def taken_fields(source: Source) -> dict[str, Any]:
+    """Give when and where an image was taken."""
+    gps = source.metadata.gps
+    return {
+        "timestamp": source.metadata.timestamp,
+        "gps": None if gps is None else (gps.latitude, gps.longitude, gps.altitude),
+    }
 
 
 def output_geometry(canvas: Canvas, *, turned: bool) -> dict[str, Any]:
@@ -169,10 +194,14 @@ def _stage(registration: Registration) -> dict[str, Any] | None:
     if registration.tiles is None:
         return None
     grid, model = registration.tiles.grid, registration.tiles.adjustment.stage
-    lines = zip(registration.sources, grid.rows, grid.columns, registration.tiles.linked, strict=True)
+    # Whole pixels are another source of error.
+    stds = np.hypot(registration.tiles.stds, 0.0 if registration.alignment.distortion else math.sqrt(1.0 / 12.0))
+    lines = zip(registration.sources, grid.rows, grid.columns, registration.tiles.linked, stds, strict=True)
     return {
         "source": grid.source,
         "pixel_um": grid.pixel_size,
+        "z": registration.tiles.z,
+        "time": registration.tiles.time,
         "matrix": model.matrix,
         "rows_px": model.rows,
         "columns_px": model.columns,
@@ -180,8 +209,14 @@ def _stage(registration: Registration) -> dict[str, Any] | None:
         "column_std_px": model.column_std,
         "tile_std_px": model.std,
         "tiles": [
-            {"name": source.name, "row": row, "column": column, "placed_by": "overlap" if linked else "stage"}
-            for source, row, column, linked in lines
+            {
+                "name": source.name,
+                "row": row,
+                "column": column,
+                "placed_by": "overlap" if linked else "stage",
+                "std_px": std,
+            }
+            for source, row, column, linked, std in lines
         ],
     }
 

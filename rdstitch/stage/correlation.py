@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.io.reduction import block_mean
 from rdstitch.system.late_imports import fft
 
 Image = NDArray[np.float32]
@@ -18,7 +19,15 @@ Image = NDArray[np.float32]
 _TAPER = 0.15  # share of a window on each side over which it falls to 0
 _NOISE_SHARE = 4.0  # products of spectra are whitened where they are so many times what noise would give
 _CORRELATED = 4.0 * math.pi  # pixels that share their noise after a Gaussian filter of 1 pixel
-_BETTER = 3.0  # standard deviations of chance by which a correlation must exceed another
+_FALSE_ALARMS = 1e-4  # chance that the highest of all peaks of noise is taken for an overlap
+_ILLUMINATION = 0.25  # share of a tile's side over which its illumination, or the medium's glow, is even
+_UNLIKE = 0.2  # share of the variance that two images of the same may differ by: interpolation, bleaching, focus
+_INDEPENDENT = 24  # independent pieces of evidence that the pixels of an overlap count for
+_CONTENT = 0.02  # least share of the variance that is content: the noise is not known better
+_WIDE_PEAKS = 6  # highest peaks of two whole tiles that are compared by their normalized cross-correlation
+_EDGE = 0.02  # the taper of whole tiles, whose overlap is at their border
+_ASIDE = 0.35  # displacement of neighbours along one of the axes, at least, share of the side
+_LEAST_COMMON = 0.02  # share of the side that neighbours have in common, at least
 _BLOCKS = 8  # blocks along a side of a tile: a lens that bends the overlap hardly bends one of them
 # side of a block, pixels, from which on it has enough of independent pixels for its displacement to be sure
 _LEAST_SIDE = 40
@@ -39,14 +48,14 @@ class Overlap:
     blocks: IntArray  # (K, 4), int: boxes x0, y0, x1, y1 in the first tile, end exclusive
 
     @classmethod
-    def expected(cls, first: int, second: int, offset: FloatArray, size: tuple[int, int], least: int) -> "Overlap":
-        """For tiles of a size, one of which should lie at an offset in the other.
+    def expected(cls, first: int, second: int, offset: FloatArray, sizes: IntArray, least: int) -> "Overlap":
+        """For two tiles of sizes (2, 2), width and height, the second of which should lie at an offset in the first.
 
         An overlap narrower than ``least`` pixels is taken to be so wide.
         """
-        side = np.array(size)
+        side = sizes[0]
         whole = np.rint(offset).astype(np.intp)
-        low, high = np.maximum(0, whole), np.minimum(side, side + whole)
+        low, high = np.maximum(0, whole), np.minimum(side, sizes[1] + whole)
         lacking = np.maximum(0, least - (high - low))
         # Of the second tile so much is expected beyond the border of the first.
         low, high = low - np.where(whole > 0, lacking, 0), high + np.where(whole > 0, 0, lacking)
@@ -86,6 +95,7 @@ class Surfaces:
     # (K, 2 P + 1, 2 P + 1), float16: rows are displacements in y, from -P on; columns in x. Noise has the standard
     # deviation 1 in their sum
     values: NDArray[np.float16]
+    plain: Image  # (2 P + 1, 2 P + 1): of all blocks, with the frequencies as strong as they are
 
     @property
     def reach(self) -> int:
@@ -124,43 +134,135 @@ def correlate(first: Image, second: Image, overlap: Overlap, reach: int) -> Surf
         noise[1, number] = _fill(frames[1, number], second, moved, margins, corner - overlap.offset)
     spectra = fft.rfft2(frames)
     product = spectra[0] * np.conj(spectra[1])
+    rows, columns = (np.arange(-reach, reach + 1) % side for side in shape)
+    plain = fft.irfft2(product.sum(axis=0), s=shape)[rows[:, None], columns]
     floor = np.float32(_NOISE_SHARE) * np.sqrt(noise[0] * noise[1]).astype(np.float32)
     product /= np.abs(product) + floor[:, None, None] + np.float32(1e-12)
     power = float((np.abs(product) ** 2).sum()) * 2.0
     surface = fft.irfft2(product, s=shape) * (shape[0] * shape[1] / np.sqrt(power + 1e-12))
-    rows, columns = (np.arange(-reach, reach + 1) % side for side in shape)
-    return Surfaces(surface[:, rows[:, None], columns].astype(np.float16))
+    return Surfaces(surface[:, rows[:, None], columns].astype(np.float16), plain)
 
 
-def best_place(
-    first: Image, second: Image, overlap: Overlap, shifts: FloatArray, places: Sequence[FloatArray]
-) -> FloatArray:
-    """Choose the place with the best normalized cross-correlation of what two tiles (h, w) have in common there.
+@dataclass(frozen=True)
+class CoarseTile:
+    """A tile as overlaps are looked for."""
 
-    Places (2,) are those of the second tile in the first, pixels, and each block of the overlap is displaced by its
-    shift (K, 2) besides. The first of the places stands unless another is better by more than chance.
+    pixels: Image  # (h, w)
+    content: Image  # (h, w): without most of its noise, without the illumination, and less bright where it is bright
+    noise: float  # variance of the noise of a pixel in units of the content
+
+    @property
+    def content_share(self) -> float:
+        """Share of the variance of the content that is none of noise."""
+        return 1.0 - self.noise / _CORRELATED / max(float(self.content.var()), 1e-12)
+
+    @property
+    def grain(self) -> float:
+        """Radius of the area that is alike, pixels: peaks that are no farther from each other are one."""
+        squares, slopes = float(np.vdot(self.content, self.content)), _energies(self.content)[1]
+        return max(2.0, math.sqrt(2.0 * squares / max(slopes, 1e-30)))
+
+
+def coarse_tile(tile: NDArray[Any], factor: int) -> CoarseTile:
+    """Blocks of so many pixels a side of a tile (h, w) become one."""
+    image = np.asarray(block_mean(tile, factor), dtype=np.float32)
+    noise = noise_variance(image)
+    side = max(3, round(_ILLUMINATION * max(image.shape)) | 1)
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
+    light = smooth - np.float32(np.median(smooth))
+    # The brightest spot must not be all that counts.
+    scale = max(4.0 * math.sqrt(noise / _CORRELATED), 1.5 * float(np.median(np.abs(light))), 0.1 * float(light.std()))
+    light = np.arcsinh(light / np.float32(max(scale, 1e-12)))
+    even = cv2.blur(light, (side, side), borderType=cv2.BORDER_REFLECT)
+    return CoarseTile(image, np.asarray(light - even, dtype=np.float32), noise / max(scale, 1e-12) ** 2)
+
+
+def log_evidence(
+    tiles: Sequence[CoarseTile], overlap: Overlap, place: FloatArray, shifts: FloatArray | None = None
+) -> float:
+    """How much more likely two tiles are with the second at a place (2,) in the first than anywhere else, in nats.
+
+    By their normalized cross-correlation in the blocks of the overlap, each displaced by its shift (K, 2) besides, but
+    for their noise. However many pixels an overlap has, they count as few: neighbours are alike, and what interpolation
+    and bleaching change is not independent.
     """
-    if len(places) == 1:
-        return places[0]
-    one, two = (cv2.GaussianBlur(tile, (0, 0), 1.0) for tile in (first, second))
-    scores, variances = np.full(len(places), -1.0), np.ones(len(places))
-    for number, place in enumerate(places):
-        common: tuple[list[NDArray[Any]], list[NDArray[Any]]] = [], []
-        for block, moved in zip(overlap.blocks, np.rint(place + shifts).astype(int), strict=True):
-            low = np.maximum(np.maximum(block[:2], moved), 0)
-            high = np.maximum(low, np.minimum(np.minimum(block[2:], moved + second.shape[::-1]), first.shape[::-1]))
-            for parts, tile, (x0, y0), (x1, y1) in (
-                (common[0], one, low, high),
-                (common[1], two, low - moved, high - moved),
-            ):
-                parts.append(tile[y0:y1, x0:x1].ravel())
-        a, b = (np.concatenate(parts) for parts in common)
-        if len(a):
-            a, b = a - a.mean(), b - b.mean()
-            scores[number] = float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12)
-            variances[number] = _CORRELATED / len(a)
-    better = scores - _BETTER * np.sqrt(variances + variances[0]) > scores[0]
-    return places[int(np.argmax(np.where(better, scores, -1.0)))] if better.any() else places[0]
+    first, second = (tile.content for tile in tiles)
+    noise = np.array([tile.noise for tile in tiles])
+    shifts = np.zeros((len(overlap.blocks), 2)) if shifts is None else shifts
+    products, pixels, features = np.zeros(3), 0, np.zeros((2, 2))
+    for block, moved in zip(overlap.blocks, place + shifts, strict=True):
+        low = np.maximum(np.maximum(block[:2], np.ceil(moved).astype(np.intp)), 0)
+        high = np.minimum(
+            np.minimum(block[2:], np.floor(moved).astype(np.intp) + second.shape[::-1]), first.shape[::-1]
+        )
+        width, height = (high - low).tolist()
+        if min(width, height) < 2:
+            continue
+        x, y = (low - moved).tolist()
+        a = first[low[1] : high[1], low[0] : high[0]]
+        middle = x + (width - 1) / 2.0, y + (height - 1) / 2.0
+        b = np.asarray(cv2.getRectSubPix(second, (width, height), middle), dtype=np.float32)
+        products += [float(np.vdot(a, a)), float(np.vdot(b, b)), float(np.vdot(a, b))]
+        features += [_energies(a), _energies(b)]
+        pixels += width * height
+    if pixels < _CORRELATED or not min(products[:2]) > 0.0:
+        return 0.0
+    content = np.maximum(products[:2] - noise * pixels / _CORRELATED, _CONTENT * products[:2])
+    correlation = min(1.0, max(0.0, products[2]) / math.sqrt(float(content.prod())))
+    chance = math.sqrt(_CORRELATED / pixels * float((products[:2] / content).prod()))
+    # As many pixels as the energy is spread over, and as are independent: a single bright spot is like any other.
+    independent = products[:2] * features[:, 1] / (2.0 * math.pi * np.maximum(features[:, 0], 1e-30))
+    count = min(_INDEPENDENT, float(independent.min()))
+    unlike = _UNLIKE + 2.0 * chance
+    return -0.5 * count * math.log((1.0 - correlation**2 + unlike) / (1.0 + unlike))
+
+
+def _energies(image: Image) -> tuple[float, float]:
+    """Sums of the fourth powers of samples, and of the squares of their differences from neighbours."""
+    squares = image * image
+    slopes = np.diff(image, axis=0), np.diff(image, axis=1)
+    return float(np.vdot(squares, squares)), sum(float(np.vdot(slope, slope)) for slope in slopes)
+
+
+def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
+    """Places of the second tile in the first (K, 2), wherever along a side, and the evidence for them (K,), nats.
+
+    Of the highest peaks of two whole tiles; where they nearly coincide they share the camera and not the specimen.
+    """
+    first, second = (tile.pixels for tile in tiles)
+    sizes = np.array([first.shape, second.shape])
+    shape = tuple(int(fft.next_fast_len(int(side), real=True)) for side in sizes.sum(axis=0))
+    frames, noise = np.zeros((2, *shape), dtype=np.float32), []
+    for frame, tile in zip(frames, (first, second), strict=True):
+        weights = _taper(tile.shape[0], _EDGE)[:, None] * _taper(tile.shape[1], _EDGE)
+        frame[: tile.shape[0], : tile.shape[1]] = (tile - tile.mean()) * weights
+        noise.append(noise_variance(tile) * float((weights**2).sum()))
+    spectra = fft.rfft2(frames)
+    product = spectra[0] * np.conj(spectra[1])
+    product /= np.abs(product) + np.float32(_NOISE_SHARE * math.sqrt(noise[0] * noise[1])) + np.float32(1e-12)
+    surface = fft.irfft2(product, s=shape)
+    y, x = (
+        np.where(np.arange(n) < side, np.arange(n), np.arange(n) - n) for n, side in zip(shape, sizes[0], strict=True)
+    )
+    height, width = sizes.min(axis=0)
+    common = [np.minimum(s[0], v + s[1]) - np.maximum(0, v) for v, s in ((y, sizes[:, 0]), (x, sizes[:, 1]))]
+    least = [max(2.0, _LEAST_COMMON * n) for n in (height, width)]
+    aside = (np.abs(y)[:, None] > _ASIDE * height) | (np.abs(x) > _ASIDE * width)
+    broad = (common[0][:, None] > 0.5 * height) | (common[1] > 0.5 * width)
+    possible = aside & broad & (common[0][:, None] > least[0]) & (common[1] > least[1])
+    deviation = float(np.median(np.abs(surface[possible]))) / 0.6745 + 1e-12
+    surface = np.where(possible, surface / deviation, 0.0).astype(np.float32)
+    rows, columns = np.nonzero((surface == cv2.dilate(surface, np.ones((3, 3), np.uint8))) & (surface > 2.0))
+    height, at = surface[rows, columns], np.stack([x[columns], y[rows]], axis=1).astype(np.float64)
+    order = np.argsort(-height, kind="stable")
+    places = at[order[height[order] > peak_threshold(1.0, surface.size)][:_WIDE_PEAKS]]
+    boxes = [Overlap.expected(0, 1, place, sizes[:, ::-1], 1) for place in places]
+    return places, np.array([log_evidence(tiles, box, at) for at, box in zip(places, boxes, strict=True)])
+
+
+def peak_threshold(deviation: float, places: int) -> float:
+    """Height that the highest of the peaks of noise of a standard deviation hardly reaches among so many places."""
+    return deviation * math.sqrt(2.0 * math.log(places / _FALSE_ALARMS))
 
 
 def _fill(
@@ -187,7 +289,7 @@ def noise_variance(part: Image) -> float:
 
 
 @lru_cache(maxsize=64)
-def _taper(length: int) -> Image:
-    """A window that falls to 0 as a cosine at both ends."""
-    distance = (np.minimum(np.arange(length), np.arange(length)[::-1]) + 0.5) / max(1.0, _TAPER * length)
+def _taper(length: int, share: float = _TAPER) -> Image:
+    """A window that falls to 0 as a cosine at both ends, over a share of its length."""
+    distance = (np.minimum(np.arange(length), np.arange(length)[::-1]) + 0.5) / max(1.0, share * length)
     return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.minimum(distance, 1.0)), dtype=np.float32)

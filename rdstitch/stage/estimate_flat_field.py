@@ -8,6 +8,7 @@ The dark level D, which light does not multiply, is where the variance of photon
 light, becomes 0 (photon transfer). Samples that are no counts of light, as of JPEG files, show none, and D is 0.
 """
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,10 @@ from rdstitch.arrays import FloatArray
 from rdstitch.io.flat_field import FlatField
 from rdstitch.io.reduction import block_mean
 
+LEAST_TILES = 20  # fewer show one flat field as well as another
+LARGEST_ERROR = 0.01  # root mean square, by which two halves of the tiles may differ from their mean
+_PARTS = 4  # of the tiles, by which the error of the dark level is known
+_KNOWN = 3.0  # standard deviations from 0 from which on it is taken out
 _CELLS = 24  # cells along each side of a tile
 _SIDE = 512  # pixels of the longer side that are enough
 _DEGREE = 4  # degree of the polynomial that the logarithm of the illumination is
@@ -31,10 +36,11 @@ _BINS, _LEAST_BINS, _LEAST_IN_BIN = 24, 6, 16
 class Illumination:
     """The flat field that tiles show, or why they do not."""
 
-    field: FlatField | None  # None where the tiles do not show it better than by half of what it is
+    field: FlatField | None  # None where two halves of the tiles do not show the same
     error: float  # its root mean square error, by how far two halves of the tiles differ
     shading: float  # largest share of the light that is missing
     dark: FloatArray  # (C,)
+    dark_error: FloatArray  # (C,): its standard deviation; 0 where the tiles do not show it, and it is 0
 
 
 class _Statistics:
@@ -85,6 +91,8 @@ def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
 
 def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
     """Estimate the flat field and the dark level of tiles."""
+    if count < LEAST_TILES:
+        return Illumination(None, math.inf, 0.0, np.zeros(1), np.zeros(1))
     first = read(0)
     shown = _Statistics(read(index) for index in range(count))
     channels = shown.ground.shape[3]
@@ -95,23 +103,63 @@ def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Il
         for side, small, used in ((width, shown.size[1], shown.used[1]), (height, shown.size[0], shown.used[0]))
     )
     gain = np.empty((height, width, channels), dtype=np.float32)
-    dark, errors, noise = np.zeros(channels), [], []
+    dark, dark_error, errors, noise = np.zeros(channels), np.zeros(channels), [], []
     for channel in range(channels):
         ground = shown.ground[..., channel]
-        dark[channel] = _dark_level(shown.light[..., channel], shown.variance[..., channel])
+        light, variance = shown.light[..., channel], shown.variance[..., channel]
+        dark[channel] = _dark_level(light, variance)
+        dark_parts = [_dark_level(light[k::_PARTS], variance[k::_PARTS]) for k in range(_PARTS)]
+        dark_error[channel] = float(np.std(dark_parts, ddof=1)) / math.sqrt(_PARTS)
+        if dark[channel] < _KNOWN * dark_error[channel] or not all(dark_parts):
+            dark[channel] = dark_error[channel] = 0.0
         whole = _fitted(ground - dark[channel])
-        halves = [_fitted(ground[k::2] - dark[channel]) for k in (0, 1)] if count > 1 else [whole, 2.0 * whole]
+        halves = [_fitted(ground[k::2] - dark[channel]) for k in (0, 1)]
         gain[..., channel] = np.exp(_surface(whole, x, y))
         gain[..., channel] /= gain[..., channel].mean()
         cells = [np.exp(_on_cells(coefficients)) for coefficients in (whole, *halves)]
         errors.append(float(np.sqrt(((cells[1] / cells[1].mean() - cells[2] / cells[2].mean()) ** 2).mean())) / 2.0)
         noise.append(float((cells[0] / cells[0].mean()).std()))
     field = FlatField(gain, dark.astype(np.float32)[None, None])
-    good = all(error < 0.5 * spread for error, spread in zip(errors, noise, strict=True)) and bool(
-        np.isfinite(gain).all()
-    )
+    good = all(error < min(LARGEST_ERROR, 0.5 * spread) for error, spread in zip(errors, noise, strict=True))
+    good = good and bool(np.isfinite(gain).all())
     missing = float(1.0 - (gain.min(axis=(0, 1)) / gain.max(axis=(0, 1))).min())
-    return Illumination(field if good else None, max(errors), missing, dark)
+    # As for one of the halves: what both have in common, such as the form of the surface, is not seen between them.
+    return Illumination(field if good else None, math.sqrt(2.0) * max(errors), missing, dark, dark_error)
+
+
+def agrees_with_overlaps(field: FlatField, overlaps: Iterable[tuple[NDArray[Any], NDArray[Any], FloatArray]]) -> bool:
+    """Check whether the same content differs between two tiles as it should by a flat field that they did not make.
+
+    An overlap is two tiles as measured, (h, w) or (h, w, C), and the place of the second in the first.
+    """
+    measured, expected = [], []
+    for first, second, offset in overlaps:
+        x, y = np.rint(offset).astype(int).tolist()
+        (h1, w1), (h2, w2) = first.shape[:2], second.shape[:2]
+        here = np.s_[max(0, y) : min(h1, y + h2), max(0, x) : min(w1, x + w2)]
+        there = np.s_[max(0, -y) : min(h2, h1 - y), max(0, -x) : min(w2, w1 - x)]
+        parts = [
+            tile[cut].reshape(*tile[cut].shape[:2], -1) - field.dark[0, 0]
+            for tile, cut in ((first, here), (second, there))
+        ]
+        height, width = parts[0].shape[:2]
+        for rows in np.array_split(np.arange(height), max(1, round(height / h1 * _CELLS))):
+            for columns in np.array_split(np.arange(width), max(1, round(width / w1 * _CELLS))):
+                cell = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+                a, b = (part[cell].mean(axis=(0, 1)) for part in parts)
+                f, g = (field.gain[part][cell].mean(axis=(0, 1)) for part in (here, there))
+                shown = (a > 0.0) & (b > 0.0)
+                measured += np.log(a[shown] / b[shown]).tolist()
+                expected += np.log(f[shown] / g[shown]).tolist()
+    r, f = np.array(measured), np.array(expected)
+    if not len(r) or not (f**2).sum() > 0.0:
+        return False
+    weights, slope = np.ones(len(r)), 0.0
+    for _ in range(5):
+        slope = float((weights * r * f).sum() / (weights * f**2).sum())
+        off = np.abs(r - slope * f)
+        weights = 1.0 / np.maximum(off, np.median(off) + 1e-9)
+    return slope > 0.5
 
 
 def _powers() -> list[tuple[int, int]]:

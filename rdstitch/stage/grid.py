@@ -15,12 +15,13 @@ _MIN_OVERLAP = 0.3
 
 @dataclass(frozen=True)
 class TileGrid:
-    """Nominal places of tiles of one size."""
+    """Nominal places of tiles."""
 
     places: FloatArray  # (N, 2): of the first pixel of each tile, pixels; x to the right, y down
-    size: tuple[int, int]  # width and height of a tile, pixels
+    size: tuple[int, int]  # width and height of the largest tile, pixels
     pixel_size: float | None = None  # micrometres, where it is known
     source: str = ""  # where the places come from, for reports
+    own_sizes: IntArray | None = None  # (N, 2): width and height of each tile, where they differ
 
     def __post_init__(self) -> None:
         if self.places.ndim != 2 or self.places.shape[1] != 2 or not np.isfinite(self.places).all():
@@ -29,6 +30,11 @@ class TileGrid:
     def __len__(self) -> int:
         """Number of tiles."""
         return len(self.places)
+
+    @property
+    def sizes(self) -> IntArray:
+        """Width and height of each tile, (N, 2)."""
+        return np.tile(np.array(self.size, dtype=np.intp), (len(self), 1)) if self.own_sizes is None else self.own_sizes
 
     @property
     def rows(self) -> IntArray:
@@ -42,15 +48,17 @@ class TileGrid:
 
     def neighbours(self, reach: float) -> NDArray[np.intp]:
         """Pairs of tiles that overlap along a good part of a side, or come so near that they may, (M, 2)."""
-        size = np.array(self.size, dtype=np.float64)
+        sizes = self.sizes.astype(np.float64)
         order = np.argsort(self.places[:, 1], kind="stable")
         y = self.places[order, 1]
         pairs = []
         for position, first in enumerate(order.tolist()):
-            stop = int(np.searchsorted(y, y[position] + size[1] + reach))
+            stop = int(np.searchsorted(y, y[position] + sizes[first, 1] + reach))
             others = order[position + 1 : stop]
-            common = size - np.abs(self.places[others] - self.places[first])
-            near = (common > -reach / 2).all(axis=1) & (common.max(axis=1) > _MIN_OVERLAP * size.min())
+            low = np.maximum(self.places[others], self.places[first])
+            high = np.minimum(self.places[others] + sizes[others], self.places[first] + sizes[first])
+            common, least = high - low, np.minimum(sizes[others], sizes[first]).min(axis=1)
+            near = (common > -reach / 2).all(axis=1) & (common.max(axis=1) > _MIN_OVERLAP * least)
             pairs += [(min(first, k), max(first, k)) for k in others[near].tolist()]
         return np.array(sorted(pairs), dtype=np.intp).reshape(-1, 2)
 

@@ -1,5 +1,6 @@
 """Displacements of blocks to a fraction of a pixel, by Newton's method on their correlation, with their covariance."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,6 +22,7 @@ _CORRELATED = 4.0 * np.pi * _SMOOTHING**2  # pixels that share their noise after
 
 
 Transfer = Callable[[FloatArray], FloatArray]
+Gradient = list[NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,12 @@ class BlockMatches:
     def __len__(self) -> int:
         """Number of blocks."""
         return len(self.points1)
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of their mean in the worst direction, pixels: along an edge it is large."""
+        least = float(np.linalg.eigvalsh(self.information.sum(axis=0))[0]) if len(self) else 0.0
+        return 1.0 / math.sqrt(least) if least > 0.0 else math.inf
 
 
 def refine(
@@ -74,7 +82,8 @@ def _refined(
     total = float(weight.sum())
     one -= float((weight * one).sum()) / total
     deviation = np.sqrt(float((weight * one * one).sum()) / total)
-    gradient1 = _gradient(one)
+    without_light = _without_illumination(one, weight)
+    gradient1 = without_light(_gradient(one))
     shift = np.zeros(2)
     for _ in range(_ITERATIONS):
         x, y = (maps[..., k] - np.float32(shift[k]) for k in (0, 1))
@@ -85,7 +94,7 @@ def _refined(
         if not min(spread, deviation) > 0.0:
             return None
         two *= np.float32(deviation / spread)
-        gradient2 = _gradient(two)
+        gradient2 = without_light(_gradient(two))
         mean = [(a + b) * np.float32(0.5) * weight for a, b in zip(gradient1, gradient2, strict=True)]
         # The gradients of both images in one product: noise, which they do not share, is not taken for structure.
         hessian = np.array([[float((weight * a * b).sum()) for b in gradient2] for a in gradient1])
@@ -125,10 +134,29 @@ def _smooth(tile: NDArray[Any], low: IntArray, high: IntArray) -> NDArray[np.flo
     return np.asarray(cv2.GaussianBlur(part, (0, 0), _SMOOTHING, borderType=cv2.BORDER_REFLECT), dtype=np.float32)
 
 
-def _gradient(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+def _gradient(image: NDArray[np.float32]) -> Gradient:
     """Derivatives by x and y, central differences."""
     kernel = np.array([[-0.5, 0.0, 0.5]], dtype=np.float32)
     return [np.asarray(cv2.filter2D(image, -1, k), dtype=np.float32) for k in (kernel, kernel.T)]
+
+
+def _without_illumination(image: NDArray[np.float32], weight: NDArray[np.float32]) -> Callable[[Gradient], Gradient]:
+    """What is left of a gradient without what a change of illumination over a block may look like.
+
+    That is a ramp in front of the image, or one that multiplies it: neighbours have their overlap on opposite sides.
+    """
+    height, width = image.shape
+    x = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None]
+    y = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
+    ramps = [np.ones_like(image), x + 0.0 * image, y + 0.0 * image]
+    basis = np.stack([*ramps, *(ramp * image for ramp in ramps)]).reshape(6, -1)
+    weighted = basis * weight.ravel()
+    inverse = np.linalg.pinv((weighted @ basis.T).astype(np.float64)).astype(np.float32)
+
+    def project(gradient: Gradient) -> Gradient:
+        return [part - ((inverse @ (weighted @ part.ravel())) @ basis).reshape(part.shape) for part in gradient]
+
+    return project
 
 
 def _window(height: int, width: int) -> NDArray[np.float32]:
@@ -141,7 +169,7 @@ def _window(height: int, width: int) -> NDArray[np.float32]:
     return np.asarray(side(height)[:, None] * side(width), dtype=np.float32)
 
 
-def _centroid(gradients: list[NDArray[np.float32]]) -> FloatArray:
+def _centroid(gradients: Gradient) -> FloatArray:
     """Middle of what has structure, (x, y)."""
     energy = gradients[0] ** 2 + gradients[1] ** 2
     columns, rows = energy.sum(axis=0, dtype=np.float64), energy.sum(axis=1, dtype=np.float64)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -11,9 +11,16 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.io.reduction import block_mean
 from rdstitch.stage.adjustment import Adjustment, LinkedPoints, adjust
-from rdstitch.stage.correlation import Overlap, Surfaces, best_place, correlate
+from rdstitch.stage.correlation import (
+    CoarseTile,
+    Overlap,
+    coarse_tile,
+    correlate,
+    log_evidence,
+    peak_threshold,
+    wide_peaks,
+)
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.refinement import BlockMatches, Transfer, refine
 from rdstitch.system.late_imports import csgraph, sparse
@@ -22,18 +29,29 @@ from rdstitch.system.progress import Progress, silent
 Reader = Callable[[int], NDArray[Any]]
 """Gives a tile as it is registered, (h, w)."""
 
-_COARSE_SIDE = 512  # pixels of the longer side of a tile that are enough to find a displacement to a pixel of theirs
+_Tile = TypeVar("_Tile")
+
+COARSE_SIDE = 512  # pixels of the longer side of a tile that are enough to find a displacement to a pixel of theirs
 # displacement from the nominal place that is searched where the user does not say, share of the longer side
 _SEARCH = 0.05
 # largest displacement of an overlap's blocks against each other that the lens may add, share of the longer side
 _LENS_REACH = 0.02
 _LENSES = np.linspace(-0.04, 0.04, 21)  # values of λ that are tried before it is estimated
-_FALSE_ALARMS = 1e-4  # chance that the highest of all peaks of noise is taken for an overlap
-_LARGEST_REACH = 4.0  # standard deviations of the stage within which a peak of little height is looked for
+_NARROW = 2  # pixels about where others say that a pair is: peaks are kept that rise above the noise of so few
 _CANDIDATES = 12  # highest peaks of a pair that are compared by normalized cross-correlation
 _AGREES = 0.25  # weight of a pair from which on it holds its tiles
-_PROBED = 16  # pairs by which the axes of the stage are found
 _LEAST_BLOCK = 0.02  # overlap that is compared at least, share of the longer side
+_POOR = 6.0  # nats below which a pair is looked for elsewhere: a correlation of about 0.6
+_RIVAL = 4.6  # nats from which on a place is possible that the whitened correlation does not show: a hundred to one
+_SHOWS = 0.5  # share of the variance of a tile that must be content to look for it elsewhere
+_SURE = 0.99  # probability that one place of a pair must have among all that are possible
+_ASTRAY = 1e-4  # probability that a tile is anywhere but where its stage was sent, within its errors
+_LARGEST_STD = 1.0  # coarse pixels
+_ROUNDS = 4  # by which what is certain of the stage decides about what was not
+# λ is taken where pairs along rows and pairs along columns show it by so many standard deviations each
+_LENS_SHOWN = 5.0
+_LENS_AGREES = 0.25  # and where the two differ by no more than so much of it, beyond chance
+_WHOLE_PIXEL = 0.5  # and where corners move farther than by leaving whole pixels
 
 
 @dataclass(frozen=True)
@@ -47,6 +65,35 @@ class TileRegistration:
     # (N,), bool: tiles that links hold; the others have the place that the model of the stage gives them
     linked: BoolArray
     groups: tuple[tuple[int, ...], ...]  # tiles that links hold together, the largest group first
+    search: float  # how far neighbours were looked for, pixels
+    z: int | Literal["max"] | None = None  # z, time: plane and time of the files that were read, where they were chosen
+    time: int | None = None
+
+    @property
+    def stds(self) -> FloatArray:
+        """Standard deviation of each tile's place against the largest group, in x and in y, pixels (N,)."""
+        group = self.groups[0] if self.groups else range(len(self.grid))
+        return self.adjustment.stds(np.array(group))
+
+    @property
+    def off_stage(self) -> FloatArray:
+        """How far each tile is from where the model of the stage has it, pixels (N,)."""
+        return np.asarray(np.linalg.norm(self.adjustment.off_stage, axis=1))
+
+    @property
+    def mostly_nominal(self) -> bool:
+        """Whether more tiles have their places from the stage alone than from what they show."""
+        return 2 * int(self.linked.sum()) < len(self.grid)
+
+
+def search_radius(grid: TileGrid, search: float | None) -> float:
+    """How far neighbours may be off, pixels."""
+    return _SEARCH * max(grid.size) if search is None else search
+
+
+def coarse_factor(grid: TileGrid) -> int:
+    """By how much tiles are made smaller to be looked for."""
+    return max(1, round(max(grid.size) / COARSE_SIDE))
 
 
 def register_tiles(
@@ -54,100 +101,261 @@ def register_tiles(
     read: Reader,
     *,
     search: float | None = None,
-    distortion: float | None = None,
+    distortion: float | Literal["auto"] | None = None,
     progress: Progress = silent,
 ) -> TileRegistration:
-    """Find the places of all tiles; ``search`` is how far neighbours may be off, pixels."""
-    side = max(grid.size)
-    search = _SEARCH * side if search is None else search
+    """Find the places of all tiles; ``search`` is how far neighbours may be off, pixels.
+
+    ``distortion`` is λ where it is known, "auto" where it is to be estimated; otherwise it is 0 unless pairs along rows
+    and pairs along columns show the same.
+    """
+    search, factor = search_radius(grid, search), coarse_factor(grid)
     pairs = grid.neighbours(search)
-    factor = max(1, round(side / _COARSE_SIDE))
-    radius, spare = max(2, math.ceil(search / factor)), math.ceil(_LENS_REACH * side / factor)
-    least = math.ceil(_LEAST_BLOCK * side)
-
-    def expected(pair: IntArray, places: FloatArray, scale: int) -> Overlap:
-        size = -(-grid.size[0] // scale), -(-grid.size[1] // scale)
-        first, second = pair.tolist()
-        return Overlap.expected(first, second, (places[second] - places[first]) / scale, size, least // scale)
-
-    overlaps = [expected(pair, grid.places, factor) for pair in pairs]
-    surfaces: list[Surfaces] = []
-    for number, (one, two) in enumerate(_in_pairs(lambda k: _coarse(read(k), factor), pairs)):
-        surfaces.append(correlate(one, two, overlaps[number], radius + spare))
-        progress("correlating", number + 1, len(pairs))
-    coarse = Camera((-(-grid.size[0] // factor), -(-grid.size[1] // factor)))
-    known = _best_lens(surfaces, overlaps, coarse, radius) if distortion is None else distortion
-    lens, coarse = Camera(grid.size, known), coarse.with_coefficients(known)
-    peaks = [_peaks(s, o, _shifts(o, coarse), radius) for s, o in zip(surfaces, overlaps, strict=True)]
-    rough = _adjusted(grid, pairs, peaks, factor, search, known)
-    # Again, nearer to where the stage as it has shown itself puts them.
-    near = rough.places
-    std = max(rough.stage.std, factor / 2.0)
-    window = max(2, min(radius, math.ceil(_LARGEST_REACH * math.sqrt(2.0) * std / factor)))
-    peaks = [
-        _peaks(s, o, _shifts(o, coarse), radius, ((near[p[1]] - near[p[0]]) / factor - o.offset, window)) + others
-        for s, o, p, others in zip(surfaces, overlaps, pairs, peaks, strict=True)
-    ]
-    peaks = [list({tuple(peak): peak for peak in of_pair}.values()) for of_pair in peaks]
-    shown = [k for k, of_pair in enumerate(peaks) if of_pair]
-    if not shown:
-        return _result(grid, pairs, [], rough)
+    known = distortion if isinstance(distortion, float | int) else None
+    finder = _PairFinder(grid, pairs, factor, search)
+    candidates, lens = finder.candidates(read, known, progress)
+    chosen, rough = _chosen(grid, pairs, candidates, factor, search, lens)
+    if not chosen:
+        return _result(grid, pairs, _links(pairs, {}), rough, search)
     matches: dict[int, BlockMatches] = {}
-    for number, (one, two) in enumerate(_in_pairs(read, pairs[shown])):
-        pair, overlap = pairs[shown[number]], overlaps[shown[number]]
-        # Whitened spectra weigh all frequencies alike: of a repeated pattern a wrong period may be the highest peak.
-        small = _coarse(one, factor), _coarse(two, factor)
-        offset = factor * best_place(*small, overlap, _shifts(overlap, coarse), peaks[shown[number]])
-        overlap = expected(pair, _moved(grid.places, pair, offset), 1)
+    camera = Camera(grid.size, lens)
+    numbers = sorted(chosen)
+    for count, (one, two) in enumerate(_in_pairs(read, pairs[numbers])):
+        number = numbers[count]
+        offset = chosen[number]
+        overlap = finder.overlap(number, offset, 1)
         for cells in (overlap.cells(grid.size), overlap.whole):
             cut = replace(overlap, blocks=cells)
-            refined = refine(one, two, cells, _transfer(cut, offset, lens), factor + 1.5)
-            if len(refined):
-                matches[shown[number]] = refined
+            refined = refine(one, two, cells, _transfer(cut, offset, camera), factor + 1.5)
+            # What is less sure than the coarse place was not found by looking around that.
+            if refined.std < _LARGEST_STD * factor:
+                matches[number] = refined
                 break
-        progress("refining", number + 1, len(shown))
-    if not matches:
-        return _result(grid, pairs, [], rough)
+        progress("refining", count + 1, len(chosen))
     links = _links(pairs, matches)
+    return _result(grid, pairs, links, _with_lens(grid, links, search / 3.0, lens, distortion), search)
+
+
+def _with_lens(
+    grid: TileGrid, links: LinkedPoints, std: float, lens: float, wanted: float | Literal["auto"] | None
+) -> Adjustment:
+    """All places, with λ where it is asked for, or where it is there."""
+    if isinstance(wanted, float | int):
+        return adjust(grid, links, std, float(wanted))
+    straight = adjust(grid, links, std)
+    if not len(links.pair) or grid.own_sizes is not None:
+        return straight
+    bent = adjust(grid, links, std, lens, free_lens=True)
+    better = straight.cost(bent.noise) - bent.cost(bent.noise) > math.log(max(2, len(links.pair)))
+    moved = abs(bent.distortion) * math.hypot(*grid.size) / 2.0
+    if wanted == "auto" or (better and moved > _WHOLE_PIXEL and _lens_is_there(grid, links, std, bent.distortion)):
+        return bent
+    return replace(straight, distortion_std=max(bent.distortion_std, abs(bent.distortion)))
+
+
+def _lens_is_there(grid: TileGrid, links: LinkedPoints, std: float, lens: float) -> bool:
+    """Check whether pairs along rows and pairs along columns show the same λ: what else bends tiles does not."""
+    off = np.abs(grid.places[links.tiles[:, 1]] - grid.places[links.tiles[:, 0]])
+    shown = []
+    for along in (off[:, 0] > off[:, 1], off[:, 0] <= off[:, 1]):
+        part = links.of_pairs(along)
+        if not len(part.pair):
+            return False
+        fitted = adjust(grid, part, std, lens, free_lens=True)
+        shown.append((fitted.distortion, fitted.distortion_std))
+    (a, a_std), (b, b_std) = shown
+    apart = abs(a - b) <= max(_LENS_AGREES * abs(a + b) / 2.0, 3.0 * math.hypot(a_std, b_std))
+    return apart and a * b > 0.0 and all(abs(value) > _LENS_SHOWN * deviation for value, deviation in shown)
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """Where the second tile of a pair may be in the first."""
+
+    offsets: FloatArray  # (K, 2), pixels
+    nats: FloatArray  # (K,): evidence for each, see :func:`log_evidence`
+    grain: float  # pixels within which two of them are one
+
+
+class _PairFinder:
+    """Looks for the second tile of each pair in the first, on coarse tiles."""
+
+    def __init__(self, grid: TileGrid, pairs: IntArray, factor: int, search: float) -> None:
+        self.grid, self.pairs, self.factor = grid, pairs, factor
+        side = max(grid.size)
+        self.radius = max(2, math.ceil(search / factor))
+        self.spare = math.ceil(_LENS_REACH * side / factor)
+        self.least = math.ceil(_LEAST_BLOCK * side)
+        self.sizes = grid.sizes
+        self.coarse = Camera((-(-grid.size[0] // factor), -(-grid.size[1] // factor)))
+
+    def overlap(self, number: int, offset: FloatArray | None = None, scale: int | None = None) -> Overlap:
+        """What the tiles of a pair have in common with the second at an offset, by default where the grid has it."""
+        scale = scale or self.factor
+        first, second = self.pairs[number].tolist()
+        if offset is None:
+            offset = self.grid.places[second] - self.grid.places[first]
+        sizes = -(-self.sizes[[first, second]] // scale)
+        return Overlap.expected(first, second, offset / scale, sizes, self.least // scale)
+
+    def candidates(self, read: Reader, known: float | None, progress: Progress) -> tuple[list[_Candidates], float]:
+        """Candidates of all pairs, and the λ by which they were found; where that is unknown, twice if need be."""
+        heights = np.zeros((2, len(_LENSES)))
+        lens = known or 0.0
+        found = self._each(read, lens, progress, heights if known is None and self.grid.own_sizes is None else None)
+        middle = len(_LENSES) // 2
+        best = int(heights.sum(axis=0).argmax())
+        if best != middle and (heights[:, best] > heights[:, middle]).all():
+            lens = float(_LENSES[best])
+            found = self._each(read, lens, progress, None)
+        return found, lens
+
+    def _each(self, read: Reader, lens: float, progress: Progress, heights: FloatArray | None) -> list[_Candidates]:
+        found = []
+        pairs = _in_pairs(lambda index: coarse_tile(read(index), self.factor), self.pairs)
+        for number, tiles in enumerate(pairs):
+            found.append(self._of_pair(number, tiles, self.coarse.with_coefficients(lens), heights))
+            progress("correlating", number + 1, len(self.pairs))
+        return found
+
+    def _of_pair(
+        self, number: int, tiles: tuple[CoarseTile, CoarseTile], lens: Camera, heights: FloatArray | None
+    ) -> _Candidates:
+        overlap = self.overlap(number)
+        surface = correlate(tiles[0].pixels, tiles[1].pixels, overlap, self.radius + self.spare)
+        total = surface.total(_shifts(overlap, lens), self.radius)
+        if heights is not None:
+            tops = [
+                surface.total(_shifts(overlap, self.coarse.with_coefficients(v)), self.radius).max() for v in _LENSES
+            ]
+            if max(tops) > _threshold(total, self.radius):
+                heights[int(np.abs(overlap.offset).argmax())] += tops
+        inner = slice(self.spare, self.spare + 2 * self.radius + 1)
+        plain = surface.plain[inner, inner].astype(np.float64)
+        likely = [_vertex(total, *at) for at in _maxima(total, _threshold(total, _NARROW))]
+        # Of a repeated pattern all places are alike, whichever of them a whitened correlation makes higher.
+        others = [_vertex(plain, *at) for at in _maxima(plain, 0.0)]
+        grain = min(tile.grain for tile in tiles)
+        others = [at for at in others if all(np.abs(at - other).max() > grain for other in likely)]
+        offsets: list[FloatArray] = []
+        nats: list[float] = []
+        for at in (*likely, *others):
+            offset = overlap.offset + at - self.radius
+            there = self.overlap(number, offset * self.factor)
+            value = log_evidence(tiles, there, offset, _shifts(there, lens))
+            if len(offsets) < len(likely) or value > _RIVAL:
+                offsets.append(offset)
+                nats.append(value)
+        if max(nats, default=0.0) < _POOR and min(tile.content_share for tile in tiles) > _SHOWS:
+            places, values = wide_peaks(tiles)
+            offsets, nats = [*offsets, *places], [*nats, *values.tolist()]
+        return _Candidates(self.factor * np.array(offsets).reshape(-1, 2), np.array(nats), self.factor * grain)
+
+
+def _maxima(surface: FloatArray, threshold: float) -> list[tuple[int, int]]:
+    """Columns and rows of the highest peaks above a threshold, the highest first."""
+    y, x = np.nonzero((surface == cv2.dilate(surface, np.ones((3, 3)))) & (surface > threshold))
+    order = np.argsort(-surface[y, x], kind="stable")[:_CANDIDATES]
+    return [(int(x[k]), int(y[k])) for k in order]
+
+
+def _vertex(surface: FloatArray, x: int, y: int) -> FloatArray:
+    """Place of a peak to a fraction of a pixel, by a parabola through its neighbours along each axis."""
+    place = np.array([x, y], dtype=np.float64)
+    for axis, (line, k) in enumerate(((surface[y], x), (surface[:, x], y))):
+        if 0 < k < len(line) - 1:
+            before, at, after = line[k - 1 : k + 2]
+            place[axis] += 0.5 * (before - after) / min(before + after - 2.0 * at, -1e-9)
+    return place
+
+
+def _chosen(
+    grid: TileGrid, pairs: IntArray, candidates: Sequence[_Candidates], factor: int, search: float, lens: float
+) -> tuple[dict[int, FloatArray], Adjustment]:
+    """Where the second tile of a pair is in the first, by pair, where one place stands out; and all places by that.
+
+    What is certain teaches what the stage does, and that decides among the places of the other pairs.
+    """
+    chosen: dict[int, FloatArray] = {}
     std = search / 3.0
-    fitted = adjust(grid, links, std, 0.0 if distortion is None else distortion)
-    if distortion is None:
-        bent = adjust(grid, links, std, known, free_lens=True)
-        if fitted.cost(bent.noise) - bent.cost(bent.noise) > math.log(max(2, len(links.pair))):
-            fitted = bent
-        else:
-            fitted = replace(fitted, distortion_std=bent.distortion_std)
-    return _result(grid, pairs, links, fitted)
+    fitted = adjust(grid, _links(pairs, {}), std, lens)
+    outside = math.log(float(np.prod(grid.size)))
+    for count in range(_ROUNDS):
+        before = dict(chosen)
+        doubted = {number for number, weight in zip(chosen, fitted.weights, strict=True) if weight < _AGREES}
+        for number, of_pair in enumerate(candidates):
+            if not len(of_pair.nats) or (number in chosen and number not in doubted):
+                continue
+            expected, covariance = fitted.between(pairs[number])
+            covariance = covariance + np.eye(2) * (factor / 2.0) ** 2
+            off = of_pair.offsets - expected
+            log_prior = -0.5 * np.einsum("ki,ij,kj->k", off, np.linalg.inv(covariance), off) - 0.5 * math.log(
+                (2.0 * math.pi) ** 2 * float(np.linalg.det(covariance))
+            )
+            score = of_pair.nats + np.logaddexp(log_prior, math.log(_ASTRAY) - outside)
+            best = int(score.argmax())
+            # Nothing of what was found may be right, either.
+            apart = np.abs(of_pair.offsets - of_pair.offsets[best]).max(axis=1) > of_pair.grain
+            others = np.append(score[apart], -outside)
+            chosen.pop(number, None)
+            sure = score[best] - np.logaddexp.reduce(others) > math.log(_SURE / (1.0 - _SURE))
+            # What is likely wherever the stage is goes first, and what is so only near where it should be second.
+            if sure and (count > 0 or of_pair.nats[best] > _RIVAL):
+                chosen[number] = of_pair.offsets[best]
+        chosen.update(_moved_tiles(pairs, candidates, fitted, chosen, search))
+        chosen = dict(sorted(chosen.items()))
+        if count > 0 and {k: v.tolist() for k, v in chosen.items()} == {k: v.tolist() for k, v in before.items()}:
+            break
+        fitted = adjust(grid, _coarse_links(grid, pairs, chosen, factor), std, lens)
+    return chosen, fitted
 
 
-def evidence(grid: TileGrid, *, read: Reader, search: float | None = None) -> float:
-    """Measure how clearly some neighbours correlate where the grid has them, in heights of peaks above noise."""
-    side = max(grid.size)
-    search = _SEARCH * side if search is None else search
-    pairs = grid.neighbours(search)
-    if not len(pairs):
-        return 0.0
-    pairs = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _PROBED)).astype(np.intp))]
-    factor = max(1, round(side / _COARSE_SIDE))
-    radius = max(2, math.ceil(search / factor))
-    size = -(-grid.size[0] // factor), -(-grid.size[1] // factor)
-    shown = 0.0
-    for pair, (one, two) in zip(pairs, _in_pairs(lambda k: _coarse(read(k), factor), pairs), strict=True):
-        offset = (grid.places[pair[1]] - grid.places[pair[0]]) / factor
-        overlap = Overlap.expected(int(pair[0]), int(pair[1]), offset, size, math.ceil(_LEAST_BLOCK * max(size)))
-        total = correlate(one, two, overlap, radius).total(np.zeros((len(overlap.blocks), 2)), radius)
-        shown += max(0.0, float(total.max()) - _threshold(total, radius))
-    return shown
+def _moved_tiles(
+    pairs: IntArray, candidates: Sequence[_Candidates], fitted: Adjustment, chosen: dict[int, FloatArray], search: float
+) -> dict[int, FloatArray]:
+    """Places of pairs of tiles that are somewhere else, where nothing was chosen for any of a tile's pairs.
+
+    No pair alone can say that a tile is far from where its stage was sent, but all of them together.
+    """
+    of_tile: dict[int, list[int]] = {}
+    for number, pair in enumerate(pairs.tolist()):
+        for tile in pair:
+            of_tile.setdefault(tile, []).append(number)
+    found: dict[int, FloatArray] = {}
+    for tile, numbers in of_tile.items():
+        if any(number in chosen or number in found for number in numbers):
+            continue
+        moves, nats, owner, index = [], [], [], []
+        for number in numbers:
+            expected, _ = fitted.between(pairs[number])
+            sign = 1.0 if pairs[number][1] == tile else -1.0
+            for k, value in enumerate(candidates[number].nats.tolist()):
+                moves.append(sign * (candidates[number].offsets[k] - expected))
+                nats.append(value)
+                owner.append(number)
+                index.append(k)
+        if len(set(owner)) < 2:
+            continue
+        near = np.abs(np.array(moves)[:, None] - np.array(moves)).max(axis=2) <= search
+        strongest = [
+            {
+                n: max((nats[k], k) for k in np.flatnonzero(row) if owner[k] == n)
+                for n in {owner[k] for k in np.flatnonzero(row)}
+            }
+            for row in near
+        ]
+        sums = np.array([sum(value for value, _ in of_pair.values()) for of_pair in strongest])
+        best = int(sums.argmax())
+        rival = sums[~near[best]].max(initial=0.0)
+        if len(strongest[best]) > 1 and sums[best] - rival > math.log(_SURE / (1.0 - _SURE) / _ASTRAY):
+            found.update({n: candidates[n].offsets[index[k]] for n, (_, k) in strongest[best].items()})
+    return found
 
 
-def _coarse(tile: NDArray[Any], factor: int) -> NDArray[np.float32]:
-    return np.asarray(block_mean(tile, factor), dtype=np.float32)
-
-
-def _in_pairs(read: Reader, pairs: IntArray) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+def _in_pairs(read: Callable[[int], _Tile], pairs: IntArray) -> Iterator[tuple[_Tile, _Tile]]:
     """The tiles of each pair; each is read when it is first needed, and kept until its last pair has been."""
     last = {int(tile): number for number, pair in enumerate(pairs) for tile in pair}
-    held: dict[int, NDArray[Any]] = {}
+    held: dict[int, _Tile] = {}
     for number, pair in enumerate(pairs.tolist()):
         for tile in pair:
             if tile not in held:
@@ -175,70 +383,20 @@ def _transfer(overlap: Overlap, offset: FloatArray, camera: Camera) -> Transfer:
     return lambda points: camera.distort(camera.undistort(points) - between)
 
 
-def _best_lens(surfaces: Sequence[Surfaces], overlaps: Sequence[Overlap], camera: Camera, radius: int) -> float:
-    """λ for which the blocks of all pairs agree best."""
-    heights = np.zeros(len(_LENSES))
-    lenses = [camera.with_coefficients(value) for value in _LENSES]
-    for surface, overlap in zip(surfaces, overlaps, strict=True):
-        tops = np.array([surface.total(_shifts(overlap, lens), radius).max() for lens in lenses])
-        if tops.max() > _threshold(surface.total(np.zeros((len(overlap.blocks), 2)), radius), radius):
-            heights += tops
-    return 0.0 if heights.max() <= heights[len(_LENSES) // 2] else float(_LENSES[int(heights.argmax())])
-
-
 def _threshold(total: FloatArray, radius: int) -> float:
     """Height that a peak of noise hardly reaches within a window."""
     deviation = float(np.median(np.abs(total))) / 0.6745
-    return deviation * math.sqrt(2.0 * math.log((2 * radius + 1) ** 2 / _FALSE_ALARMS))
+    return peak_threshold(deviation, (2 * radius + 1) ** 2)
 
 
-def _peaks(
-    surface: Surfaces,
-    overlap: Overlap,
-    shifts: FloatArray,
-    radius: int,
-    near: tuple[FloatArray, int] | None = None,
-) -> list[FloatArray]:
-    """Places of the second tile in the first, coarse pixels, at peaks of which the first, the highest, is no noise.
-
-    Near an expected displacement, if that is given with a window.
-    """
-    total = surface.total(shifts, radius)
-    middle, window = (np.zeros(2), radius) if near is None else near
-    low = np.clip(np.rint(middle).astype(int) - window + radius, 0, 2 * radius)
-    high = np.clip(np.rint(middle).astype(int) + window + radius + 1, 1, 2 * radius + 1)
-    part = total[low[1] : high[1], low[0] : high[0]]
-    if part.max() < _threshold(total, window):
-        return []
-    y, x = np.nonzero(part == cv2.dilate(part, np.ones((3, 3), dtype=np.uint8)))
-    order = np.argsort(-part[y, x], kind="stable")[:_CANDIDATES]
-    return [overlap.offset + low + (x[k], y[k]) - radius for k in order]
-
-
-def _moved(places: FloatArray, pair: IntArray, offset: FloatArray) -> FloatArray:
-    """The places with the second tile of a pair at an offset in the first."""
-    moved = places.copy()
-    moved[pair[1]] = moved[pair[0]] + offset
-    return moved
-
-
-def _adjusted(
-    grid: TileGrid,
-    pairs: IntArray,
-    peaks: Sequence[Sequence[FloatArray]],
-    factor: int,
-    search: float,
-    distortion: float,
-) -> Adjustment:
-    """Places by the highest peaks alone."""
+def _coarse_links(grid: TileGrid, pairs: IntArray, chosen: dict[int, FloatArray], factor: int) -> LinkedPoints:
+    """Matches of whole overlaps, as exact as coarse tiles show them."""
     matches = {}
-    for number, highest in enumerate(peaks):
-        if highest:
-            offset = highest[0] * factor
-            middle = (np.array(grid.size) - 1.0 + offset) / 2.0
-            information = np.eye(2)[None] / (factor / 2.0) ** 2
-            matches[number] = BlockMatches(middle[None], (middle - offset)[None], information)
-    return adjust(grid, _links(pairs, matches), search / 3.0, distortion)
+    for number, offset in chosen.items():
+        middle = (np.array(grid.size) - 1.0 + offset) / 2.0
+        information = np.eye(2)[None] / (factor / 2.0) ** 2
+        matches[number] = BlockMatches(middle[None], (middle - offset)[None], information)
+    return _links(pairs, matches)
 
 
 def _links(pairs: IntArray, matches: dict[int, BlockMatches]) -> LinkedPoints:
@@ -257,30 +415,39 @@ def _links(pairs: IntArray, matches: dict[int, BlockMatches]) -> LinkedPoints:
     )
 
 
-def _result(grid: TileGrid, pairs: IntArray, links: Any, fitted: Adjustment) -> TileRegistration:
-    links = links or _links(pairs, {})
+def _result(
+    grid: TileGrid, pairs: IntArray, links: LinkedPoints, fitted: Adjustment, search: float
+) -> TileRegistration:
     held = links.tiles[fitted.weights[: len(links.tiles)] > _AGREES]
     joined = sparse.coo_matrix((np.ones(len(held)), held.T), shape=(len(grid),) * 2)
     count, label = csgraph.connected_components(joined, directed=False)
     groups = [np.flatnonzero(label == k) for k in range(count)]
     groups = sorted((group for group in groups if len(group) > 1), key=len, reverse=True)
     linked = np.isin(np.arange(len(grid)), held)
-    return TileRegistration(grid, fitted, links, pairs, linked, tuple(tuple(g.tolist()) for g in groups))
+    return TileRegistration(grid, fitted, links, pairs, linked, tuple(tuple(g.tolist()) for g in groups), search)
 
 
 def places_table(names: Sequence[str], tiled: TileRegistration) -> str:
     """CSV of name, x and y of the first pixel, row, column, what placed it, and micrometres where they are known."""
     grid, fitted = tiled.grid, tiled.adjustment
     places = fitted.places - fitted.places.min(axis=0)
-    header = ["name", "x", "y", "row", "column", "placed_by"]
+    header = ["name", "x", "y", "std", "row", "column", "placed_by"]
     if grid.pixel_size is not None:
         header += ["x_um", "y_um"]
-    lines = [",".join(header)]
+    lines, stds = [",".join(header)], tiled.stds
     for index, name in enumerate(names):
         x, y = places[index].tolist()
         by = "overlap" if tiled.linked[index] else "stage"
         quoted = f'"{name}"' if "," in name else name
-        cells = [quoted, f"{x:.3f}", f"{y:.3f}", str(grid.rows[index]), str(grid.columns[index]), by]
+        cells = [
+            quoted,
+            f"{x:.3f}",
+            f"{y:.3f}",
+            f"{stds[index]:.3f}",
+            str(grid.rows[index]),
+            str(grid.columns[index]),
+            by,
+        ]
         if grid.pixel_size is not None:
             cells += [f"{x * grid.pixel_size:.4f}", f"{y * grid.pixel_size:.4f}"]
         lines.append(",".join(cells))

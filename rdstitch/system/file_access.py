@@ -122,7 +122,7 @@ def _filesystem(path: str | Path) -> tuple[Any, str]:
     try:
         core = import_module("fsspec.core")
     except ImportError:
-        raise OSError("URLs need the extra remote: pip install 'rdstitch[remote]'") from None
+        raise OSError("URLs need fsspec: pip install 'fsspec[http]'") from None
     system, name = core.url_to_fs(url_of(path))
     return system, name
 
@@ -164,14 +164,20 @@ def open_regular(path: str | Path) -> BufferedReader:
 
 def read_limited(path: str | Path, most: int, *, regular: bool = True) -> bytes:
     """The content of a file of at most so many bytes; of a regular one, unless pipes are allowed."""
-    left, blocks = most + 1, []
+    content = read_beginning(path, most + 1, regular=regular)
+    if len(content) > most:
+        raise OSError(errno.EFBIG, "too large to be such a file", str(path))
+    return content
+
+
+def read_beginning(path: str | Path, most: int, *, regular: bool = True) -> bytes:
+    """As much of a file, but no more, however large it is."""
+    blocks = []
     with open_regular(path) if regular else Path(path).open("rb") as stream:
         # What a stream is asked for is allocated, however small the file.
-        while left > 0 and (block := stream.read(min(left, _READ_AT_ONCE))):
-            left -= len(block)
+        while most > 0 and (block := stream.read(min(most, _READ_AT_ONCE))):
+            most -= len(block)
             blocks.append(block)
-    if left <= 0:
-        raise OSError(errno.EFBIG, "too large to be such a file", str(path))
     return b"".join(blocks)
 
 

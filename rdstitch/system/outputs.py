@@ -9,6 +9,7 @@ reader sees that the older sidecar is of another image.
 import hashlib
 import json
 import os
+import platform
 import re
 import shutil
 import sys
@@ -29,7 +30,7 @@ from rdstitch.system.file_access import local_file
 if sys.platform != "win32":
     import fcntl
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi", ".zarr")
 _LEVEL_NAME, _TILE_NAME = re.compile(r"[0-9]{1,2}"), re.compile(r"[0-9]+_[0-9]+\.jpg")
 _LOCK = "lock"
 
@@ -41,29 +42,43 @@ def check_output(
     suffixes: Iterable[str] = IMAGE_SUFFIXES,
 ) -> Path:
     """Find out before long work whether a file can be written, over none of the inputs; nothing is created."""
+    file = check_suffix(path, suffixes)
+    check_outputs([file], overwrite, inputs)
+    return file
+
+
+def check_suffix(path: str | Path, suffixes: Iterable[str] = IMAGE_SUFFIXES) -> Path:
+    """Refuse an output whose name does not say what it shall be; without suffixes any name will do."""
     file, known = Path(path), tuple(suffixes)
     if known and file.suffix.lower() not in known:
         what = f"unknown file type '{file.suffix}'" if file.suffix else "no file type in the name"
         raise OutputError(f"{file}: {what}; use one of {' '.join(known)}")
-    try:
-        with naming(file):
-            _check_place(file, overwrite, inputs)
-    except ValueError as error:
-        raise OutputError(f"{file}: cannot be written: {error}") from error
     return file
 
 
-def check_outputs(paths: Sequence[Path], overwrite: bool, inputs: Iterable[str | Path]) -> None:
-    """Find out of many files what :func:`check_output` does of one, in a time linear in their number."""
+def check_outputs(paths: Sequence[Path], overwrite: bool, inputs: Iterable[str | Path] = ()) -> None:
+    """Find out before long work whether all outputs of a run can be written: each once, and over none of the inputs."""
+    seen: set[tuple[str, str]] = set()
+    for file in paths:
+        place = os.path.realpath(file.parent), file.name
+        if place in seen:
+            raise OutputError(f"{file}: is the name of two outputs; choose another one for each")
+        seen.add(place)
     check_not_read(paths, inputs)
-    for path in paths:
-        check_output(path, overwrite)
+    for file in paths:
+        try:
+            with naming(file):
+                _check_place(file, overwrite)
+        except ValueError as error:
+            raise OutputError(f"{file}: cannot be written: {error}") from error
 
 
-def _check_place(file: Path, overwrite: bool, inputs: Iterable[str | Path]) -> None:
-    """The part of :func:`check_output` that needs the file system."""
+def _check_place(file: Path, overwrite: bool) -> None:
+    """What the file system says of one output."""
     folder = file.parent
-    if file.is_dir():
+    if is_zarr(file):
+        check_zarr_folder(file, overwrite)
+    elif file.is_dir():
         raise OutputError(f"{file}: is a folder; name a file in it")
     if not folder.is_dir():
         raise OutputError(f"{file}: the folder {folder} does not exist; create it first")
@@ -71,8 +86,7 @@ def _check_place(file: Path, overwrite: bool, inputs: Iterable[str | Path]) -> N
         check_tiles_folder(tiles_folder(Path(os.path.realpath(file))), overwrite)
     if file.is_symlink() and not file.exists():
         raise OutputError(f"{file}: is a link to nothing; remove it, or choose another name")
-    if file.exists():
-        check_not_read([file], inputs)
+    if file.exists() and not is_zarr(file):
         if not overwrite:
             raise OutputError(f"{file}: exists already; choose another name or use --overwrite")
         # A link stays, and what it leads to is replaced.
@@ -87,16 +101,6 @@ def check_not_read(files: Iterable[Path], inputs: Iterable[str | Path]) -> None:
     for file in files:
         if _identity(file) in read:
             raise OutputError(f"{file}: is read as input; choose another name")
-
-
-def check_distinct(paths: Iterable[str | Path]) -> None:
-    """Find out before long work whether two outputs would be written into one file."""
-    seen: set[tuple[str, str]] = set()
-    for file in map(Path, paths):
-        place = os.path.realpath(file.parent), file.name
-        if place in seen:
-            raise OutputError(f"{file}: is the name of two outputs; choose another one for each")
-        seen.add(place)
 
 
 def _identity(file: Path) -> tuple[int, int] | None:
@@ -148,6 +152,25 @@ def check_tiles_folder(folder: Path, overwrite: bool) -> None:
         raise OutputError(f"{folder}: is a link, or holds other files than Deep Zoom tiles; choose another name")
 
 
+def is_zarr(path: str | Path) -> bool:
+    """Whether an image is a folder of chunks."""
+    return Path(path).suffix.lower() == ".zarr"
+
+
+def check_zarr_folder(folder: Path, overwrite: bool) -> None:
+    """Refuse to replace a folder that is to be kept, or that is no image in chunks."""
+    if folder.exists():
+        if not overwrite:
+            raise OutputError(f"{folder}: exists already; choose another name or use --overwrite")
+        if folder.is_symlink() or not folder.is_dir() or not _holds_only_chunks(folder):
+            raise OutputError(f"{folder}: is a link, or holds other files than an OME-Zarr image; choose another name")
+
+
+def _holds_only_chunks(folder: Path) -> bool:
+    """Check whether a folder holds what :func:`write_ome_zarr` writes at its top: levels by number, and .z files."""
+    return all(item.name.startswith(".z") or (item.name.isdecimal() and item.is_dir()) for item in folder.iterdir())
+
+
 def holds_only_tiles(folder: Path) -> bool:
     """Check whether everything in a folder, however deep, is what :func:`write_deep_zoom` writes there."""
     with os.scandir(folder) as levels:
@@ -166,16 +189,20 @@ class Fingerprint:
 
     size: int  # bytes of all files
     # of the file; of a Deep Zoom image that of the list of its files, as ``sha256sum`` prints it (digest, two spaces,
-    # name), in order of names, the description first as ``.dzi``
+    # name), in order of names, the description first as ``.dzi``; of an OME-Zarr image the same of all its files
     sha256: str
 
 
 def fingerprint(image: Path, tiles: Path | None = None) -> Fingerprint:
     """The fingerprint of an image, and of the tiles that belong to it."""
-    if tiles is None:
+    if image.is_dir():
+        tiles, named = image, []
+    elif tiles is None:
         return Fingerprint(image.stat().st_size, _sha256(image))
+    else:
+        named = [(".dzi", image)]
     members = sorted(path for path in tiles.rglob("*") if path.is_file())
-    files = [(".dzi", image), *((file.relative_to(tiles).as_posix(), file) for file in members)]
+    files = [*named, *((file.relative_to(tiles).as_posix(), file) for file in members)]
     listing = "".join(f"{_sha256(file)}  {name}\n" for name, file in files)
     return Fingerprint(sum(file.stat().st_size for _, file in files), hashlib.sha256(listing.encode()).hexdigest())
 
@@ -196,14 +223,15 @@ class TemporaryFolder:
         place = Path(parent or tempfile.gettempdir())
         _remove_dead(place, prefix)
         made = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
-        descriptor = os.open(made / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)
-        _lock(descriptor)
         try:
-            # Only a folder of this ending is looked at by others, and it has its lock by then.
+            (made / _LOCK).write_text(f"{platform.node()}\n{os.getpid()}\n", encoding="utf-8")
+            # Only a folder of this ending is looked at by others, and it says whose it is by then. No file in it is
+            # open, or Windows would not rename it.
             self.path = made.rename(f"{made}.part")
         except OSError:
-            _remove(made, descriptor)
+            _remove(made, None)
             raise
+        descriptor = _locked(self.path / _LOCK)
         self.close = weakref.finalize(self, _remove, self.path, descriptor)
         _folders[self.path] = self
 
@@ -229,29 +257,55 @@ def _folder_at(path: Path) -> TemporaryFolder:
     return folder
 
 
-def _remove(folder: Path, descriptor: int) -> None:
-    os.close(descriptor)
+def _remove(folder: Path, descriptor: int | None) -> None:
+    if descriptor is not None:
+        os.close(descriptor)
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def _lock(descriptor: int) -> bool:
-    """Lock an open file for this process; False where another has locked it, or there are no locks."""
-    with suppress(OSError):
-        if sys.platform != "win32":
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return True
-    return False
+def _locked(file: Path) -> int | None:
+    """A file, open and locked for this process; None where another has locked it, or there are no locks."""
+    if sys.platform != "win32":
+        with suppress(OSError):
+            descriptor = os.open(file, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                os.close(descriptor)
+                raise
+            return descriptor
+    return None
 
 
 def _remove_dead(parent: Path, prefix: str) -> None:
-    """Remove the folders of processes that hold their locks no more; they were killed."""
+    """Remove the folders of processes of this machine that were killed.
+
+    Such a process is there no more and holds no lock. On a mount of another machine locks may hold nothing; and of a
+    process in another container with this one's name the number says nothing.
+    """
     for folder in parent.glob(f"{prefix}*.part"):
-        with suppress(OSError):
-            descriptor = os.open(folder / _LOCK, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
-            dead = _lock(descriptor)
+        if (descriptor := _locked(folder / _LOCK)) is None:
+            continue
+        try:
+            host, process = (folder / _LOCK).read_text(encoding="utf-8").splitlines()
+            dead = host == platform.node() and not _is_alive(int(process))
+        except (OSError, ValueError):
+            dead = False
+        if dead:
+            _remove(folder, descriptor)
+        else:
             os.close(descriptor)
-            if dead:
-                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_alive(process: int) -> bool:
+    """Whether there is a process of this number; not for Windows, where the signal 0 is another one."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 class _Item(NamedTuple):
@@ -293,7 +347,7 @@ class Outputs:
 
     @contextmanager
     def writing(self, path: str | Path, *, is_folder: bool = False) -> Iterator[Path]:
-        """Stage a file, or a folder of Deep Zoom tiles; a failure of the file system is one of ``path``.
+        """Stage a file, or a folder of Deep Zoom tiles or chunks; a failure of the file system is one of ``path``.
 
         Yields where to write the file, or the empty folder.
         """
@@ -315,15 +369,24 @@ class Outputs:
 
     def attempt(self, path: str | Path, stage: Callable[[], object]) -> list[Message]:
         """Stage what belongs beside an image, whose failure must not cost the image: a warning, where it fails."""
-        count = len(self._items)
         try:
-            stage()
+            with self.together():
+                stage()
         except Exception as error:  # noqa: BLE001 the work of hours is not thrown away for a page, whatever is wrong
-            del self._items[count:]
             text = str(error) if isinstance(error, RdstitchError) else f"{type(error).__name__}: {error}"
             older = "; the file of this name is older" if Path(path).exists() else ""
             return [Message(f"{path}: not written, all else is: {text.removeprefix(f'{path}: ')}{older}")]
         return []
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Stage several outputs, all of them or, after an error, none."""
+        count = len(self._items)
+        try:
+            yield
+        except BaseException:
+            del self._items[count:]
+            raise
 
     def staged(self, path: str | Path) -> Path | None:
         """Give where an output lies until it is in its place; None where none of this name is staged."""
@@ -333,11 +396,14 @@ class Outputs:
         place = Path(os.path.realpath(name.parent)) / name.name
         if place.is_symlink():
             place = Path(os.path.realpath(place))
+        if any(item.place == place for item in self._items):
+            raise OutputError(f"{name}: is the name of two outputs; choose another one for each")
         if place.parent not in self._folders:
             self._folders[place.parent] = TemporaryFolder(place.parent, ".rdstitch-")
         # Tiles are staged just before their description, and are found beside it by its name.
         number = sum(not item.is_folder for item in self._items)
-        staged = self._folders[place.parent].path / f"new{number}{'_files' if is_folder else name.suffix}"
+        suffix = "_files" if is_folder and not is_zarr(name) else name.suffix
+        staged = self._folders[place.parent].path / f"new{number}{suffix}"
         self._items.append(_Item(name, place, staged, is_folder))
         return staged
 
@@ -349,6 +415,8 @@ class Outputs:
             raise _appeared(item.name)
         if not item.is_folder:
             item.staged.chmod(item.place.stat().st_mode & 0o777)
+        elif is_zarr(item.place):
+            check_zarr_folder(item.place, overwrite=True)
         elif not holds_only_tiles(item.place):
             raise OutputError(f"{item.name}: holds other files than Deep Zoom tiles; choose another name")
 

@@ -44,7 +44,10 @@ def parse_yaml(text: str, file: str) -> Any:
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """Knows OpenCV's matrices, which are objects."""
+        """Knows OpenCV's matrices, which are objects; and no merge keys, by which a few lines become millions."""
+
+        def flatten_mapping(self, node: Any) -> None:
+            pass
 
     Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)  # type: ignore[type-var]
     if len(text) > _MAX_YAML:
@@ -96,6 +99,7 @@ def check_invertible(matrix: tuple[Triple, Triple, Triple], name: str) -> None:
 
 def _checked(value: Any, file: str) -> Any:
     containers: list[tuple[str, int, Any]] = [("", 1, {"": value})]
+    seen = set[int]()  # aliases of YAML are one object at many places: a few lines can hold millions
     while containers:
         field, depth, container = containers.pop()
         if depth > _DEEPEST:
@@ -104,6 +108,9 @@ def _checked(value: Any, file: str) -> Any:
             name = f"{field}[{key}]" if isinstance(container, list) else f"{field}.{key}".lstrip(".")
             if isinstance(item, float) and not math.isfinite(item):
                 raise InputError(f"{file}: {name}: expected a finite number, not {item}")
-            if isinstance(item, (dict, list)):
+            if isinstance(item, str) and "\0" in item:  # which no system takes as part of a name
+                raise InputError(f"{file}: {name}: holds a NUL character")
+            if isinstance(item, (dict, list)) and id(item) not in seen:
+                seen.add(id(item))
                 containers.append((name, depth + 1, item))
     return value

@@ -6,6 +6,7 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from importlib import import_module
 from typing import Any
 
 import cv2
@@ -23,10 +24,10 @@ from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
-from rdstitch.system.late_imports import import_late_modules
 from rdstitch.tracking.metric_plane import MetricPlane, SeenPair, ShownCamera, chained, shown_camera
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 
+_ALIGNMENT_IMPORTS = "scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial"
 _WINDOW = 48  # keyframes that are aligned together
 _KEPT = 200  # older keyframes at the most, among which a lost frame looks for its place
 _PARTNERS = 2  # last keyframes that a frame is matched with
@@ -166,7 +167,8 @@ class Tracker:
         self._first_executor = executor
         if not options.patient:
             self._first_executor = ThreadPoolExecutor(1)
-            import_late_modules()
+            for name in _ALIGNMENT_IMPORTS:  # now: nothing that follows should wait for them
+                import_module(name)
         self._count, self._map, self._lost = 0, 0, 0
         self._flow = CornerFlow()
         self._model = options.alignment.model
@@ -610,9 +612,9 @@ class Tracker:
             far = np.linalg.norm(path.position, axis=1)
             last = int(np.argmax(far))
             if path.covariance is not None and far[last] > 0.0:
-                variance = float(np.linalg.eigvalsh(path.covariance[last, :2, :2])[-1]) / far[last] ** 2
-                yaw_std = math.sqrt(float(path.covariance[:, 3, 3].max()))
-                self._shape_std = math.sqrt(max(variance - alignment.length_std**2, 0.0)), yaw_std
+                # Across: along it is what all lengths share.
+                variance = float(np.linalg.eigvalsh(path.covariance[last, :2, :2])[0]) / far[last] ** 2
+                self._shape_std = math.sqrt(max(variance, 0.0)), math.sqrt(float(path.covariance[:, 3, 3].max()))
         measured = [keyframe.attitude for keyframe in keyframes]
         known = ("rigid", "similarity", *(("tilting",) if None not in measured else ()))
         if alignment.model in known and poses is not None and tilt and alignment.focal:

@@ -81,12 +81,14 @@ class ComparedImage:
 def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> Grey:
     pixels = image.pixels
     full = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else max(float(pixels.max()), 1e-12)
-    if stretch is not None:  # black may be anywhere: only differences of grey levels are compared
-        full = max(stretch[1] - stretch[0], 1e-12)
+    black = 0.0
+    if stretch is not None:
+        # Correlations of small differences on a large base would be lost in rounding.
+        black, full = stretch[0], max(stretch[1] - stretch[0], 1e-12)
     height, width = pixels.shape[:2]
     factor = min(1.0, COMPARED_SIDE / max(width, height))
     size = max(1, round(width * factor)), max(1, round(height * factor))
-    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(full)
+    small = (cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) - black) / np.float32(full)
     grey = mean_of_channels(small)
     if image.alpha is not None:
         grey[cv2.resize(image.alpha, size, interpolation=cv2.INTER_AREA) < _OPAQUE] = np.nan

@@ -134,6 +134,16 @@ def test_profile_and_exif_are_kept_and_the_image_is_upright(
         assert written.getexif().get(ExifTags.Base.Orientation, 1) == 1
 
 
+@pytest.mark.parametrize(
+    ("output", "more"),
+    [("layers/a.tif", "--layers layers"), ("x.dzi", "--report x.html"), ("x.png", "--poses x.png.json")],
+)
+def test_two_outputs_of_one_name_are_refused_before_the_work(rdstitch: Run, here: Path, output: str, more: str) -> None:
+    (here / "layers").mkdir()
+    rdstitch("mosaic", "a.png", "b.png", "-o", output, *more.split(), status=6, told="is the name of two outputs")
+    assert not list((here / "layers").iterdir())
+
+
 @pytest.mark.parametrize("whole", [False, True])
 def test_layers_by_their_masks_are_the_composite(
     rdstitch: Run, frames: list[Path], tmp_path: Path, whole: bool
@@ -171,5 +181,5 @@ def test_what_is_there_is_kept(rdstitch: Run, frames: list[Path], tmp_path: Path
     folder = tmp_path / "layers"
     folder.mkdir()
     (folder / f"{frames[0].stem}.tif").write_bytes(b"mine")
-    rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "a.png", "--layers", folder, *CACHED, told="exists")
+    rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "a.png", "--layers", folder, status=6, told="exists already")
     assert [file.read_bytes() for file in folder.iterdir()] == [b"mine"]

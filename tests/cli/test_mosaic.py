@@ -121,6 +121,26 @@ def test_each_block_has_a_file_and_is_named(rdstitch: Run, folder: Path, tmp_pat
     assert "c_" in done.err
 
 
+def test_all_blocks_are_planned_before_the_first_one_and_published_together(
+    rdstitch: Run, folder: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(folder, tmp_path / "flight")
+    (tmp_path / "flight" / "z_broken.png").write_bytes(b"no image")
+    first = min(path.name for path in folder.iterdir())
+    how = [
+        *("mosaic", tmp_path / "flight", "-o", tmp_path / "floor.png", "--all-blocks", "--lambda", DISTORTION, *CACHED),
+        *(part for pattern in ("a*", "b*", "z*") for part in ("--include-only", pattern)),
+        *("--exclude", "*_frame_0002.png", "--reference", first, "--rectangle", "50,50,350,50,350,250,50,250"),
+    ]
+    (tmp_path / "floor-2.png").write_bytes(b"mine")
+    rdstitch(*how, status=6, told="floor-2.png: exists already")
+    assert {file.name for file in tmp_path.iterdir()} == {"flight", "floor-2.png"}
+    (tmp_path / "floor-2.png").unlink()
+    rdstitch(*how, told="z_broken.png")
+    names = {"floor.png", "floor.png.json", "floor-2.png", "floor-2.png.json"}
+    assert {file.name for file in tmp_path.iterdir()} == {"flight", *names}
+
+
 @pytest.fixture
 def spoiled(tmp_path: Path) -> list[Path]:
     """Five images in a row; the last shows other ground, but for a patch by which it is registered."""

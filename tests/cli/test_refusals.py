@@ -33,6 +33,8 @@ INCOMING: Files = {"incoming": None}
 BROKEN: Files = {"empty.png": "", "half.png": "\x89PNG"}
 MASK = cv2.imencode(".png", np.full((40, 30), 255, np.uint8))[1].tobytes()
 
+CUT = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (300, 400), dtype=np.uint8))[1].tobytes()[:9000]
+
 
 def _check(rdstitch: Run, folder: Path, arguments: list[str], status: int, *told: str) -> None:
     before = state_of(folder)
@@ -206,6 +208,7 @@ def _tables() -> list[tuple[str, int, str | tuple[str, ...], Files]]:
         ("mosaic more -o b.png --mask b.png --overwrite", 6, "b.png: is read as input", {}),
         ("mosaic more -o masks/frame_0000.png --mask masks --overwrite", 6, "frame_0000.png: is read as input",
          {"masks": None, "masks/frame_0000.png": MASK}),
+        ("mosaic a.png cut.jpg -o out.png", 4, "left out cut.jpg: not an image that can be read", {"cut.jpg": CUT}),
         # What would fail at the end of a run that follows a folder.
         (FOLLOW + "out.png", 3, "no images", INCOMING),
         (FOLLOW + "out.png", 6, "out.png: ", INCOMING | {"out.png": "mine"}),

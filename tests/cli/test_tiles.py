@@ -68,12 +68,31 @@ def test_places_from_a_mirrored_stage_are_found_too(rdstitch: Run, slide: Path, 
     assert not list(tmp_path.glob("*.json"))
 
 
-def test_wrong_places_are_refused_in_one_line(rdstitch: Run, slide: Path, tmp_path: Path) -> None:
+def test_a_wrong_overlap_is_found_and_named(rdstitch: Run, slide: Path, tmp_path: Path) -> None:
     output = tmp_path / "out.tif"
-    rdstitch("tiles", slide, "--grid", "r{row}c{col}", "--overlap", "60", "-o", output, status=4, told="--search")
+    rdstitch("tiles", slide, "--grid", "r{row}c{col}", "--overlap", "60", "-o", output, told="neighbours overlap by 1")
+    assert tifffile.imread(output).shape[1] > 600
+
+
+def test_tiles_that_show_nothing_are_refused_in_one_line(rdstitch: Run, slide: Path, tmp_path: Path) -> None:
+    output, rng = tmp_path / "out.tif", np.random.default_rng(1)
+    for row in range(2):
+        tifffile.imwrite(tmp_path / f"r{row}c0.tif", rng.integers(90, 110, (200, 200), dtype=np.uint16))
+    rdstitch("tiles", tmp_path, *NAMED, "-o", output, status=4, told="--search")
     assert not output.exists()
     rdstitch("tiles", slide, "-o", output, status=3)
     rdstitch("tiles", slide, *NAMED, status=2)
+
+
+def test_black_ground_stays(rdstitch: Run, slide: Path, tmp_path: Path) -> None:
+    folder, output = tmp_path / "dark", tmp_path / "dark.tif"
+    folder.mkdir()
+    for file in slide.glob("*.tif"):
+        tifffile.imwrite(
+            folder / file.name, (1 + tifffile.imread(file).astype(np.uint32) ** 2 // 4096).astype(np.uint16)
+        )
+    rdstitch("tiles", folder, *NAMED, "--flat-field", "off", "-o", output)
+    assert (tifffile.imread(output)[20:-20, 20:-20] > 0).all()
 
 
 def test_ome_tiff_in_and_out(rdstitch: Run, tmp_path: Path) -> None:

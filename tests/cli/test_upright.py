@@ -110,6 +110,21 @@ def test_a_facade_becomes_upright(
     assert np.linalg.matrix_rank(record["output"]["orientation"]) == 3
 
 
+def test_the_output_is_cropped_to_the_rectangle(
+    facade: tuple[Sequence, list[Path]], registered: Path, rdstitch: Run, tmp_path: Path
+) -> None:
+    sequence, paths = facade
+    how = ("--images", paths[0].parent, "-o", tmp_path / "up.png", "--rectangle", _corners(sequence))
+    rdstitch("apply", registered, *how, "--crop")
+    record = json.loads((tmp_path / "up.png.json").read_text("utf-8"))
+    width, height = record["output"]["size"]
+    image = record["images"][0]
+    lens = Camera(LENS.image_size, image["lambda"], center=tuple(image["center_px"]))
+    corners = np.array(_corners(sequence).split(","), dtype=np.float64).reshape(4, 2)
+    ends = [(0, 0), (width - 1, 0), (width - 1, height - 1), (0, height - 1)]
+    np.testing.assert_allclose(to_plane(lens, np.array(image["to_output"]), corners), ends, atol=1.0)
+
+
 def test_a_mosaic_becomes_upright_at_once(facade: tuple[Sequence, list[Path]], rdstitch: Run, tmp_path: Path) -> None:
     output = tmp_path / "up.png"
     rdstitch("mosaic", *facade[1], "-o", output, *KNOWN, "--straighten", "auto", *CACHED)

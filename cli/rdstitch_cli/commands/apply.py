@@ -63,8 +63,6 @@ def apply(
     reporter.finish()
     for missing in told_once(result.left_out.values()):
         reporter.warn(str(missing))
-    if result.matched == "order" and match == "auto":
-        reporter.warn("no image has a name of the sidecar; they were taken in order")
     for message in result.messages:
         reporter.tell(message)
     if result.plan is not None:

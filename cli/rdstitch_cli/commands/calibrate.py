@@ -6,7 +6,7 @@ from typing import Any
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
 from rdstitch_cli.option_texts import option
-from rdstitch_cli.stitching import FilesBeside, report_registration, stitch_options
+from rdstitch_cli.stitching import files_beside, report_registration, stitch_options
 from rdstitch_cli.terminal import Reporter
 
 
@@ -20,6 +20,7 @@ from rdstitch_cli.terminal import Reporter
 )
 @options.inputs
 @option("-o --output", options.IMAGE, of="calibrate", required=True)
+@options.camera_format
 @options.every
 @options.topic
 @options.registration
@@ -48,14 +49,13 @@ def calibrate(
     from rdstitch.sidecar.write import plain
 
     paths = options.resolve(inputs)
-    beside = FilesBeside(reporter, paths, given)
+    beside = files_beside(reporter, given)
     wanted = stitch_options(reporter, save_camera=output, **given)
-    with beside.explaining():
-        registration = recipe(paths, wanted, every=every, progress=beside.progress, beside=beside.stage)
+    registration = recipe(paths, wanted, every=every, progress=beside.timer, beside=beside)
     report_registration(registration, reporter, (lambda: plain(registration.camera.as_dict())) if as_json else None)
     for line in (
         *describe_camera(registration.alignment, registration.camera),
-        *export_note(registration.camera, output),
+        *export_note(registration.camera, output, wanted.camera_format),
     ):
         reporter.note(line)
     reporter.made(f"{output}: {registration.summary}")

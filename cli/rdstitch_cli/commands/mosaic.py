@@ -13,7 +13,7 @@ from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
 from rdstitch_cli.option_texts import option
 from rdstitch_cli.parameter_types import RealNumber
-from rdstitch_cli.stitching import FilesBeside, stitch_options, summarize
+from rdstitch_cli.stitching import files_beside, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
@@ -65,18 +65,14 @@ def mosaic(
     with ExitStack() as stack:
         named = list(inputs) if following else options.resolve(inputs)
         with_poses = given["poses"] is not None
-        beside = FilesBeside(reporter, named, given, output)
+        beside = files_beside(reporter, given)
         stitch = stitch_options(reporter, pose_covariance=with_poses, **given)
         paths: Sequence[Named] = named
         if following:
-            arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle, refresh=refresh)
-            paths = stack.enter_context(arrived)
-        how: dict[str, Any] = {"every": every, "progress": beside.progress, "beside": beside.stage}
-        with beside.explaining():
-            if all_blocks:
-                results = mosaic_blocks(paths, output, stitch, **how)
-            else:
-                results = (recipe(paths, output, stitch, **how),)
+            watched: dict[str, Any] = {"output": output, "every": every, "idle": idle, "refresh": refresh}
+            paths = stack.enter_context(live.followed(inputs, stitch, reporter, **watched, beside=beside))
+        how: dict[str, Any] = {"every": every, "progress": beside.timer, "beside": beside}
+        results = mosaic_blocks(paths, output, stitch, **how) if all_blocks else [recipe(paths, output, stitch, **how)]
         for result in results:
             if following and not as_json:
                 live.print_result(result.registration, reporter, output)

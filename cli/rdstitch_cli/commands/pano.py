@@ -5,7 +5,7 @@ from typing import Any
 
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
-from rdstitch_cli.stitching import FilesBeside, stitch_options, summarize
+from rdstitch_cli.stitching import files_beside, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
 
 
@@ -37,10 +37,9 @@ def pano(
     from rdstitch.pipeline.recipes import pano as recipe
 
     paths = options.resolve(inputs)
-    beside = FilesBeside(reporter, paths, given, output)
+    beside = files_beside(reporter, given)
     stitch = stitch_options(reporter, **given)
-    with beside.explaining():
-        result = recipe(paths, output, stitch, every=every, progress=beside.progress, beside=beside.stage)
+    result = recipe(paths, output, stitch, every=every, progress=beside.timer, beside=beside)
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:
         reporter.made(result.summary)

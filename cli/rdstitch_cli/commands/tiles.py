@@ -1,16 +1,23 @@
 """``rdstitch tiles``: tiles from a motorised stage become one image, or a table of places."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from rdstitch.errors import PartialResultError
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
 from rdstitch_cli.option_texts import option
-from rdstitch_cli.parameter_types import RealNumber, WholeNumber
-from rdstitch_cli.stitching import FilesBeside, composite_fields, report_registration, summarize
+from rdstitch_cli.parameter_types import LENS, RealNumber, WholeNumber, word_or_number
+from rdstitch_cli.stitching import composite_fields, files_beside, report_registration, summarize
 from rdstitch_cli.terminal import Reporter
+
+ORDERS = ("rows", "columns", "snake-rows", "snake-columns")
+ORIGINS = ("top-left", "top-right", "bottom-left", "bottom-right")
+
+if TYPE_CHECKING:
+    from rdstitch.stage import TileRegistration
 
 
 @command(
@@ -20,6 +27,10 @@ from rdstitch_cli.terminal import Reporter
   rdstitch tiles slide/*.tif --positions stage.csv -o slide.dzi
   rdstitch tiles ome/ --channel 0 -o slide.ome.tif --report slide.html
   rdstitch tiles slide/ --grid 'r{row}c{col}' --positions-only places.csv
+  rdstitch tiles plate/ --grid '{letter}{col}' --overlap 8 -o plate.ome.tif                   # A01, A02, …
+  rdstitch tiles sem/ --grid 'img_{number}' --columns 12 --order snake-rows -o sem.tif
+  rdstitch tiles sem/ --grid 'img_{number}' --columns 12 --origin bottom-left -o sem.tif
+  rdstitch tiles slide/ --positions TileConfiguration.txt --z max -o slide.ome.zarr
 """,
 )
 @options.inputs
@@ -27,14 +38,19 @@ from rdstitch_cli.terminal import Reporter
 @options.overwrite
 @option("--grid")
 @option("--overlap", RealNumber(0.0, 100.0), 10.0)
+@option("--columns", WholeNumber(1))
+@option("--order", ORDERS, "rows")
+@option("--origin", ORIGINS, "top-left")
 @option("--positions", options.IMAGE, of="tiles")
 @option("--positions-only", options.IMAGE)
 @option("--pixel-size", RealNumber(0.0))
 @option("--search", RealNumber(0.0))
 @option("--channel", WholeNumber(0))
+@option("--z", word_or_number(("max",), 0, 1_000_000))
+@option("--time", WholeNumber(0))
 @options.flat_field
 @option("--save-flat-field", options.IMAGE)
-@options.distortion
+@option("--lambda", LENS, dest="distortion")
 @options.cut
 @options.crop
 @options.interpolation
@@ -68,19 +84,27 @@ def tiles(
     if output is None and positions_only is None:
         raise click.UsageError("nothing to write: give --output or --positions-only")
     paths = options.resolve(inputs)
-    beside = FilesBeside(reporter, paths, given, output)
+    beside = files_beside(reporter, given)
     composite = CompositeOptions(exposure="none", seam="none", **composite_fields(given))
-    chosen = TileOptions(overlap=overlap / 100.0, composite=composite, **given)
+    chosen = TileOptions(overlap=overlap, composite=composite, **given)
     if output is None:
-        with beside.explaining():
-            _, registration = place_tiles(paths, positions_only, chosen, progress=beside.progress)
+        tiled, registration = place_tiles(paths, positions_only, chosen, progress=beside.timer)
         report_registration(registration, reporter)
         reporter.made(f"{positions_only}: {registration.summary}")
+        _check_placed(tiled)
         return
-    with beside.explaining():
-        result = recipe(
-            paths, output, chosen, positions_file=positions_only, progress=beside.progress, beside=beside.stage
-        )
+    result = recipe(paths, output, chosen, positions_file=positions_only, progress=beside.timer, beside=beside)
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:
         reporter.made(result.summary)
+    _check_placed(result.registration.tiles)
+
+
+def _check_placed(tiled: "TileRegistration | None") -> None:
+    """End with the status of a partial result where most tiles lie where the stage was told to go, right or wrong."""
+    if tiled is not None and tiled.mostly_nominal:
+        alone = len(tiled.grid) - int(tiled.linked.sum())
+        raise PartialResultError(
+            f"{alone} of {len(tiled.grid)} tiles have their places from the stage alone: they show nothing, or "
+            f"the places ({tiled.grid.source}) or the overlap are wrong; what could be placed is written"
+        )

@@ -8,7 +8,7 @@ from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from xml.etree import ElementTree
 
 import cv2
@@ -18,6 +18,7 @@ import pytest
 from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import export_note, load_camera, read_camera_file, save_camera
 from rdstitch.camera_files.polynomials import fitted_polynomial
+from rdstitch.choices import CameraFormat
 from rdstitch.errors import InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
@@ -456,6 +457,19 @@ def test_four_coefficients_of_usual_lenses_need_no_mark(tmp_path: Path, name: st
     assert found == load_camera(marked)
 
 
+@pytest.mark.parametrize("reference", ["[*{0},*{0},*{0},*{0}]", "{{<<: [*{0},*{0},*{0},*{0}]}}"])
+def test_a_few_lines_of_yaml_do_not_become_millions(tmp_path: Path, reference: str) -> None:
+    """4 to the power of 30 objects: without end where each is visited."""
+    lines = ["a0: &a0 {x: [1]}", *(f"a{k + 1}: &a{k + 1} {reference.format(f'a{k}')}" for k in range(30))]
+    (tmp_path / "laugh.yaml").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"laugh\.yaml"):
+        load_camera(tmp_path / "laugh.yaml")
+
+
+def test_an_alias_is_what_it_stands_for() -> None:
+    assert parse_yaml("a: &one [1.0, 2.0]\nb: *one\n", "c.yaml") == {"a": [1.0, 2.0], "b": [1.0, 2.0]}
+
+
 def test_yaml_may_be_written_in_any_style(tmp_path: Path) -> None:
     usual = load_camera(_opencv_file(tmp_path / "c.yml", (900.0, 900.0), [-0.2, 0.05, 0.0, 0.0, 0.0], (1280, 960)))
     rows = "\n".join(f"    - {value}" for value in ("9e2", "0", "641.", "0", "9e+02", "478.", "0", "0", "1"))
@@ -592,3 +606,9 @@ def test_a_lens_of_any_sign_keeps_its_scale_at_the_unit_radius(distortion: float
     scale, moved = fitted_polynomial(camera, 1224.0, powers).moved()
     assert scale * (1.0 - sum(moved)) == pytest.approx(1.0)
     assert 0.5 < scale < 2.0
+
+
+@pytest.mark.parametrize("camera_format", [name for name in get_args(CameraFormat) if name != "auto"])
+def test_a_format_needs_no_name(camera_format: CameraFormat, tmp_path: Path) -> None:
+    save_camera(CAMERAS[0], tmp_path / "lens", camera_format)
+    assert load_camera(tmp_path / "lens").distortion == pytest.approx(CAMERAS[0].distortion, abs=0.01)

@@ -170,6 +170,18 @@ def test_the_room_for_an_image_is_known_before(shrink: float, masked: bool) -> N
         assert reader.nbytes(0, shrink) >= reader.prepared(0, shrink).nbytes
 
 
+def test_a_grey_image_before_coloured_ones_gets_colours() -> None:
+    grey, coloured = (as_image(np.full((3, 4, *bands), 7, dtype=np.uint8)) for bands in ((), (3,)))
+    images = [
+        PlacedImage(partial(replace, image), Camera((4, 3)), np.eye(3), coloured=image is coloured)
+        for image in (grey, coloured)
+    ]
+    for reader in (ImageReader(images), ImageReader(images).part([0])):
+        assert reader.samples[0] == 3
+        np.testing.assert_array_equal(reader(0).pixels, coloured.pixels)
+    assert ImageReader(images[:1]).samples[0] == 1
+
+
 def test_a_failed_prefetch_raises_where_the_image_is_read() -> None:
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=80_000, ahead=True)

@@ -218,6 +218,8 @@ def test_a_body_and_a_black_border_are_found(shape: str) -> None:
         v, u = np.ogrid[:_HEIGHT, :_WIDTH]
         region = np.hypot(u - 100, v - 75) > 85
         images[:, region] = 0.0
+    for base in (0.0, -0.8) if shape == "border" else (0.0,):
+        assert static_pixels(list(images + np.float32(base)))[region].mean() > 0.95
     found = static_pixels(list((images * 255).astype(np.uint8)))
     assert found[region].mean() > 0.95
     assert found[~region].mean() < 0.06
@@ -249,6 +251,14 @@ def test_the_white_margins_of_a_page_with_a_header_that_stays_are_kept() -> None
     found = static_pixels(list(images))
     assert found[:24].mean() > 0.9
     assert not found[40:].any()
+
+
+def test_what_is_dark_by_chance_is_content() -> None:
+    """Floating-point numbers below 0, and the dark ground of a microscope, which most of every image shows."""
+    images = _images()
+    assert static_pixels(list(images - np.quantile(images, 0.7).astype(np.float32))) is None
+    images[images < np.quantile(images, 0.7)] = 0.0
+    assert static_pixels(list(images)) is None
 
 
 def test_a_camera_that_hardly_moves_masks_nothing() -> None:

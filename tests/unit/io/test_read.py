@@ -103,6 +103,23 @@ def test_every_mode_becomes_grey_or_rgb(tmp_path: Path, colours: Samples, mode: 
     assert decoded.pixels.dtype in (np.uint8, np.uint16, np.float32)
 
 
+def test_the_header_knows_whether_there_are_colours(tmp_path: Path, colours: Samples) -> None:
+    for mode, suffix in (
+        ("L", "png"),
+        ("P", "png"),
+        ("P", "gif"),
+        ("P", "tif"),
+        ("RGB", "jpg"),
+        ("L", "jpg"),
+        ("1", "tif"),
+    ):
+        for coloured in (True, False):
+            image = Image.fromarray(colours if coloured else colours[..., 0]).convert(mode)
+            image.save(tmp_path / f"a.{suffix}")
+            bands = read_image(tmp_path / f"a.{suffix}").pixels.shape[2:]
+            assert read_metadata(tmp_path / f"a.{suffix}").channels == (bands[0] if bands else 1), (mode, suffix)
+
+
 def test_first_image_of_several(tmp_path: Path, colours: Samples) -> None:
     frames = [Image.fromarray(colours), Image.fromarray(255 - colours)]
     for name in ("a.gif", "a.png", "a.webp", "a.tif"):
@@ -127,6 +144,29 @@ class TestMetadata:
         exif[0x8769] = {0x920A: 5.0, 0xA20E: 800.0, 0xA210: 4, 0xA002: 4000}
         Image.new("L", (1000, 750)).save(tmp_path / "a.jpg", exif=exif)
         assert read_metadata(tmp_path / "a.jpg").focal_px == pytest.approx(1000.0)
+
+    @pytest.mark.parametrize(
+        ("tags", "middle", "focal"),
+        [
+            # As the drone wrote it, with a middle that is not quite there; reduced, by EXIF's width or by the middle.
+            ({0xA002: 400}, 203.0, 268.0),
+            ({0xA002: 1600}, None, 67.0),
+            ({0xA002: 400}, 800.0, 67.0),
+            ({}, 800.0, 67.0),
+            # Nothing says that it was reduced, but what 35 mm film would have says so; that it was, and by how much.
+            ({0xA405: 6}, None, None),
+            ({0xA405: 6}, 800.0, 67.0),
+        ],
+    )
+    def test_a_calibrated_focal_length_is_that_of_the_original(
+        self, tmp_path: Path, tags: dict[int, Any], middle: float | None, focal: float | None
+    ) -> None:
+        exif = Image.Exif()
+        exif[0x8769] = tags
+        told = "" if middle is None else f'drone-dji:CalibratedOpticalCenterX="{middle}"'
+        xmp = f'<rdf:Description drone-dji:CalibratedFocalLength="268.0" {told}/>'
+        Image.new("L", (400, 300)).save(tmp_path / "a.jpg", exif=exif, xmp=xmp.encode())
+        assert read_metadata(tmp_path / "a.jpg").focal_px == pytest.approx(focal)
 
     def test_place_and_attitude(self, tmp_path: Path) -> None:
         exif = Image.Exif()

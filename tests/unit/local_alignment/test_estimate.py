@@ -12,6 +12,7 @@ import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.features.prepared_image import View
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
 from rdstitch.local_alignment import DisplacementField, LocalAlignment, Match, align_locally, fit
@@ -174,13 +175,12 @@ def test_relief_of_single_images_is_tried() -> None:
     assert align_locally(found, CAMERAS, homographies(sequence)).before is not None
 
 
-def test_a_number_of_cells_is_used_in_any_case_and_off_in_none() -> None:
+def test_a_number_of_cells_is_used_in_any_case() -> None:
     sequence = scene(None)
     found = matches(sequence)
     local = align_locally(found, CAMERAS, homographies(sequence), 7)
     assert [field.values.shape for field in local.fields] == [(6, 8, 2)] * 6
     assert max(field.largest for field in local.fields) < 0.5
-    assert align_locally(found, CAMERAS, homographies(sequence), "off").fields == ()
 
 
 def test_the_whole_does_not_move_and_fields_fade_where_nothing_supports_them() -> None:
@@ -226,13 +226,14 @@ def test_nothing_folds_even_where_matches_say_so() -> None:
     assert 0.45 < max(field.steepest for field in fields) <= 0.501
 
 
-def test_that_ground_is_flat_is_found_pair_by_pair() -> None:
+def test_that_ground_is_flat_is_found_pair_by_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of thousands of images, the matches of all pairs together would be what takes memory."""
     sequence = scene(None)
-    found = 40 * matches(sequence)
+    found, matrices = 40 * matches(sequence), homographies(sequence)
+    monkeypatch.setattr("rdstitch.local_alignment.estimate._MAX_MATCHES", 10_000)
     tracemalloc.start()
     try:
-        assert align_locally(found, CAMERAS, homographies(sequence)).fields == ()
+        assert align_locally(iter(found), CAMERAS, matrices, pairs=len(found)).fields == ()
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -330,12 +331,40 @@ def test_registered_turns_are_aligned_locally() -> None:
         )
         for k in found
     ]
+    sources = [SimpleNamespace(view=lambda megapixels: View(np.zeros((480, 640), np.uint8)))] * 4
     alignment = SimpleNamespace(
         used=np.ones(4, dtype=np.bool_), cameras=CAMERAS[:4], homographies=matrices, on_sphere=True
     )
-    registration: Any = SimpleNamespace(pairs=pairs, alignment=alignment)
+    registration: Any = SimpleNamespace(pairs=pairs, alignment=alignment, sources=sources)
+    assert align_registration_locally(registration, "off").fields == ()
     fields = align_registration_locally(registration, "auto").fields
     assert [f.values.tolist() for f in fields] == [
         f.values.tolist() for f in align_locally(found, CAMERAS[:4], matrices, on_sphere=True).fields
     ]
     assert len(fields) == 4
+
+
+def test_fields_that_bend_straight_edges_more_than_they_mend_are_left_out() -> None:
+    """Half of the matches of each pair lie on something near; edges run across it, and straight ones are long."""
+    sequence = scene(None)
+    found = []
+    for match in matches(sequence, count=600):
+        near = np.abs(match.points1 % 160.0 - 80.0).max(axis=1) < 45.0
+        found.append(replace(match, points2=match.points2 + np.where(near, 4.0, 0.0)[:, None] * (1.0, -1.0)))
+    starts = [(x, y, 40.0 * k) for k in (-1, 0, 1) for x in (20, 300) for y in range(60, 460, 20)]
+    ends = np.array([[(x, y), (x + 300.0, y + rise)] for x, y, rise in starts])
+    on = align_locally(found, CAMERAS, homographies(sequence))
+    off = align_locally(found, CAMERAS, homographies(sequence), edges=lambda image: ends)
+    assert len(on.fields) == 6
+    worst = max(float(np.percentile(field.bends(ends), 95)) for field in on.fields)
+    assert worst > 1.0
+    assert all(np.percentile(field.bends(ends), 95) < 0.5 * worst for field in off.fields)
+
+
+def test_a_bend_is_the_distance_from_a_straight_line() -> None:
+    x, y = node_points(SIZE, SHAPE).T
+    bow = DisplacementField(
+        SIZE, np.stack([0.1 * x, 4.0 * (1.0 - ((x - 319.5) / 200.0) ** 2) + 0.05 * y], -1).reshape(*SHAPE, 2)
+    )
+    ends = np.array([[(119.5, 200.0), (519.5, 200.0)], [(300.0, 40.0), (300.0, 440.0)]])
+    np.testing.assert_allclose(bow.bends(ends), [4.0, 0.0], atol=0.05)

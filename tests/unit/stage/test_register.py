@@ -7,17 +7,20 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.source import read_sources
 from rdstitch.io.flat_field import FlatField, read_flat_field
+from rdstitch.io.stored_tiles import stored_tiles
 from rdstitch.pipeline.read_inputs import with_flat_field
 from rdstitch.stage import TileRegistration, register_tiles
-from rdstitch.stage.correlation import Overlap, correlate
+from rdstitch.stage.axes import with_axes_shown
+from rdstitch.stage.correlation import Overlap, coarse_tile, correlate
 from rdstitch.stage.estimate_flat_field import estimate_illumination
 from rdstitch.stage.grid import TileGrid
-from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table, oriented
+from rdstitch.stage.positions import Scan, grid_from_names, grid_from_table, grid_from_tiles
 from tests.stage_grid import Specimen, StageGrid
 
 
@@ -40,7 +43,7 @@ def test_few_tiles_that_show_other_things_have_no_flat_field() -> None:
 
 
 def test_what_is_read_before_the_flat_field_is_known_is_corrected_too(tmp_path: Path) -> None:
-    stage = StageGrid(rows=3, columns=4, tile=256, content=0.5, seed=1)
+    stage = StageGrid(rows=6, columns=6, tile=192, content=0.5, seed=1)
     sources, _ = read_sources(stage.write(tmp_path), skip_bad=False)
     raw = [source.read(keep=True).pixels for source in sources]
     corrected, _ = with_flat_field(sources, "auto")
@@ -68,10 +71,20 @@ SIZE = (100, 80)
 
 def test_names_give_rows_and_columns() -> None:
     names = ["s_r03c10.tif", "s_r03c11.tif", "s_r04c10.tif"]
-    grid = grid_from_names(names, "r{row}c{col}", 0.1, SIZE)
+    grid = grid_from_names(names, "r{row}c{col}", 10.0, SIZE)
     np.testing.assert_allclose(grid.places, [(0, 0), (90, 0), (0, 72)])
     assert (grid.rows.tolist(), grid.columns.tolist()) == ([0, 0, 1], [0, 1, 0])
     assert sorted(map(tuple, grid.neighbours(4.0).tolist())) == [(0, 1), (0, 2)]
+
+
+def test_running_numbers_go_to_and_fro_from_a_corner() -> None:
+    names = [f"img_{k:03d}.tif" for k in range(5, 11)]
+    grid = grid_from_names(names, "img_{number}", 0.0, (10, 10), Scan(3, "snake-rows", "bottom-left"))
+    np.testing.assert_array_equal(grid.places, [(0, 10), (10, 10), (20, 10), (20, 0), (10, 0), (0, 0)])
+    down = grid_from_names(names, "img_{number}", 0.0, (10, 10), Scan(3, "snake-columns", "top-right"))
+    np.testing.assert_array_equal(down.places, [(20, 0), (20, 10), (10, 10), (10, 0), (0, 0), (0, 10)])
+    plate = grid_from_names(["plate_A01.tif", "plate_B02.tif"], "{letter}{col}", 0.0, (10, 10))
+    np.testing.assert_array_equal(plate.places, [(0, 0), (10, 10)])
 
 
 @pytest.mark.parametrize(
@@ -79,7 +92,7 @@ def test_names_give_rows_and_columns() -> None:
 )
 def test_a_pattern_that_does_not_tell_tiles_apart_is_refused(pattern: str, names: list[str]) -> None:
     with pytest.raises(ArgumentError):
-        grid_from_names(names, pattern, 0.1, SIZE)
+        grid_from_names(names, pattern, 10.0, SIZE)
 
 
 def test_a_table_in_micrometres_needs_the_size_of_a_pixel(tmp_path: Path) -> None:
@@ -103,7 +116,7 @@ def test_ome_tiff_says_where_it_was_taken(tmp_path: Path) -> None:
             "Plane": {"PositionX": 0.0225 * k, "PositionXUnit": "mm", "PositionY": 1.0, "PositionYUnit": "mm"},
         }
         tifffile.imwrite(file, np.zeros((80, 100), np.uint16), ome=True, metadata=metadata)
-    grid = grid_from_files(files, SIZE, None)
+    grid = grid_from_tiles(stored_tiles(files), SIZE, None)
     np.testing.assert_allclose(grid.places, [(0, 0), (90, 0)])
     assert grid.pixel_size == 0.25
 
@@ -122,18 +135,75 @@ def test_micro_manager_says_it_beside_the_files(tmp_path: Path) -> None:
     files = [tmp_path / f"img_{k}.tif" for k in range(2)]
     for file in files:
         tifffile.imwrite(file, np.zeros((80, 100), np.uint16))
-    np.testing.assert_allclose(grid_from_files(files, SIZE, None).places, [(90, 0), (0, 0)])
+    np.testing.assert_allclose(grid_from_tiles(stored_tiles(files), SIZE, None).places, [(90, 0), (0, 0)])
     (tmp_path / "metadata.txt").unlink()
     with pytest.raises(InputError, match="--grid"):
-        grid_from_files(files, SIZE, None)
+        grid_from_tiles(stored_tiles(files), SIZE, None)
 
 
-def test_axes_of_the_stage_are_turned_only_where_the_tiles_say_so() -> None:
-    grid = TileGrid(np.array([(0.0, 0.0), (90.0, 0.0), (0.0, 72.0)]), SIZE)
-    mirrored = np.array([(90.0, 0.0), (0.0, 0.0), (90.0, 72.0)])
-    assert oriented(grid, lambda _: 1.0) is grid
-    found = oriented(grid, lambda g: 5.0 if np.allclose(g.places, mirrored) else 1.0)
-    np.testing.assert_allclose(found.places, mirrored)
+@pytest.mark.parametrize("matrix", [((0, 1), (1, 0)), ((1, 0), (0, -1)), ((-1, 0), (0, -1))])
+def test_axes_and_overlap_are_those_that_the_tiles_show(matrix: tuple[tuple[int, int], tuple[int, int]]) -> None:
+    stage = StageGrid(rows=3, columns=3, tile=256, overlap=0.13, content=0.9, seed=5)
+    told = stage.nominal @ np.array(matrix, float) * 0.9
+    grid = TileGrid(told - told.min(axis=0), (256, 256))
+    read = lambda index: coarse_tile(stage.render(index), 1)  # noqa: E731
+    shown, words = with_axes_shown(grid, read, 1, 12.8)
+    assert np.abs(shown.places - stage.nominal).max() < 12.0
+    assert "neighbours overlap by 1" in words
+    right = TileGrid(stage.nominal, (256, 256))
+    assert with_axes_shown(right, read, 1, 12.8) == (right, "")
+
+
+def _array(rng: np.random.Generator) -> tuple[list[NDArray[np.float32]], FloatArray]:
+    """Six tiles of an integrated circuit with nothing unique, and where they are, some pixels off."""
+    y, x = np.mgrid[:640, :900].astype(np.float32)
+    ground = 60.0 * np.exp(-((x % 16.0 - 8.0) ** 2 + (y % 10.0 - 5.0) ** 2) / 6.0)
+    places = np.array([(270.0 * c, 220.0 * r) for r in range(2) for c in range(3)]) + rng.integers(0, 5, (6, 2)).astype(
+        np.float64
+    )
+    tiles = [ground[int(v) : int(v) + 256, int(u) : int(u) + 320] for u, v in places]
+    return [(tile + rng.normal(0.0, 3.0, tile.shape)).astype(np.float32) for tile in tiles], places
+
+
+def test_tiles_of_a_pattern_without_anything_unique_stay_where_the_stage_was_sent() -> None:
+    tiles, places = _array(np.random.default_rng(4))
+    nominal = np.array([(270.0 * c, 220.0 * r) for r in range(2) for c in range(3)])
+    grid = TileGrid(nominal, (320, 256))
+    assert with_axes_shown(grid, lambda index: coarse_tile(tiles[index], 1), 1, 16.0)[1] == ""
+    found = register_tiles(grid, tiles.__getitem__)
+    off = found.adjustment.places - places
+    assert np.abs(off - np.median(off, axis=0)).max() < 5.0
+    assert (
+        np.abs(off - off[list(found.groups[0]) if found.groups else 0].mean(axis=0)).max(axis=1) < 5 * found.stds + 0.5
+    ).all()
+
+
+def test_a_tile_that_lies_elsewhere_is_found_there() -> None:
+    stage = StageGrid(rows=3, columns=3, tile=256, overlap=0.2, content=0.9, backlash=0.0, seed=6)
+    nominal = stage.nominal.copy()
+    nominal[4] += (45.0, -20.0)
+    tiles = [stage.render(index).astype(np.float32) for index in range(9)]
+    found = register_tiles(TileGrid(nominal, (256, 256)), tiles.__getitem__)
+    off = found.adjustment.places - stage.places
+    assert np.abs(off - np.median(off, axis=0)).max() < 0.5
+    assert int(found.off_stage.argmax()) == 4
+
+
+@pytest.mark.parametrize("content", [0.35, 0.9])
+def test_errors_are_what_they_are_said_to_be(content: float) -> None:
+    squared = []
+    for seed in range(3):
+        stage = StageGrid(rows=5, columns=5, tile=192, overlap=0.15, content=content, backlash=4.0, seed=seed)
+        found = _registered(stage)
+        off = found.adjustment.places - stage.places
+        squared.append(((off - off[list(found.groups[0])].mean(axis=0)) / found.stds[:, None]) ** 2)
+    assert 0.3 < np.mean(squared) < 2.5
+    assert np.max(squared) < 25.0
+
+
+def test_two_tiles_show_no_lens() -> None:
+    stage = StageGrid(rows=1, columns=2, tile=320, overlap=0.13, content=0.9, seed=3)
+    assert _registered(stage).adjustment.distortion == 0.0
 
 
 def _registered(stage: StageGrid) -> TileRegistration:
@@ -188,7 +258,7 @@ def test_a_wrong_period_of_a_pattern_does_not_win_by_the_height_of_its_peak(seed
     ground = dots + 30.0 * clouds / clouds.std()
     tiles = [ground[20:276, 10:266], ground[23:279, 225:481]]
     tiles = [(tile + rng.normal(0.0, 12.0, size=tile.shape)).astype(np.float32) for tile in tiles]
-    overlap = Overlap.expected(0, 1, np.array([212.0, 0.0]), (256, 256), 5)
+    overlap = Overlap.expected(0, 1, np.array([212.0, 0.0]), np.full((2, 2), 256), 5)
     surface = correlate(tiles[0], tiles[1], overlap, 30).total(np.zeros((len(overlap.blocks), 2)), 30)
     highest = np.unravel_index(int(surface.argmax()), surface.shape)
     assert np.abs(np.array(highest) - (33, 33)).max() > 5

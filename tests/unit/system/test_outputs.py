@@ -1,6 +1,7 @@
 """Output files, and the safe opening of files."""
 
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -200,6 +201,52 @@ def test_leftovers_of_dead_processes_go_and_those_of_living_ones_stay(
     assert _leftovers(out, temporary) == []
 
 
+def test_what_a_process_of_another_machine_writes_stays(tmp_path: Path) -> None:
+    # On a mount that both see, whose locks hold nothing.
+    for name, host in (("here", platform.node()), ("there", "another machine")):
+        (tmp_path / f".rdstitch-{name}.part").mkdir()
+        (tmp_path / f".rdstitch-{name}.part" / "lock").write_text(f"{host}\n{2**30}\n")
+    write_bytes_atomic(tmp_path / "a.txt", b"x")
+    assert [path.name for path in _leftovers(tmp_path)] == [".rdstitch-there.part"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="the system does not say which files are open")
+def test_nothing_is_renamed_in_which_a_file_is_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows refuses that."""
+
+    def refusing(rename: Callable[[Path, Path], None]) -> Callable[[Path, Path], None]:
+        def renamed(old: Path, new: Path) -> None:
+            targets = [os.path.realpath(link) for link in Path("/proc/self/fd").iterdir()]
+            if any(Path(target).is_relative_to(old) for target in targets):
+                raise PermissionError(13, "is used by another process", str(old))
+            rename(old, new)
+
+        return renamed
+
+    for name in ("rename", "replace"):
+        monkeypatch.setattr(os, name, refusing(getattr(os, name)))
+    for _ in range(2):
+        with Outputs(overwrite=True) as outputs:
+            with outputs.writing(tmp_path / "x_files", is_folder=True) as folder:
+                (folder / "0").mkdir()
+                (folder / "0" / "0_0.jpg").write_bytes(b"tile")
+            outputs.write(tmp_path / "x.dzi", b"description")
+    assert {path.name for path in tmp_path.rglob("*")} == {"x_files", "0", "0_0.jpg", "x.dzi"}
+
+
+def test_of_two_outputs_in_one_place_neither_is_published(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path)
+
+    def write() -> None:
+        with Outputs(overwrite=True) as outputs:
+            outputs.write(tmp_path / "a.txt", b"first")
+            outputs.write(tmp_path / "link" / "a.txt", b"second")
+
+    with pytest.raises(OutputError, match="is the name of two outputs"):
+        write()
+    assert [path.name for path in tmp_path.iterdir()] == ["link"]
+
+
 @pytest.mark.parametrize("make", [lambda path: path.mkdir(), lambda path: path.touch()])
 def test_what_only_has_the_name_of_a_leftover_stays(tmp_path: Path, make: Callable[[Path], None]) -> None:
     make(tmp_path / ".rdstitch-mine.part")
@@ -306,7 +353,7 @@ def test_addresses_of_nothing(flight: str, name: str, message: str) -> None:
 
 def test_a_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
-    with pytest.raises(InputError, match=r"URLs need the extra remote: pip install 'rdstitch\[remote\]'"):
+    with pytest.raises(InputError, match=r"URLs need fsspec: pip install 'fsspec\[http\]'"):
         read_metadata(Path("s3://bucket/a.jpg"))
 
 

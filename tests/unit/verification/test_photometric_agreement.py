@@ -53,6 +53,23 @@ def test_exposure_and_contrast_do_not_matter() -> None:
     assert overlap_agreement(_placed(100, 100), _placed(200, 150, pixels=darker)).share > 0.95
 
 
+def test_small_differences_on_a_large_base_count() -> None:
+    """As of thermal cameras: 16-bit counts, or kelvins."""
+    for base, scale, kind in ((12000.0, 31.0, np.uint16), (290.0, 0.6, np.float32)):
+        compared = [
+            ComparedImage.of(
+                DecodedImage((base + scale * placed.grey).astype(kind), None, Metadata(SIZE)),
+                LENS,
+                placed.homography,
+                (base, base + scale),
+            )
+            for placed in (_placed(100, 100), _placed(200, 150))
+        ]
+        found = overlap_agreement(*compared)
+        assert found.cells > 40
+        assert found.share > 0.95
+
+
 def test_what_has_no_texture_says_nothing() -> None:
     flat = np.full((300, 400), 0.5, dtype=np.float32)
     assert overlap_agreement(_placed(100, 100, pixels=flat), _placed(200, 150)).cells == 0

@@ -1,0 +1,199 @@
+"""The lens that took another band, by what images of both show: phase correlation of patches, and one fit of all.
+
+Bands of a rig are taken at one moment from one place by lenses side by side. To first order one image is then a
+homography of the other for the whole flight, at the usual distance, with a distortion of its own. Contrast differs, and
+may be reversed: what is compared is where it is strong.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import FloatArray
+from rdstitch.errors import InputError
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import from_plane, to_plane
+from rdstitch.inputs.source import Source
+from rdstitch.results.messages import Message
+from rdstitch.system.late_imports import optimize
+
+_MAX_IMAGES = 8  # that are compared
+_COARSE_SIDE = 512  # pixels
+_PATCHES = 5  # along the longer side
+_AGREEING = 1.0  # pixels: patches that show a common shift
+_ENOUGH = 0.3  # of the patches must agree for a shift to be one
+_WORTH_CORRECTING = 0.2  # pixels: the error of a patch
+_ELSEWHERE = 4.0  # pixels between images of one flight: parallax, and triggers that are not quite at one time
+_ROUNDS = 3
+
+Grey = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class _Shifts:
+    """Patches of one pair of images."""
+
+    points: FloatArray  # (P, 2): pixels of the registered image
+    others: FloatArray  # (P, 2): where the other image shows the same
+
+
+@dataclass(frozen=True, eq=False)
+class BandLens:
+    """How another lens beside the registered one sees."""
+
+    homography: FloatArray  # (3, 3): undistorted normalized coordinates of the registered image to those of the band
+    distortion: float  # what the band's λ has more
+    shift: float  # median distance of what the band shows from where the registered image has it, pixels
+    error: float  # what is left of it
+
+    def camera(self, camera: Camera) -> Camera:
+        """The band's camera beside a registered one."""
+        return replace(camera, distortion=camera.distortion + self.distortion)
+
+    @property
+    def message(self) -> Message:
+        """What the user should know of it."""
+        text = f"{self.shift:.1f} pixels from what was registered in the median: the lens of this band was registered"
+        return Message(f"{text}, to {self.error:.1f} pixels", severity="note", code="band-lens")
+
+
+def band_lens(
+    pairs: Mapping[int, tuple[Source, Source]], report: Callable[[int, int], None] = lambda done, total: None
+) -> tuple[BandLens | None, list[Message]]:
+    """The lens of a band from registered images and those that take their place, by numbers; None where it is the same.
+
+    Where the images show nothing in common, as masks do, nothing is known, and nothing changed.
+
+    Raises
+    ------
+    InputError
+        When images were evidently not taken from the same places.
+    """
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_IMAGES)).astype(np.intp)).tolist()
+    compared = [list(pairs.values())[k] for k in chosen]
+    compared = [pair for pair in compared if pair[0].camera.image_size == pair[1].camera.image_size]
+    if not compared:
+        return None, []
+    edges = []
+    for done, pair in enumerate(compared):
+        report(done, len(compared))
+        edges.append((_edges(pair[0]), _edges(pair[1])))
+    coarse = [_coarse_shift(*each) for each in edges]
+    _refuse_other_places(compared, edges, coarse)
+    expected: Callable[[FloatArray], FloatArray] = partial(np.add, np.median(coarse, axis=0))
+    camera = compared[0][0].camera
+    found = BandLens(np.eye(3), 0.0, 0.0, 0.0)
+    for _ in range(_ROUNDS):
+        shifts = [_patch_shifts(*each, expected) for each in edges]
+        fitted = _fit(camera, shifts)
+        if fitted is None:
+            return None, []
+        found, expected = fitted, partial(_seen_by_band, camera, fitted.homography, fitted.distortion)
+    return (None, []) if found.shift < max(_WORTH_CORRECTING, found.error) else (found, [found.message])
+
+
+def _seen_by_band(camera: Camera, homography: FloatArray, distortion: float, points: FloatArray) -> FloatArray:
+    """Pixels (N, 2) of a registered image as the band has them."""
+    other = replace(camera, distortion=camera.distortion + distortion)
+    return from_plane(other, np.eye(3), to_plane(camera, homography, points))
+
+
+def _edges(source: Source) -> Grey:
+    """Where the contrast is strong, whatever its sign, of one standard deviation."""
+    pixels = source.read().pixels
+    grey = pixels.astype(np.float32) if pixels.ndim == 2 else pixels[..., :3].mean(axis=2, dtype=np.float32)
+    smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    steep = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+    # The few strongest edges shall not outweigh all others.
+    level = float(np.median(steep)) or float(steep.mean()) or 1.0
+    compressed: Grey = np.log1p(steep / level).astype(np.float32)
+    return compressed
+
+
+def _shift(first: Grey, second: Grey) -> FloatArray:
+    """By how many pixels (x, y) the second shows the same further right and down."""
+    window = cv2.createHanningWindow((first.shape[1], first.shape[0]), cv2.CV_32F)
+    (x, y), _ = cv2.phaseCorrelate(first - first.mean(), second - second.mean(), window)
+    return np.array([x, y])
+
+
+def _coarse_shift(first: Grey, second: Grey) -> FloatArray:
+    factor = min(1.0, _COARSE_SIDE / max(first.shape))
+    size = round(first.shape[1] * factor), round(first.shape[0] * factor)
+    small = [cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (first, second)]
+    moved: FloatArray = _shift(small[0].astype(np.float32), small[1].astype(np.float32)) / factor
+    return moved
+
+
+def _patch_shifts(first: Grey, second: Grey, expected: Callable[[FloatArray], FloatArray]) -> _Shifts:
+    """Patches of the first image, and where the second one shows them, near where that is expected."""
+    height, width = first.shape
+    side = max(32, max(width, height) // _PATCHES // 2 * 2)
+    corners = np.array(
+        [(x, y) for y in range(0, height - side + 1, side // 2) for x in range(0, width - side + 1, side // 2)]
+    )
+    points = corners.astype(np.float64).reshape(-1, 2) + (side - 1) / 2
+    starts = np.rint(expected(points) - points)
+    starts = np.where(np.isfinite(starts), starts, 0.0).astype(np.intp) + corners.reshape(-1, 2)
+    kept, others = [], []
+    for (x, y), (u, v), point in zip(corners.reshape(-1, 2).tolist(), starts.tolist(), points, strict=True):
+        if 0 <= u <= width - side and 0 <= v <= height - side:
+            moved = _shift(first[y : y + side, x : x + side], second[v : v + side, u : u + side])
+            kept.append(point)
+            others.append(point + moved + np.array([u - x, v - y]))
+    return _Shifts(np.array(kept).reshape(-1, 2), np.array(others).reshape(-1, 2))
+
+
+def _fit(camera: Camera, shifts: Sequence[_Shifts]) -> BandLens | None:
+    """The lens that most patches agree with; None where few do."""
+    points, others = (np.concatenate([getattr(each, name) for each in shifts]) for name in ("points", "others"))
+    if len(points) < 9:
+        return None
+    start = np.zeros(9)
+    start[[2, 5]] = np.median(others - points, axis=0) / camera.scale
+
+    def seen(parameters: FloatArray) -> FloatArray:
+        homography = np.eye(3) + np.append(parameters[:8], 0.0).reshape(3, 3)
+        return _seen_by_band(camera, homography, float(parameters[8]), points)
+
+    def residuals(parameters: FloatArray) -> FloatArray:
+        off: FloatArray = np.nan_to_num(seen(parameters) - others, nan=1e3).ravel()
+        return off
+
+    result = optimize.least_squares(residuals, start, loss="cauchy", f_scale=_AGREEING / 3.0, x_scale=0.01, max_nfev=50)
+    off = np.linalg.norm(residuals(result.x).reshape(-1, 2), axis=1)
+    if (off < _AGREEING).mean() < _ENOUGH:
+        return None
+    moved = np.linalg.norm(seen(result.x) - points, axis=1)
+    homography = np.eye(3) + np.append(result.x[:8], 0.0).reshape(3, 3)
+    agreeing = off < _AGREEING
+    return BandLens(homography, float(result.x[8]), float(np.median(moved)), float(np.median(off[agreeing])))
+
+
+def _refuse_other_places(
+    compared: Sequence[tuple[Source, Source]], edges: Sequence[tuple[Grey, Grey]], coarse: Sequence[FloatArray]
+) -> None:
+    """Refuse images that show the same as the registered ones, but each shifted by something else."""
+    sure = []
+    for (first, second), shift in zip(edges, coarse, strict=True):
+        shifts = _patch_shifts(first, second, partial(np.add, shift))
+        away = np.linalg.norm(shifts.others - shifts.points - shift, axis=1)
+        sure.append(len(away) > 0 and float((away < 3.0 * _AGREEING).mean()) > _ENOUGH)
+    certain = np.array(sure)
+    if certain.sum() < 2:
+        return
+    shifts_of = np.array(coarse)
+    off = np.where(certain, np.linalg.norm(shifts_of - np.median(shifts_of[certain], axis=0), axis=1), 0.0)
+    worst = int(np.argmax(off))
+    limit = max(_ELSEWHERE, 0.01 * math.hypot(*edges[0][0].shape))
+    if off[worst] > limit:
+        registered, given = compared[worst]
+        raise InputError(
+            f"{given.path}: shows what {registered.name} does {off[worst]:.0f} pixels further off than the "
+            "others do: it was not taken from the same place; register these images of their own"
+        )

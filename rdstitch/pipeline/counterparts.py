@@ -1,0 +1,187 @@
+"""Which given image takes the place of which registered one: by name, what varies in the names, time, or position."""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.errors import InputError
+from rdstitch.inputs.frame import Frame, files_of
+from rdstitch.inputs.measurements import metres_around_median
+from rdstitch.io.metadata import GpsPosition, read_metadata
+from rdstitch.io.opening import check_readable
+from rdstitch.results.messages import Message, names_of, shortened
+from rdstitch.sidecar.read import ImageRecord, SavedRegistration
+from rdstitch.system.file_access import canonical_name, canonical_text
+
+MatchBy = Literal["auto", "name", "order"]
+MatchedBy = Literal["name", "time", "position", "order"]
+_TOKEN = re.compile(r"\d+|[^\W\d_]+|[\W_]+")
+
+Chosen = list[Frame | None]
+"""For each image of the registration the frame that takes its place."""
+
+
+def counterparts(
+    saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy
+) -> tuple[Chosen, MatchedBy, list[Message]]:
+    """For each registered image the frame that takes its place, by what it was found, and which frames have none."""
+    # Arrays have no names of their own.
+    if match == "order" or all(frame.image is not None for frame in frames):
+        return list(_by_order(saved, frames)), "order", []
+    chosen: Chosen = []
+    for part in ("name", "stem"):
+        chosen = _by_name(saved, frames, attrgetter(part))
+        if any(frame is not None for frame in chosen):
+            return chosen, "name", []
+    ways: tuple[tuple[MatchedBy, Callable[[], Chosen | None]], ...] = (
+        ("name", lambda: _by_varying_part(saved, frames)),
+        ("time", lambda: _by_measurement(saved, frames, _seconds)),
+        ("position", lambda: _by_measurement(saved, frames, _metres)),
+    )
+    for matched, find in ways[:1] if match == "name" else ways:
+        if (found := find()) is not None:
+            return found, matched, _without_counterpart(found, frames)
+    for path in files_of(frames):
+        check_readable(path)
+    wanted = next(image.name for image in saved.images if image.to_plane is not None)
+    by = "has a name that is in it" if match == "name" else "fits by name, time or GPS position to one in it"
+    raise InputError(
+        f"{saved.path}: none of the given images {by}, such as {wanted}; --match order takes them in order"
+    )
+
+
+def _without_counterpart(chosen: Chosen, frames: Sequence[Frame]) -> list[Message]:
+    taken = {id(frame) for frame in chosen}
+    extra = [str(frame.path) for frame in frames if id(frame) not in taken]
+    if not extra:
+        return []
+    who = "has" if len(extra) == 1 else f"{len(extra)} of the given images ({shortened(names_of(extra))}) have"
+    return [Message(f"{who} no counterpart among those registered, and is not used", tuple(extra))]
+
+
+def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[Path], str]) -> Chosen:
+    given: dict[str, list[Frame]] = {}
+    for frame in frames:
+        given.setdefault(canonical_name(key(frame.path)), []).append(frame)
+    chosen: Chosen = []
+    for image in saved.images:
+        *folders, name = Path(canonical_text(image.name)).parts or ("",)
+        alike = [] if image.to_plane is None else given.get(key(Path(name)), [])
+        if folders:
+            alike = [frame for frame in alike if _folders(frame)[-len(folders) :] == folders]
+        if len(alike) > 1 or (alike and alike[0] in chosen):
+            raise InputError(
+                f"{saved.path}: several images are called {name}; give as many images as it has, in its order, with "
+                "--match order"
+            )
+        chosen.append(alike[0] if alike else None)
+    return chosen
+
+
+def _folders(frame: Frame) -> list[str]:
+    return [canonical_name(part) for part in frame.path.absolute().parent.parts]
+
+
+def _by_varying_part(saved: SavedRegistration, frames: Sequence[Frame]) -> Chosen | None:
+    """By what differs between names of one side, as of V07_RED.jpg and V07_NIR.jpg."""
+    ours = _varying_parts([image.name for image in saved.images])
+    theirs = _varying_parts([frame.path.name for frame in frames])
+    if ours is None or theirs is None or not set(ours) & set(theirs):
+        return None
+    files = dict(zip(theirs, frames, strict=True))
+    used = zip(saved.images, ours, strict=True)
+    chosen = [None if image.to_plane is None else files.get(part) for image, part in used]
+    # Equal numbers of another flight are no counterparts.
+    for measure in (_seconds, _metres):
+        near = _by_measurement(saved, frames, measure)
+        for image, by_name, by_place in zip(saved.images, chosen, near or chosen, strict=True):
+            if by_name is not None and by_place is not None and by_name is not by_place:
+                raise InputError(
+                    f"{by_name.path}: has the number of {image.name}, but {by_place.path.name} was taken when and "
+                    "where that was; --match order takes images in order"
+                )
+    return chosen
+
+
+def _varying_parts(names: Sequence[str]) -> list[tuple[str, ...]] | None:
+    """Of each name without suffix the parts that are not the same in all; None where these do not tell them apart."""
+    split = [_TOKEN.findall(Path(canonical_text(name)).stem) for name in names]
+    if len(names) < 2 or len({len(parts) for parts in split}) != 1:
+        return None
+    varying = [k for k, column in enumerate(zip(*split, strict=True)) if len(set(column)) > 1]
+    keys = [tuple(parts[k] for k in varying) for parts in split]
+    return keys if max(Counter(keys).values()) == 1 else None
+
+
+_Known = tuple[float | None, GpsPosition | None]
+
+
+def _seconds(ours: Sequence[_Known], theirs: Sequence[_Known]) -> tuple[FloatArray, FloatArray]:
+    each = [np.array([np.nan if time is None else time for time, _ in known]) for known in (ours, theirs)]
+    return each[0][:, None], each[1][:, None]
+
+
+def _metres(ours: Sequence[_Known], theirs: Sequence[_Known]) -> tuple[FloatArray, FloatArray]:
+    both = metres_around_median([position for _, position in (*ours, *theirs)])
+    return both[: len(ours)], both[len(ours) :]
+
+
+def _by_measurement(
+    saved: SavedRegistration,
+    frames: Sequence[Frame],
+    measure: Callable[[Sequence[_Known], Sequence[_Known]], tuple[FloatArray, FloatArray]],
+) -> Chosen | None:
+    """By what is nearer than half the way to the next registered image; None where most have no such counterpart."""
+    if any(frame.image is not None or frame.number is not None for frame in frames):
+        return None
+    theirs = []
+    for frame in frames:
+        metadata = read_metadata(frame.path)
+        theirs.append((metadata.timestamp, metadata.gps))
+    here, there = measure([_known_of(image) for image in saved.images], theirs)
+    used = np.array([image.to_plane is not None for image in saved.images])
+    here = np.where(used[:, None], here, np.nan)
+    distance = np.linalg.norm(here[:, None] - there[None], axis=2)
+    between = np.linalg.norm(here[:, None] - here[None], axis=2)
+    np.fill_diagonal(between, np.nan)
+    if not (np.isfinite(distance).any() and np.isfinite(between).any()):
+        return None
+    reach = np.min(np.where(np.isfinite(between), between, np.inf), axis=1) / 2.0
+    nearest = np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=1)
+    fits = distance[np.arange(len(here)), nearest] < reach
+    counts = Counter(nearest[fits].tolist())
+    chosen = [frames[k] if fit and counts[k] == 1 else None for k, fit in zip(nearest.tolist(), fits, strict=True)]
+    return chosen if 2 * sum(frame is not None for frame in chosen) > used.sum() else None
+
+
+def _known_of(image: ImageRecord) -> _Known:
+    """Time and position of a registered image."""
+    gps = None if image.gps is None else GpsPosition(*image.gps)
+    return image.timestamp, gps
+
+
+def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Frame]:
+    if any(image.camera is None for image in saved.images):
+        raise InputError(
+            f"{saved.path}: has images that could not be read, so that the order is lost; give images of the same names"
+        )
+    if len(frames) != len(saved.images):
+        for path in files_of(frames):
+            check_readable(path)
+        raise InputError(
+            f"{saved.path}: has {len(saved.images)} images, but {len(frames)} others were given; give images of "
+            "the same names, or equally many"
+        )
+    return frames
+
+
+def registered_files(saved: SavedRegistration, chosen: Mapping[int, Frame]) -> dict[int, Path]:
+    """Files of the registered images that are still there, where they are not the given ones themselves."""
+    files = {k: Path(saved.images[k].path) for k in chosen}
+    return {k: file for k, file in files.items() if file.is_file() and file.resolve() != chosen[k].path.resolve()}

@@ -1,0 +1,121 @@
+"""Another band by the registration of a first one: which image belongs where, and what its lens is."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+from rdstitch.compositing import CompositeOptions
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.crs import Crs
+from rdstitch.pipeline.apply_sidecar import apply
+from rdstitch.pipeline.recipes import mosaic
+from rdstitch.results.stitch_options import StitchOptions
+from tests.cli.running import flight
+
+_SHIFT = np.array([-7.0, 9.0])
+_NAMES = [f"IMG_{k:04d}_{{}}.png" for k in (3, 4, 7, 8, 11, 12)]
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folders red/ and nir/, the latter by a lens beside the first one and with reversed contrast, and red.tif."""
+    folder = tmp_path_factory.mktemp("rig")
+    red = flight(7, 3, 2)
+    assert isinstance(red.lens, Camera)
+    center = np.array(red.lens.center) + _SHIFT
+    nir = replace(red, lens=replace(red.lens, focal=382.0, center=(float(center[0]), float(center[1]))))
+    place = Crs(32733)
+    rows = ["name,lat,lon"]
+    for name, sequence in (("red", red), ("nir", nir)):
+        (folder / name).mkdir()
+        for k, pattern in enumerate(_NAMES):
+            frame = sequence.frame(k)
+            file = folder / name / pattern.format(name.upper())
+            cv2.imwrite(str(file), frame if name == "red" else 255 - frame[..., 1] // 2)
+            x, y = red.poses.position[k] * 0.05
+            ((latitude, longitude),) = place.geographic([(500_000.0 + x, 7_000_000.0 - y)])
+            rows.append(f"{file.name},{latitude:.10f},{longitude:.10f}")
+    (folder / "p.csv").write_text("\n".join(rows), encoding="utf-8")
+    options = StitchOptions(workers=1, positions=folder / "p.csv")
+    mosaic([folder / "red"], folder / "red.tif", options)
+    return folder
+
+
+def _shift_between(first: Path, second: Path) -> float:
+    """Median distance between what two files show, pixels."""
+    with rasterio.open(first) as one, rasterio.open(second) as two:
+        assert (one.transform, one.shape, one.crs) == (two.transform, two.shape, two.crs)
+        bands = [opened.read(1).astype(np.float32) for opened in (one, two)]
+    steep = [np.hypot(cv2.Sobel(band, cv2.CV_32F, 1, 0), cv2.Sobel(band, cv2.CV_32F, 0, 1)) for band in bands]
+    window, side, shifts = cv2.createHanningWindow((96, 96), cv2.CV_32F), 96, []
+    for y in range(60, steep[0].shape[0] - side - 60, side):
+        for x in range(60, steep[0].shape[1] - side - 60, side):
+            parts = [np.log1p(each[y : y + side, x : x + side]) for each in steep]
+            shifts.append(cv2.phaseCorrelate(parts[0] - parts[0].mean(), parts[1] - parts[1].mean(), window)[0])
+    return float(np.median(np.linalg.norm(shifts, axis=1)))
+
+
+def test_a_band_by_another_lens_is_registered(rig: Path, tmp_path: Path) -> None:
+    result = apply(rig / "red.tif.json", [rig / "nir"], tmp_path / "nir.tif", workers=1)
+    assert result.matched == "name"
+    (told,) = [message.text for message in result.messages if message.code == "band-lens"]
+    assert told.startswith("11.")
+    assert _shift_between(rig / "red.tif", tmp_path / "nir.tif") < 0.3
+    again = apply(tmp_path / "nir.tif.json", [rig / "nir"], tmp_path / "again.tif", workers=1)
+    assert not [message for message in again.messages if message.code == "band-lens"]
+    assert _shift_between(rig / "red.tif", tmp_path / "again.tif") < 0.3
+
+
+def test_a_lost_image_and_one_from_elsewhere_move_no_other(rig: Path, tmp_path: Path) -> None:
+    files = sorted((rig / "nir").iterdir())
+    stranger = tmp_path / "IMG_0099_NIR.png"
+    stranger.write_bytes(files[0].read_bytes())
+    result = apply(rig / "red.tif.json", [*files[:2], *files[3:], stranger], tmp_path / "nir.tif", workers=1)
+    assert list(result.left_out) == [2]
+    assert [Path(m.images[0]).name for m in result.messages if "no counterpart" in m.text] == [stranger.name]
+    assert _shift_between(rig / "red.tif", tmp_path / "nir.tif") < 0.3
+
+
+def test_images_of_other_places_are_refused(rig: Path, tmp_path: Path) -> None:
+    """Under right names, shifted each by something else."""
+    for k, file in enumerate(sorted((rig / "nir").iterdir())):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(tmp_path / file.name), np.roll(image, (12 * k, -9 * k), axis=(0, 1)))
+    with pytest.raises(InputError, match="was not taken from the same place"):
+        apply(rig / "red.tif.json", [tmp_path], workers=1)
+    unlike = [tmp_path / f"{word}.png" for word in ("one", "two", "three", "four", "five", "six")]
+    for file, copy in zip(sorted((rig / "red").iterdir()), unlike, strict=True):
+        copy.write_bytes(file.read_bytes())
+    with pytest.raises(InputError, match="--match order takes them in order"):
+        apply(rig / "red.tif.json", unlike, workers=1)
+
+
+def test_the_grid_of_another_file(rig: Path, tmp_path: Path) -> None:
+    """An extent of the map, and the same pixels for another run; elsewhere there is nothing."""
+    sidecar, files = rig / "red.tif.json", [rig / "red"]
+    with rasterio.open(rig / "red.tif") as opened:
+        west, south = opened.bounds.left + 5.0, opened.bounds.bottom + 5.0
+    part = CompositeOptions(extent=(west, south, west + 12.0, south + 8.0), gsd=0.1)
+    apply(sidecar, files, tmp_path / "part.tif", part, workers=1)
+    with rasterio.open(tmp_path / "part.tif") as opened:
+        assert opened.shape == (80, 120)
+        assert opened.transform[:6] == (0.1, 0.0, west, 0.0, -0.1, south + 8.0)
+    like = CompositeOptions(like=str(tmp_path / "part.tif"))
+    apply(sidecar, files, tmp_path / "like.tif", like, workers=1)
+    assert _same_pixels(tmp_path / "part.tif", tmp_path / "like.tif")
+    with pytest.raises(ArgumentError, match="none of the images lies there"):
+        apply(sidecar, files, options := None, replace(part, extent=(west + 5e3, south, west + 6e3, south + 9.0)))
+    cv2.imwrite(str(tmp_path / "plain.tif"), np.zeros((9, 9), dtype=np.uint8))
+    with pytest.raises(InputError, match="is no GeoTIFF with square pixels"):
+        apply(sidecar, files, options, CompositeOptions(like=str(tmp_path / "plain.tif")))
+
+
+def _same_pixels(first: Path, second: Path) -> bool:
+    with rasterio.open(first) as one, rasterio.open(second) as two:
+        same = (one.transform, one.shape, one.crs) == (two.transform, two.shape, two.crs)
+        return same and bool((one.read() == two.read()).all())
