@@ -19,7 +19,7 @@ so that they count as one."""
 
 _TILT_STARTS = (0.0, 0.0), (0.35, 0.0), (-0.35, 0.0), (0.0, 0.35), (0.0, -0.35)
 _STEPS, _DIFFERENCE, _SETTLED = 15, 1e-5, 1e-6  # radians
-_MAX_CONDITION = 1e6
+_MAX_CONDITION, _HALVINGS = 1e6, 6
 _HORIZON = 0.05  # of a ray of unit depth: what is nearer to the horizon has no place
 
 
@@ -81,7 +81,7 @@ class SeenPair:
     attitude2: FloatArray
 
     def errors(self, camera: FloatArray) -> FloatArray:
-        """How far (2 N,) their points on the plane are from a rigid motion, in heights; inf beyond the horizon.
+        """How far (2 N,) their points on the plane are from a rigid motion, focal lengths; inf beyond the horizon.
 
         ``camera``: the tilt, and log of how much longer the focal length is.
         """
@@ -91,7 +91,8 @@ class SeenPair:
         )
         one, two = one - one.mean(), two - two.mean()
         turn = complex(np.vdot(two, one))
-        errors = one - turn / max(abs(turn), 1e-300) * two
+        # In given focal lengths, as the points were measured: a longer one makes no errors smaller.
+        errors = (one - turn / max(abs(turn), 1e-300) * two) * np.exp(camera[2])
         return np.concatenate([errors.real, errors.imag])
 
 
@@ -110,7 +111,8 @@ def shown_camera(pairs: Sequence[SeenPair]) -> ShownCamera:
     """The tilt, and the focal length, by which the motions between frames are rigid."""
 
     def errors(camera: FloatArray) -> FloatArray:
-        return np.concatenate([pair.errors(camera) for pair in pairs])
+        with np.errstate(all="ignore"):  # beyond the horizon
+            return np.concatenate([pair.errors(camera) for pair in pairs])
 
     def fitted(start: FloatArray, free: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The camera, its errors and their derivatives (2 N, free) after Gauss and Newton's steps."""
@@ -122,8 +124,9 @@ def shown_camera(pairs: Sequence[SeenPair]) -> ShownCamera:
                 break
             step = np.zeros(3)
             step[:free] = np.linalg.lstsq(change, value, rcond=None)[0]
-            after = errors(camera - step)
-            if not after @ after < value @ value:
+            shorter = ((step / 2**k, errors(camera - step / 2**k)) for k in range(_HALVINGS))
+            step, after = next((one for one in shorter if one[1] @ one[1] < value @ value), (step, None))
+            if after is None:
                 break
             camera, value = camera - step, after
             if abs(step).max() < _SETTLED:
