@@ -6,6 +6,19 @@ FeatureName = Literal["rootsift", "sift", "surf", "orb", "akaze", "aliked"]
 SolverName = Literal["auto", "two_point", "three_point", "three_point_similarity", "four_point", "five_point"]
 LensName = Literal["auto", "division", "division-center", "division2", "division3"]
 ModelName = Literal["auto", "rigid", "similarity", "tilting", "pose", "homography", "rotation"]
+CameraFormat = Literal[
+    "auto",
+    "rdstitch",
+    "opencv",
+    "opencv-json",
+    "fisheye",
+    "ros",
+    "kalibr",
+    "colmap",
+    "opendronemap",
+    "hugin",
+    "lensfun",
+]
 ProjectionName = Literal["auto", "plane", "cylinder", "sphere", "mercator", "panini", "stereographic"]
 
 FEATURES: tuple[str, ...] = get_args(FeatureName)

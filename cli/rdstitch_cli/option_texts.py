@@ -15,8 +15,7 @@ _TABLE = """
 * tiles -o --output: Image to write: .ome.tif, .tif, .png, .jpg, .webp or .dzi.
 * undistort -o --output DIR: Folder to write to; made if missing.
 * trajectory -o --output FILE: File to write.
-* calibrate -o --output FILE: Camera file to write: .json, .yml and .fisheye.yml (OpenCV), .pto (Hugin), cameras.json
-    (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS), camchain.yaml (Kalibr), .xml (lensfun).
+* calibrate -o --output FILE: Camera file to write: .json, or in the format of others, see --camera-format.
 * --overwrite: Replace existing output files.
 * --images INPUT: Images to compose: what 'rdstitch mosaic' takes; may be given several times.
 * --preview: A quick draft of at most 1200 pixels: few features of reduced images, straight seams; options given take
@@ -26,7 +25,7 @@ _TABLE = """
     estimated.
 * --focal PX: Focal length, pixels; otherwise from EXIF, or a guess.
 * --mask DIR|FILE: Mask whose black pixels are excluded: a folder of masks with the images' names, or one file for all.
-* --scale: Scale of the output; 1 keeps the resolution of the reference image.
+* --scale: Scale of the output; 1 keeps the resolution of the reference image, one of the largest.
 * --report FILE: Write a report to FILE (.html): graph, votes on λ, matches, residuals.
 trajectory --format: csv: a table with names, time stamps, x, y, yaw_deg, height and their covariances. tum: time,
     position and quaternion. kitti: matrices.
@@ -77,8 +76,10 @@ tiles --lambda L|auto: Known λ (half-diagonal frame), or auto: estimate it; oth
 --attitude FILE|xmp: Tilt of each image: CSV name,psi,theta in degrees; xmp: from the XMP
     of drone images.
 --attitude-std: Standard deviation of the attitudes, degrees; 0 for exact ones.
---save-camera FILE: Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), .xml (lensfun), camera_info.yaml
-    (ROS) …
+--save-camera FILE: Write the estimated camera.
+--camera-format: Format of the camera file written. auto: by its name, .json (rdstitch), .yml (OpenCV), .fisheye.yml,
+    .pto (Hugin), .xml (lensfun), cameras.json (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS),
+    camchain.yaml (Kalibr).
 # Features and registration
 --features: Feature detector and descriptor.
 --aliked-model FILE: ONNX file of the network of --features aliked.

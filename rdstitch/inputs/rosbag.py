@@ -62,7 +62,7 @@ def opened_bag(path: Path) -> "Iterator[Any]":
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise InputError(f'{path}: reading ROS bags needs the extra ros: pip install "rdstitch[ros]"') from None
+        raise InputError(f"{path}: reading ROS bags needs rosbags: pip install rosbags") from None
     # A bag of ROS 2 is a folder; its files may be named as well.
     bag = path.parent if path.suffix.lower() in (".db3", ".mcap") and (path.parent / _DESCRIPTION).is_file() else path
     try:

@@ -48,7 +48,6 @@ RAW_SUFFIXES = frozenset(
 )
 """What TIFF readers see in raw files is their thumbnail."""
 
-_EXTRAS = {"pillow_heif": "heif", "rawpy": "raw"}
 _BITS = 16
 _KEPT_TAGS = {int(getattr(ExifTags.Base, name)) for name in ("Make", "Model", "Artist", "Copyright", "DateTime")}
 _KEPT_BLOCKS = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
@@ -298,6 +297,6 @@ def _package(name: str, path: Path) -> Any:
     try:
         return import_module(name)
     except ImportError:
-        extra = _EXTRAS[name]
-        remedy = f'pip install "rdstitch[{extra}]"; or convert it to JPEG or TIFF'
-        raise InputError(f"{path}: {path.suffix} needs the extra {extra}: {remedy}") from None
+        package = name.replace("_", "-")
+        remedy = f"pip install {package}; or convert it to JPEG or TIFF"
+        raise InputError(f"{path}: {path.suffix} needs {package}: {remedy}") from None

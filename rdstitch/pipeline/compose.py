@@ -24,8 +24,9 @@ from rdstitch.compositing import (
     plan_composite,
 )
 from rdstitch.compositing.boxes import Box
+from rdstitch.compositing.projection import PLANE
 from rdstitch.compositing.tiles import Block, BlockRunner, OutputStrip
-from rdstitch.compositing.upright import Corners
+from rdstitch.compositing.upright_options import Corners
 from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, has_place, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes
@@ -46,6 +47,7 @@ from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
 
 # Reduction of an image of which only the kind of its samples is wanted.
 _PROBE_REDUCTION = 8
+_VISIBLE_CUT = 0.02  # share of the images that is cut away, from which on it is said
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -117,7 +119,11 @@ def compose_images(
     layout = placed if isinstance(placed, Layout) else Layout.of(placed, options)
     placed, canvas, images, place = layout.placed, layout.canvas, layout.images, layout.georeference
     world_files = world_file_paths(output) if output is not None and placed.has_place else ()
-    notes = [*_masked(placed), *place_messages(place, layout.not_georeferenced, placed)]
+    notes = [
+        *_masked(placed),
+        *place_messages(place, layout.not_georeferenced, placed),
+        *_cut_away(placed, canvas, options),
+    ]
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)
@@ -185,6 +191,17 @@ def compose_images(
         georeference=place,
         seams=layout.seams,
     )
+
+
+def _cut_away(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> list[Message]:
+    """How much of the images has no place in the output."""
+    if placed.grid is not None or options.like is not None or options.extent is not None:
+        return []
+    share = canvas.cut_away(placed.cameras, placed.homographies)
+    text = f"{share:.0%} of what the images show is cut away: it would be stretched over {options.max_stretch:g} times"
+    if placed.turned and canvas.projection == PLANE:
+        text += "; --projection cylinder or sphere shows more"
+    return [Message(text, severity="note")] if share > _VISIBLE_CUT else []
 
 
 def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:

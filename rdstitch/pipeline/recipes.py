@@ -183,7 +183,7 @@ def mosaic_blocks(
         frames = selected(listed.frames, options.exclude, options.include_only)
         names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
         further = names[1:]
-        found = listed
+        found = replace(listed, outputs=[], notes=())
         while len(frames) > 1 or not results:
             name = names[len(results)]
             try:
@@ -204,7 +204,7 @@ def mosaic_blocks(
             used = [source.frame or Frame(source.path) for source, used in pairs if used]
             done = {(frame.path, frame.number) for frame in used}
             frames = [frame for frame in frames if (frame.path, frame.number) not in done]
-            found = replace(listed, frames=frames)
+            found = replace(found, frames=frames)
             # These are of the first block, or of its reference image.
             options, beside, further = _for_further_blocks(options), NOTHING_BESIDE, []
     return (_without_blocks(results[0], results[1:], [*listed.messages, *refused]), *map(_without_blocks, results[1:]))
@@ -471,4 +471,5 @@ def _save_camera(registration: Registration, options: StitchOptions, outputs: Ou
     if options.save_camera is not None:
         from rdstitch.camera_files import camera_file_text
 
-        outputs.write(options.save_camera, text_bytes(camera_file_text(registration.camera, options.save_camera)))
+        text = camera_file_text(registration.camera, options.save_camera, options.camera_format)
+        outputs.write(options.save_camera, text_bytes(text))

@@ -54,7 +54,7 @@ def _reason(evidence: Evidence, images: Sequence[int], fits: Sequence[LinkFit], 
     few = [(evidence.registration.sources[k].name, few_features(evidence.registration.keypoints, k)) for k in images]
     if any(why for _, why in few):
         return ", ".join(f"{name} has {why}" for name, why in few if why)
-    why = "they agree with each other: another plane, camera or zoom, or none (trees, walls)?"
+    why = "they fit each other: does it show another surface, or come from another camera or zoom?"
     if sum(fit.count for fit in fits) < limit("few matches"):
         why = "too few to place it: little overlap, or none?"
     return f"{why} {remedy}".strip()

@@ -199,5 +199,5 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
 
 
 def _no_plane(pair: PairRegistration) -> RadialHomography:
-    relation, reason = pair.relation, "what the two share fills less than half of them (a vehicle?)"
+    relation, reason = pair.relation, "what the two share fills less than half of them (something that moved?)"
     return RadialHomography.failed(reason, relation.camera, relation.camera2, len(relation.inliers))

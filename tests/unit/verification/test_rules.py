@@ -141,7 +141,7 @@ def _misfits(registration: Any) -> list[Message]:
     ("registration", "reason"),
     [
         (_registration(39), "too few to place it: little overlap, or none? stitch them on their own"),
-        (_registration(41), "another plane, camera or zoom, or none (trees, walls)? stitch them on their own"),
+        (_registration(41), "another surface, or come from another camera or zoom? stitch them on their own"),
         (_registration(41, keypoints=(900, 200, 900)), "b.jpg has less than a third of the features that others have"),
     ],
 )
@@ -154,7 +154,7 @@ def test_a_pair_whose_matches_agree_with_each_other_only_is_named(registration: 
 
 def test_images_of_whose_matches_two_fifths_disagree_are_named() -> None:
     first, second = _misfits(_registration(100, agree=0.55, keypoints=(900, 200, 900)))
-    assert "only 55 of 100 of its matches agree with the whole; they agree with each other" in first.text
+    assert "only 55 of 100 of its matches fit the place that was found for it; they fit each other" in first.text
     assert "b.jpg has less than a third of the features that others have (blurred?)" in second.text
     assert second.images == ("folder/b.jpg",)
     assert _misfits(_registration(100, agree=0.65)) == []
