@@ -12,7 +12,7 @@ import click
 _TABLE = """
 # Options that matter first
 * -o --output: Image to write: .jpg, .png, .tif, .webp or .dzi.
-* tiles -o --output: Image to write: .ome.tif, .tif, .png, .jpg, .webp or .dzi.
+* tiles -o --output: Image to write: .ome.tif, .ome.zarr, .tif, .png, .jpg, .webp or .dzi.
 * undistort -o --output DIR: Folder to write to; made if missing.
 * trajectory -o --output FILE: File to write.
 * calibrate -o --output FILE: Camera file to write: .json, or in the format of others, see --camera-format.
@@ -38,19 +38,27 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 --view: Field of view: size and scale of the image, everything it shows, or without empty borders.
 * -q --quiet: Print errors only.
 # Places
-* --grid PATTERN: Part of the file names, with {row} and {col} for numbers and * for anything, such as 'r{row}c{col}'.
+* --grid PATTERN: Part of the file names, with {row} and {col} for numbers and * for anything, such as 'r{row}c{col}';
+    '{letter}{col}' for A01; 'img_{number}' for running numbers.
+--columns N: With {number}: tiles in a row.
+--order: With {number}: how tiles follow each other; snake: to and fro.
+--origin: With --grid: where the first tile is.
 * --overlap PERCENT: With --grid: overlap of neighbouring tiles.
 * --positions FILE: Where images were taken, instead of EXIF: CSV name,lat,lon or name,x,y (see --crs), exiftool's -csv
     or -json, OpenDroneMap's geo.txt, or a GPX track.
-* tiles --positions FILE: CSV with name,x,y (pixels) or name,x_um,y_um; otherwise what OME-TIFF or Micro-Manager say.
+* tiles --positions FILE: CSV with name,x,y (pixels) or name,x_um,y_um, or Fiji's TileConfiguration.txt; otherwise what
+    OME-TIFF or Micro-Manager say.
 --positions-offset S: Seconds from the times of the images to those of the GPX track (UTC).
 --gcp FILE: Ground control points, as OpenDroneMap's gcp_list.txt; they place the output on the Earth.
 --check-points FILE: Points like those of --gcp that are compared with the map, and take no part in it.
-* --positions-only FILE: Write the places of the tiles to this CSV file; without --output nothing is composed.
+* --positions-only FILE: Write the places of the tiles to this CSV file, or to a .txt as Fiji's list; without --output
+    nothing is composed.
 * --pixel-size UM: Pixel size, micrometres, if no file states it.
 * --search PX: Search radius around the nominal offset of neighbours.  [default: 5 % of a tile's side]
 # Tiles
-* --channel N: Register this channel, from 0; otherwise the mean of all.
+* --channel N: Register this channel, from 0; otherwise the mean of all. All are composed.
+* --z max|N: Plane of z stacks, from 0; otherwise the brightest sample of all planes.
+--time N: Time of a series, from 0; otherwise the first.
 * --flat-field auto|off|FILE: Flat-field correction: estimated from the images, or read from FILE (second page: the
     dark field).
 * --save-flat-field FILE: Write flat field and dark field to this TIFF file.

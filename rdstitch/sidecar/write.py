@@ -200,6 +200,8 @@ def _stage(registration: Registration) -> dict[str, Any] | None:
     return {
         "source": grid.source,
         "pixel_um": grid.pixel_size,
+        "z": registration.tiles.z,
+        "time": registration.tiles.time,
         "matrix": model.matrix,
         "rows_px": model.rows,
         "columns_px": model.columns,
