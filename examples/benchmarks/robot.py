@@ -123,7 +123,7 @@ def _lit(image: NDArray[np.uint8], gain: float, k: int) -> NDArray[np.uint8]:
     return np.asarray(np.clip(image * gain * side, 0, 255), dtype=np.uint8)
 
 
-def _noisy(image: FloatArray, std: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+def _noisy(image: NDArray[np.floating[Any]], std: float, rng: np.random.Generator) -> NDArray[np.uint8]:
     return np.clip(image + rng.normal(0.0, std, image.shape), 0, 255).astype(np.uint8)
 
 

@@ -112,21 +112,23 @@ def write_layers(
 
 _LEVEL = 1e-9  # rounding of what a turn within the plane leaves as it is
 
-PosesFrame = Literal["enu", "camera", "map"]
+PosesFrame = Literal["enu", "ros", "camera", "map"]
 
 
-def poses_table(result: StitchResult, frame: PosesFrame = "enu") -> str:
+def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float = 1.0) -> str:
     """The table that ``rdstitch trajectory`` writes, of a mosaic; with covariances where ``options`` asked for them.
 
     Parameters
     ----------
     frame : str
-        "enu" or "camera", see :mod:`rdstitch.export.trajectory_files`, in heights of the first image; "map": easting,
-        northing and the height above the ground in metres, with yaw zero where the top of an image is north. The
+        "enu", "ros" or "camera", see :mod:`rdstitch.export.trajectory_files`; "map": easting, northing and the height
+        above the ground in metres, with yaw zero where the top of an image is north. The
         covariances are then relative to the reference image; how well that is placed, the georeference says.
+    height : float
+        Of the first image, in the unit that positions shall have; not for "map".
     """
     registration = result.registration
-    path = Trajectory.from_alignment(registration.alignment)
+    path = Trajectory.from_alignment(registration.alignment, height)
     if frame == "map":
         place, poses = result.georeference, registration.alignment.poses
         if place is None or poses is None:
