@@ -6,7 +6,26 @@ FeatureName = Literal["rootsift", "sift", "surf", "orb", "akaze", "aliked"]
 SolverName = Literal["auto", "two_point", "three_point", "three_point_similarity", "four_point", "five_point"]
 LensName = Literal["auto", "division", "division-center", "division2", "division3"]
 ModelName = Literal["auto", "rigid", "similarity", "tilting", "pose", "homography", "rotation"]
+CameraFormat = Literal[
+    "auto",
+    "rdstitch",
+    "opencv",
+    "opencv-json",
+    "fisheye",
+    "ros",
+    "kalibr",
+    "colmap",
+    "opendronemap",
+    "hugin",
+    "lensfun",
+]
 ProjectionName = Literal["auto", "plane", "cylinder", "sphere", "mercator", "panini", "stereographic"]
 
 FEATURES: tuple[str, ...] = get_args(FeatureName)
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
+
+Purpose = Literal["pano", "mosaic", "calibrate", "trajectory"]
+"""The recipe that a registration is for. In "pano" every image must be readable, and a turn on the spot is taken where
+a plane explains the images as well; for "calibrate" images of a repeated pattern may be off by whole periods of it, and
+doubts about their places do not matter; for "trajectory" poses must be metric, so that the freest model is that of
+planar motion with small tilts."""

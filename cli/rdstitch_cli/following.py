@@ -39,7 +39,7 @@ def followed(
     ``refresh`` is None where no image is made; ``plot`` will be written at the end too. ``poses`` says how poses are
     printed: as the file that is written at the end has them.
     """
-    from rdstitch.camera_files import CAMERA_SUFFIXES
+    from rdstitch.camera_files import format_of
     from rdstitch.inputs.arrivals import Arrivals
     from rdstitch.pipeline.compose import image_files
     from rdstitch.pipeline.follow import follow as follow_frames
@@ -56,7 +56,8 @@ def followed(
     # Before hours of frames, not after them.
     planned = [output] if refresh is None else image_files(check_suffix(output))
     if stitch.save_camera is not None:
-        planned.append(check_suffix(stitch.save_camera, CAMERA_SUFFIXES))
+        format_of(stitch.save_camera, stitch.camera_format)
+        planned.append(stitch.save_camera)
     planned += [file for file in (preview, plot) if file is not None]
     check_outputs([*planned, *(beside or NOTHING_BESIDE).files([])], stitch.overwrite, [source])
     before = file_state(preview) if preview else None

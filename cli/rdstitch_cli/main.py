@@ -41,7 +41,7 @@ _UNEXPECTED, _USAGE, _INTERRUPTED, _BROKEN_PIPE = 1, 2, 130, 141
 _TERMINATION_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 _OPENCV_NO_MEMORY = -4  # cv2.Error.StsNoMem
 _OUT_OF_MEMORY = "out of memory; try smaller images or a smaller --scale"
-_DECODERS = ("PIL", "tifffile")
+_DECODERS = ("PIL", "imagecodecs", "tifffile")
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 

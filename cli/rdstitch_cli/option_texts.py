@@ -12,11 +12,10 @@ import click
 _TABLE = """
 # Options that matter first
 * -o --output: Image to write: .jpg, .png, .tif, .webp or .dzi.
-* tiles -o --output: Image to write: .ome.tif, .tif, .png, .jpg, .webp or .dzi.
+* tiles -o --output: Image to write: .ome.tif, .ome.zarr, .tif, .png, .jpg, .webp or .dzi.
 * undistort -o --output DIR: Folder to write to; made if missing.
 * trajectory -o --output FILE: File to write.
-* calibrate -o --output FILE: Camera file to write: .json, .yml and .fisheye.yml (OpenCV), .pto (Hugin), cameras.json
-    (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS), camchain.yaml (Kalibr), .xml (lensfun).
+* calibrate -o --output FILE: Camera file to write: .json, or in the format of others, see --camera-format.
 * --overwrite: Replace existing output files.
 * --images INPUT: Images to compose: what 'rdstitch mosaic' takes; may be given several times.
 * --preview: A quick draft of at most 1200 pixels: few features of reduced images, straight seams; options given take
@@ -26,7 +25,7 @@ _TABLE = """
     estimated.
 * --focal PX: Focal length, pixels; otherwise from EXIF, or a guess.
 * --mask DIR|FILE: Mask whose black pixels are excluded: a folder of masks with the images' names, or one file for all.
-* --scale: Scale of the output; 1 keeps the resolution of the reference image.
+* --scale: Scale of the output; 1 keeps the resolution of the reference image, one of the largest.
 * --report FILE: Write a report to FILE (.html): graph, votes on λ, matches, residuals.
 trajectory --format: csv: a table with names, time stamps, x, y, yaw_deg, height and their covariances. tum: time,
     position and quaternion. kitti: matrices.
@@ -39,19 +38,27 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 --view: Field of view: size and scale of the image, everything it shows, or without empty borders.
 * -q --quiet: Print errors only.
 # Places
-* --grid PATTERN: Part of the file names, with {row} and {col} for numbers and * for anything, such as 'r{row}c{col}'.
+* --grid PATTERN: Part of the file names, with {row} and {col} for numbers and * for anything, such as 'r{row}c{col}';
+    '{letter}{col}' for A01; 'img_{number}' for running numbers.
+--columns N: With {number}: tiles in a row.
+--order: With {number}: how tiles follow each other; snake: to and fro.
+--origin: With --grid: where the first tile is.
 * --overlap PERCENT: With --grid: overlap of neighbouring tiles.
 * --positions FILE: Where images were taken, instead of EXIF: CSV name,lat,lon or name,x,y (see --crs), exiftool's -csv
     or -json, OpenDroneMap's geo.txt, or a GPX track.
-* tiles --positions FILE: CSV with name,x,y (pixels) or name,x_um,y_um; otherwise what OME-TIFF or Micro-Manager say.
+* tiles --positions FILE: CSV with name,x,y (pixels) or name,x_um,y_um, or Fiji's TileConfiguration.txt; otherwise what
+    OME-TIFF or Micro-Manager say.
 --positions-offset S: Seconds from the times of the images to those of the GPX track (UTC).
 --gcp FILE: Ground control points, as OpenDroneMap's gcp_list.txt; they place the output on the Earth.
 --check-points FILE: Points like those of --gcp that are compared with the map, and take no part in it.
-* --positions-only FILE: Write the places of the tiles to this CSV file; without --output nothing is composed.
+* --positions-only FILE: Write the places of the tiles to this CSV file, or to a .txt as Fiji's list; without --output
+    nothing is composed.
 * --pixel-size UM: Pixel size, micrometres, if no file states it.
 * --search PX: Search radius around the nominal offset of neighbours.  [default: 5 % of a tile's side]
 # Tiles
-* --channel N: Register this channel, from 0; otherwise the mean of all.
+* --channel N: Register this channel, from 0; otherwise the mean of all. All are composed.
+* --z max|N: Plane of z stacks, from 0; otherwise the brightest sample of all planes.
+--time N: Time of a series, from 0; otherwise the first.
 * --flat-field auto|off|FILE: Flat-field correction: estimated from the images, or read from FILE (second page: the
     dark field).
 * --save-flat-field FILE: Write flat field and dark field to this TIFF file.
@@ -77,8 +84,10 @@ tiles --lambda L|auto: Known λ (half-diagonal frame), or auto: estimate it; oth
 --attitude FILE|xmp: Tilt of each image: CSV name,psi,theta in degrees; xmp: from the XMP
     of drone images.
 --attitude-std: Standard deviation of the attitudes, degrees; 0 for exact ones.
---save-camera FILE: Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), .xml (lensfun), camera_info.yaml
-    (ROS) …
+--save-camera FILE: Write the estimated camera.
+--camera-format: Format of the camera file written. auto: by its name, .json (rdstitch), .yml (OpenCV), .fisheye.yml,
+    .pto (Hugin), .xml (lensfun), cameras.json (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS),
+    camchain.yaml (Kalibr).
 # Features and registration
 --features: Feature detector and descriptor.
 --aliked-model FILE: ONNX file of the network of --features aliked.

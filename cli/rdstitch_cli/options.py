@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args
 import click
 from click.core import ParameterSource
 
-from rdstitch.choices import FEATURES, LensName, ModelName, ProjectionName, SolverName
+from rdstitch.choices import FEATURES, CameraFormat, LensName, ModelName, ProjectionName, SolverName
 from rdstitch_cli.option_texts import TEXTS, option
 from rdstitch_cli.parameter_types import (
     ANGLE,
@@ -174,6 +174,8 @@ compositing = together(
     option("--georeference", ("auto", "force", "off"), "auto"),
 )
 
+camera_format = option("--camera-format", get_args(CameraFormat), "auto")
+
 # What every command that registers images takes, and what those take that also compose them.
 registration = together(overwrite, known, estimation, report, trust)
 stitching = together(
@@ -188,6 +190,7 @@ stitching = together(
     option("--whole-layers", bool),
     option("--hugin-project", IMAGE),
     option("--save-camera", IMAGE),
+    camera_format,
     registration,
     as_json("the sidecar"),
     verbosity,

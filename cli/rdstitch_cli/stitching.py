@@ -132,6 +132,12 @@ def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = Fal
     from rdstitch.sidecar.write import sidecar
 
     report_registration(result.registration, reporter, partial(sidecar, result) if as_json else None)
+    places, broken = len(result.seams.places), int(result.seams.broken.sum())
+    reporter.log(f"seams hold at {places - broken} of {places} places")
+    for one in result.seams.breaks:
+        first, second = (result.registration.used_names[k] for k in one.images)
+        x, y = one.position
+        reporter.log(f"broken over {one.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}")
     if result.plan is not None and not as_json:
         show_plan(result.plan)
 

@@ -2,9 +2,12 @@
 
 Every subfolder that holds images is one set; each is stitched by ``rdstitch mosaic`` with no option. A row a set: exit
 status, images used, model, λ, the ratio of the areas that a pixel gets within the output (98 % over 2 %), the focal
-length, lines of messages, and processor time; with ``--peer``, the ``stitch`` command of the package ``stitching``, its
-processor time beside it. A result is "good" where the status is 0, all images are used, |λ| ≤ 0.09, the ratio of areas
-at most 30, and no image folded: what a person sees at a glance. Look at the images in ``--output`` for the rest.
+length, the share of the places along its seams that is broken and the longest break in pixels, lines of messages, and
+processor time; with ``--peer``, the ``stitch`` command of the package ``stitching``, its processor time beside it. The
+seams are those of the sidecar; ``stitching``'s picture stands beside ours, and nobody is told where its seams run.
+
+A result is "good" where the status is 0, all images are used, |λ| ≤ 0.09, the ratio of areas at most 30, and no image
+folded: what a person sees at a glance. Look at the images in ``--output`` for the rest.
 """
 
 import json
@@ -44,6 +47,8 @@ class Row:
     stretch: float = math.nan
     folded: bool = False
     focal: float = math.nan
+    broken: float = math.nan  # share of the places along the seams
+    longest: float = 0.0  # break, pixels
 
     @property
     def good(self) -> bool:
@@ -56,7 +61,8 @@ class Row:
         return (
             f"{'good' if self.good else '-':4s} {self.name:24s} {self.status:3d} {self.used:3d}/{self.count:<3d} "
             f"{self.model:10s} {self.distortion:+7.3f} {self.stretch:8.1f}{'F' if self.folded else ' '} "
-            f"{self.focal:6.2f} {len(self.messages):3d} {self.seconds:7.1f} {self.peer_seconds:7.1f}"
+            f"{self.focal:6.2f} {100 * self.broken:5.1f} {self.longest:5.0f} {len(self.messages):3d} "
+            f"{self.seconds:7.1f} {self.peer_seconds:7.1f}"
         )
 
 
@@ -118,7 +124,10 @@ def stitch(folder: Path, output: Path, options: list[str], peer: str | None) -> 
     focal = (record["focal_px"] or math.nan) / (math.hypot(*used[0]["size"]) / 2.0)
     distortion = math.nan if record["lambda"] is None else record["lambda"]
     row = replace(row, used=len(used), model=record["model"], distortion=distortion)
-    return replace(row, stretch=stretch, folded=folded, focal=focal)
+    seams = record["seams"]
+    broken = seams["broken"] / seams["places"] if seams["places"] else math.nan
+    longest = max((one["length_px"] for one in seams["breaks"]), default=0.0)
+    return replace(row, stretch=stretch, folded=folded, focal=focal, broken=broken, longest=longest)
 
 
 def main(
@@ -128,7 +137,8 @@ def main(
     sets = sorted({file.parent for folder in folders for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES})
     output = output or Path(tempfile.mkdtemp())
     output.mkdir(parents=True, exist_ok=True)
-    print("     set                      status used  model           λ    areas   f/half lines  cpu s  peer s")
+    columns = "areas   f/half  torn break lines  cpu s  peer s"
+    print(f"     set                      status used  model           λ    {columns}")
     with ThreadPoolExecutor(jobs) as pool:
         rows = []
         for row in pool.map(lambda folder: stitch(folder, output, options.split(), peer), sets):

@@ -34,6 +34,8 @@ from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.matching.links import Link, in_alternate_directions
 
+# Side of an image, beside that of the largest, below which it was reduced, and must not set the scale of the output.
+_REDUCED = 0.8
 _UNCONFIRMED = 0.1
 """What the matches count in the spanning tree of a link without a consistent triangle, relative to one with."""
 
@@ -100,6 +102,17 @@ class AlignmentTask:
         return _chosen(self.cameras, self.links, self.options)
 
 
+def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
+    """The reference, or, where that is a reduced image, the one of full size whose links can be relied on most."""
+    size = np.sqrt([float(np.prod(camera.image_size)) for camera in cameras])
+    full = np.flatnonzero(size > _REDUCED * size.max())
+    if problem.reference in full:
+        return problem.reference
+    observed = problem.observations
+    trust = [float(problem.trust[(observed.image1 == k) | (observed.image2 == k)].sum()) for k in full]
+    return int(full[np.argmax(trust)])
+
+
 def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> AdjustedImages:
     """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
     known = options.camera_priors(cameras)
@@ -126,6 +139,9 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
     reference = -1 if options.reference is None else options.reference
     whole = Problem(few, relations, trust, len(cameras), reference, lens, free_lens, known, min_gain=FEW_GAIN)
     problem, images = whole.part(~wrong)
+    if options.reference is None:
+        whole = replace(whole, reference=int(images[_full_size_reference(problem, [cameras[k] for k in images])]))
+        problem, _ = whole.part(~wrong, images)
     # Data weigh against priors as they will in the final adjustment.
     problem = replace(
         problem, overdispersion=noise_of_links(problem.observations, problem.homographies, problem.lens).overdispersion

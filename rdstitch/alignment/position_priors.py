@@ -54,7 +54,7 @@ def hold_positions(problem: Problem, fit: Fit) -> tuple[Problem, Fit, str]:
     if growth <= _MAX_GROWTH and np.median(off) <= OUTLYING:
         return held, refined, ""
     why = (
-        f"they are {POSITION_STD * np.median(off):.0f} m off in the median"
+        f"half of them are {POSITION_STD * np.median(off):.0f} m or more from where the images were taken"
         if np.median(off) > OUTLYING
         else f"with them the errors of the matches grow by {growth - 1.0:.0%}"
     )

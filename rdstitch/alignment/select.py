@@ -102,7 +102,7 @@ class ModelChoice:
         """One sentence."""
         model, adjusted = self.fit.model, self.fit.adjusted
         described = model.description(adjusted.parameters.poses, adjusted.parameters.shared)
-        return f"{model.name}: {described}; it leaves an error of {adjusted.sigma:.2f} pixels{self.others}"
+        return f"{model.name}: {described}; most matches fit to {adjusted.sigma:.2f} pixels{self.others}"
 
 
 @dataclass(frozen=True)
@@ -297,7 +297,7 @@ def _choice(tried: Sequence[Hypothesis], best: Hypothesis, *, requested: bool) -
         return ModelChoice(best.fit, "; as requested", best.fit.overdispersion)
     listed = [
         f"{one.fit.model.name} {one.fit.adjusted.sigma:.2f} pixels"
-        + (", an absurd layout" if one.absurd else f", {one.score - best.score:+.0f}")
+        + (", an impossible layout" if one.absurd else f", {one.score - best.score:+.0f}")
         for one in tried
         if one is not best
     ]

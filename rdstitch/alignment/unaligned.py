@@ -35,7 +35,7 @@ def explain_unaligned(
         elif image in block_of:
             number, size = block_of[image], len(blocks[block_of[image]])
             reason = (
-                f"in block {number + 1} of {len(blocks)}, whose {size} images overlap with none of the others; "
+                f"in block {number + 1} of {len(blocks)}, whose {size} images overlap too little with the others; "
                 "stitch them on their own, or add images between the blocks"
             )
         elif image in contradicting:

@@ -1,19 +1,21 @@
 """Camera files: rdstitch's own and those of others, to whose lens models the lens is fitted; each states the residual.
 
-===================================  ==========================================================
-``*.json``                           rdstitch's own
-``*.yml``, ``*.yaml``                OpenCV's FileStorage as YAML
-``opencv.json``, ``*.opencv.json``   OpenCV's FileStorage as JSON
-``fisheye.yml``, ``*.fisheye.yml``   OpenCV's FileStorage as YAML, for ``cv2.fisheye``
-``camera_info.yaml``                 ROS
-``camchain.yaml``                    Kalibr
-``cameras.txt``                      COLMAP
-``cameras.json``                     OpenDroneMap
-``*.pto``                            Hugin
-``*.xml``                            lensfun
-===================================  ==========================================================
+================  =====================================  =================================
+format            otherwise chosen by the name
+================  =====================================  =================================
+``rdstitch``      ``*.json``                             rdstitch's own
+``opencv``        ``*.yml``, ``*.yaml``                  OpenCV's FileStorage as YAML
+``opencv-json``   ``opencv.json``, ``*.opencv.json``     the same as JSON
+``fisheye``       ``fisheye.yml``, ``*.fisheye.yml``     the same as YAML, for ``cv2.fisheye``
+``ros``           ``camera_info.yaml``                   ROS
+``kalibr``        ``camchain.yaml``                      Kalibr
+``colmap``        ``cameras.txt``                        COLMAP
+``opendronemap``  ``cameras.json``                       OpenDroneMap
+``hugin``         ``*.pto``                              Hugin
+``lensfun``       ``*.xml``                              lensfun
+================  =====================================  =================================
 
-What is written follows from the name, as above; what is read is known by its content.
+What is read is known by its content.
 """
 
 import re
@@ -26,6 +28,7 @@ from typing import Any, TypeVar
 from rdstitch.camera_files import formats
 from rdstitch.camera_files.lens_models import CameraFile, LensFit
 from rdstitch.camera_files.polynomials import hugin_project, is_hugin, lensfun_xml, read_hugin, read_lensfun
+from rdstitch.choices import CameraFormat
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.geometry.camera import Camera, CameraRecord
 from rdstitch.system.file_access import read_text
@@ -38,6 +41,7 @@ __all__ = [
     "LensFit",
     "camera_of_content",
     "export_note",
+    "format_of",
     "load_camera",
     "read_camera_file",
     "save_camera",
@@ -131,52 +135,78 @@ def _own(content: Any, file: str, field: str = "") -> CameraFile:
     return CameraFile(convert(content, CameraRecord, file, field).camera(), "rdstitch")
 
 
-def save_camera(camera: Camera, path: str | Path) -> None:
-    """Write a camera file; the name says which format.
+def save_camera(camera: Camera, path: str | Path, camera_format: CameraFormat = "auto") -> None:
+    """Write a camera file.
 
     Parameters
     ----------
     camera : Camera
     path : path
         ``.json``, ``.yml``, ``.pto``, …; see :mod:`rdstitch.camera_files`.
+    camera_format : str
+        One of ``rdstitch.choices.CameraFormat``; "auto": what the name says.
 
     Raises
     ------
     OutputError
         When the name says none, or the file cannot be written.
     """
-    write_bytes_atomic(path, text_bytes(camera_file_text(camera, path)))
+    write_bytes_atomic(path, text_bytes(camera_file_text(camera, path, camera_format)))
 
 
-def camera_file_text(camera: Camera, path: str | Path) -> str:
-    """Give what :func:`save_camera` writes into a file of this name."""
+def camera_file_text(camera: Camera, path: str | Path, camera_format: CameraFormat = "auto") -> str:
+    """Give what :func:`save_camera` writes."""
+    return _WRITERS[format_of(path, camera_format)](camera)
+
+
+def format_of(path: str | Path, camera_format: CameraFormat = "auto") -> CameraFormat:
+    """The format of a camera file that is written: the one that is wanted, or what its name says."""
+    if camera_format != "auto":
+        return camera_format
     file = Path(path)
     name = file.name.lower().removesuffix(".yml")
     name += ".yaml" if name != file.name.lower() else ""
-    for pattern, writer in _WRITERS.items():
+    for pattern, named in _NAMES.items():
         if fnmatchcase(name, pattern):
-            return writer(camera)
-    raise OutputError(f"{file}: not the name of a camera file; use one of {' '.join(CAMERA_SUFFIXES)}")
+            return named
+    known = ", ".join(_WRITERS)
+    raise OutputError(
+        f"{file}: not the name of a camera file; use one that ends with {' '.join(CAMERA_SUFFIXES)}, or give "
+        f"--camera-format ({known})"
+    )
 
 
-def export_note(camera: Camera, path: str | Path) -> tuple[str, ...]:
+def export_note(camera: Camera, path: str | Path, camera_format: CameraFormat = "auto") -> tuple[str, ...]:
     """Say what the model of a camera file of others costs, in one sentence; nothing for rdstitch's own."""
-    largest = _STATED.findall(camera_file_text(camera, path))
+    largest = _STATED.findall(camera_file_text(camera, path, camera_format))
     return tuple(f"{path}: its lens model is at most {float(value):.3f} pixels from the lens" for value in largest[-1:])
 
 
-_WRITERS: dict[str, Callable[[Camera], str]] = {
-    "cameras.json": formats.opendronemap_json,
-    "opencv.json": partial(formats.opencv_text, yaml=False),
-    "*.opencv.json": partial(formats.opencv_text, yaml=False),
-    "?*.json": lambda camera: json_bytes(camera.as_dict()).decode(),
-    "camera_info.yaml": formats.camera_info_yaml,
-    "camchain.yaml": formats.camera_chain_yaml,
-    "fisheye.yaml": partial(formats.opencv_text, fisheye=True),
-    "*.fisheye.yaml": partial(formats.opencv_text, fisheye=True),
-    "?*.yaml": formats.opencv_text,
-    "cameras.txt": formats.colmap_text,
-    "?*.pto": hugin_project,
-    "?*.xml": lensfun_xml,
+_WRITERS: dict[CameraFormat, Callable[[Camera], str]] = {
+    "rdstitch": lambda camera: json_bytes(camera.as_dict()).decode(),
+    "opencv": formats.opencv_text,
+    "opencv-json": partial(formats.opencv_text, yaml=False),
+    "fisheye": partial(formats.opencv_text, fisheye=True),
+    "ros": formats.camera_info_yaml,
+    "kalibr": formats.camera_chain_yaml,
+    "colmap": formats.colmap_text,
+    "opendronemap": formats.opendronemap_json,
+    "hugin": hugin_project,
+    "lensfun": lensfun_xml,
+}
+
+_NAMES: dict[str, CameraFormat] = {
+    "cameras.json": "opendronemap",
+    "opencv.json": "opencv-json",
+    "*.opencv.json": "opencv-json",
+    "?*.json": "rdstitch",
+    "camera_info.yaml": "ros",
+    "camchain.yaml": "kalibr",
+    "fisheye.yaml": "fisheye",
+    "*.fisheye.yaml": "fisheye",
+    "?*.yaml": "opencv",
+    "cameras.txt": "colmap",
+    "?*.pto": "hugin",
+    "?*.xml": "lensfun",
 }
 """By the name of the file, the first that fits; ``.yml`` is ``.yaml``."""

@@ -5,6 +5,8 @@ from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.compositor import Composite, FileComposite, compose, compose_to_file
 from rdstitch.compositing.panorama_canvas import plan_panorama
 from rdstitch.compositing.plan import CompositePlan, plan_composite
+from rdstitch.compositing.preparation import Decisions, decide
+from rdstitch.compositing.seam_quality import SeamBreak, SeamQuality
 from rdstitch.compositing.source_images import PlacedImage
 
 __all__ = [
@@ -12,10 +14,14 @@ __all__ = [
     "Composite",
     "CompositeOptions",
     "CompositePlan",
+    "Decisions",
     "FileComposite",
     "PlacedImage",
+    "SeamBreak",
+    "SeamQuality",
     "compose",
     "compose_to_file",
+    "decide",
     "plan_canvas",
     "plan_composite",
     "plan_panorama",

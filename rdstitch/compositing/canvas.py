@@ -56,6 +56,11 @@ class NearPart:
         kept = border[: last + 1][inside[: last + 1]]
         return np.concatenate([kept, measured[np.isfinite(measured).all(axis=1)]])
 
+    def shows(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Which measured pixels (K, 2) are drawn."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self._value(self.camera.normalize(self.camera.undistort(points))) > 0.0)
+
     def masked(self, image: DecodedImage) -> DecodedImage:
         """The image, whole or reduced, with the rest transparent."""
         height, width = image.pixels.shape[:2]
@@ -206,6 +211,18 @@ class Canvas:
         directions = to_directions(camera, homography, points)
         places: FloatArray = self.projection.project(directions) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
         return places
+
+    def cut_away(self, cameras: Sequence[Camera], homographies: FloatArray) -> float:
+        """Share of what the images show that has no place here, because it would be stretched too much."""
+        drawn = []
+        for k, (camera, matrix) in enumerate(zip(cameras, homographies, strict=True)):
+            points = points_over(camera.image_size, _PROBES)
+            part, places = self.near[k] if self.near else None, self.place(camera, matrix, points)
+            with np.errstate(invalid="ignore"):
+                beside = (places < -1.0) | (places > np.array(self.size))
+                inside = np.isfinite(places).all(axis=1) & ~beside[:, 1 if self.period else 0 :].any(axis=1)
+            drawn.append(inside if part is None else inside & part.shows(points))
+        return 1.0 - float(np.mean(drawn))
 
     def cropped(self, box: Box) -> "Canvas":
         """The part (x0, y0, x1, y1) of this canvas as a canvas of its own."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_origin, get_type_hints
 
 from rdstitch.choices import ProjectionName
-from rdstitch.compositing.upright import UprightOptions
+from rdstitch.compositing.upright_options import UprightOptions
 from rdstitch.errors import ArgumentError
 
 ExposureMethod = Literal["none", "gain", "blocks", "balanced"]

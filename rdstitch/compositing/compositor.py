@@ -13,7 +13,7 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.panorama_canvas import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
-from rdstitch.compositing.preparation import prepare_composite
+from rdstitch.compositing.preparation import Decisions, prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.tiles import BlockRunner
@@ -58,6 +58,7 @@ def compose(
     options: CompositeOptions | None = None,
     progress: ShareProgress = unheard,
     elsewhere: BlockRunner | None = None,
+    decisions: Decisions | None = None,
 ) -> Composite:
     """Put images together on a canvas, in memory.
 
@@ -69,8 +70,10 @@ def compose(
         Called with the share of the work done, 0 to 1.
     elsewhere : callable, optional
         Computes the pixels, in blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
+    decisions : Decisions, optional
+        From :func:`rdstitch.compositing.decide` with the same arguments; made here if not given.
     """
-    with prepare_composite(images, canvas, options, progress, elsewhere) as prepared:
+    with prepare_composite(images, canvas, options, progress, elsewhere, decisions) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
@@ -90,6 +93,7 @@ def compose_to_file(
     options: CompositeOptions | None = None,
     progress: ShareProgress = unheard,
     elsewhere: BlockRunner | None = None,
+    decisions: Decisions | None = None,
     *,
     metadata: Metadata | None = None,
     extra_tags: Callable[[Canvas], Iterable[ExtraTag]] = lambda canvas: (),
@@ -102,7 +106,7 @@ def compose_to_file(
     path : path
         ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
         (held in memory whole).
-    images, canvas, options, progress, elsewhere
+    images, canvas, options, progress, elsewhere, decisions
         As for :func:`compose`.
     metadata : Metadata, optional
         Colour profile, EXIF and resolution to keep.
@@ -111,7 +115,7 @@ def compose_to_file(
     outputs : Outputs, optional
         Where the file is staged, to be published with what belongs to it; without, it replaces what is there.
     """
-    with prepare_composite(images, canvas, options, progress, elsewhere) as prepared:
+    with prepare_composite(images, canvas, options, progress, elsewhere, decisions) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
         layout = Layout(
             size,

@@ -2,8 +2,9 @@
 
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Self
 
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.boxes import Box
@@ -11,10 +12,11 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.image_cache import ImageCache
-from rdstitch.compositing.photometric import no_exposure
+from rdstitch.compositing.photometric import Exposure, no_exposure
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
-from rdstitch.compositing.seam_finder import find_seams
+from rdstitch.compositing.seam_finder import SeamMap, find_seams
+from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.compositing.source_images import ImageReader, PlacedImage
 from rdstitch.compositing.survey import covered_pixels, crop_box, crop_rows, survey_factor, survey_images
 from rdstitch.compositing.tiles import BlockRunner, OutputStrip, TiledOutput, strips_of_blocks
@@ -47,6 +49,56 @@ class Prepared:
         return strips_of_blocks(self.tiles, self.elsewhere, progress)
 
 
+@dataclass(frozen=True)
+class Decisions:
+    """What is decided on small versions of the images, and what the seams are like."""
+
+    exposure: Exposure
+    seams: SeamMap | None  # None without
+    box: Box  # of the output on the canvas, which is widened where it goes all the way round
+    messages: tuple[Message, ...] = ()
+    quality: SeamQuality = field(default_factory=SeamQuality)  # of the seams, in pixels of the output
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Images and where they lie, before anything is decided."""
+
+    images: Sequence[PlacedImage]
+    canvas: Canvas  # widened where it goes all the way round
+    options: CompositeOptions
+    reader: ImageReader
+    plan: CompositePlan
+    turn: Box | None  # the middle of a canvas that was widened
+
+    @classmethod
+    def of(cls, images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions | None) -> Self:
+        options = options or CompositeOptions()
+        if len(images) != len(canvas.footprints):
+            raise ArgumentError(f"the canvas is for {len(canvas.footprints)} images, not for {len(images)}")
+        reader = ImageReader(images)
+        channels, dtype = reader.samples
+        cameras = [image.camera for image in images]
+        plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize, masked=reader.masked(0))
+        if canvas.period is not None:
+            canvas = canvas.widened(_wrap_margin(canvas, plan.bands))
+        return cls(images, canvas, options, reader, plan, _unwidened(canvas))
+
+    def cropped(self, box: Box) -> Canvas:
+        """The canvas of the output."""
+        return self.canvas if box == (0, 0, *self.canvas.size) else self.canvas.cropped(box)
+
+
+def decide(
+    images: Sequence[PlacedImage],
+    canvas: Canvas,
+    options: CompositeOptions | None = None,
+    progress: ShareProgress = unheard,
+) -> Decisions:
+    """Decide on exposure, seams and cropping, from a small version of each image; see :func:`compose`."""
+    return _decided(_Task.of(images, canvas, options), progress)
+
+
 @contextmanager
 def prepare_composite(
     images: Sequence[PlacedImage],
@@ -54,69 +106,59 @@ def prepare_composite(
     options: CompositeOptions | None = None,
     progress: ShareProgress = unheard,
     elsewhere: BlockRunner | None = None,
+    decisions: Decisions | None = None,
 ) -> Iterator[Prepared]:
-    """Decide on exposure, seams and cropping, from a small version of each image; see :func:`compose`.
+    """Everything that is needed to compute the output; see :func:`compose`.
 
     Images are read ahead as long as it lasts, if they are needed here.
+
+    Parameters
+    ----------
+    decisions : Decisions, optional
+        Of the same images, canvas and options; made here if not given.
     """
-    options = options or CompositeOptions()
-    if len(images) != len(canvas.footprints):
-        raise ArgumentError(f"the canvas is for {len(canvas.footprints)} images, not for {len(images)}")
-    reader = ImageReader(images)
-    channels, dtype = reader.samples
-    cameras = [image.camera for image in images]
-    plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize, masked=reader.masked(0))
-    if canvas.period is not None:
-        canvas = canvas.widened(_wrap_margin(canvas, plan.bands))
-    warps = plan_warps(images, canvas)
+    task = _Task.of(images, canvas, options)
+    decided = decisions or _decided(task, _part_of(progress, 0.0, _PREPARATION))
+    plan, warps, (channels, dtype) = task.plan, plan_warps(images, task.canvas), task.reader.samples
     cache = ImageCache(
-        reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1 and elsewhere is None
+        task.reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1 and elsewhere is None
     )
     with closing(cache):
-        same = no_exposure(len(images), channels)
-        renderer = Renderer(warps, cache, same, None, options, plan.bands, channels, dtype)
-        decided = _decided(renderer, reader, images, canvas, plan, _part_of(progress, 0.0, _PREPARATION))
         return_freed_memory()
-        yield replace(decided, elsewhere=elsewhere)
-
-
-def _decided(
-    renderer: Renderer,
-    reader: ImageReader,
-    images: Sequence[PlacedImage],
-    canvas: Canvas,
-    plan: CompositePlan,
-    progress: ShareProgress,
-) -> Prepared:
-    """Decide for a renderer that has neither exposure nor seams yet."""
-    options, warps, exposure = renderer.options, renderer.warps, renderer.exposure
-    seams = survey = None
-    joined = len(images) > 1 and (options.exposure != "none" or options.seam != "none")
-    if joined or options.crop == "auto":
-        surveyed = _part_of(progress, 0.0, 0.7)
-        survey = survey_images(reader, images, canvas, min(plan.workers, _READERS), surveyed)
         # The first tiles need most of them, however the seams run.
         topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
-        renderer.images.prefetch(sorted(topmost, key=lambda index: warps[index].box))
-        if joined and options.exposure != "none":
-            exposure = estimate_exposure(survey, images, options.exposure)
-        if joined and options.seam != "none":
-            seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
-            if canvas.period is not None:
-                seams = seams.repeated(round(canvas.period))
-            if options.blend == "feather":
-                seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
-    box, note = _unwidened(canvas), ""
+        cache.prefetch(sorted(topmost, key=lambda index: warps[index].box))
+        renderer = Renderer(warps, cache, decided.exposure, decided.seams, task.options, plan.bands, channels, dtype)
+        tiles = TiledOutput(renderer, decided.box, plan.tile_size, plan.workers)
+        yield Prepared(renderer, task.cropped(decided.box), tiles, decided.messages, elsewhere)
+
+
+def _decided(task: _Task, progress: ShareProgress) -> Decisions:
+    """Everything that small images say."""
+    images, canvas, options, plan = task.images, task.canvas, task.options, task.plan
+    exposure, seams, quality = no_exposure(len(images), task.reader.samples[0]), None, SeamQuality()
+    joined = len(images) > 1 and (options.exposure != "none" or options.seam != "none")
+    whole = task.turn or (0, 0, *canvas.size)
+    if not joined and options.crop != "auto":
+        return Decisions(exposure, None, whole)
+    survey = survey_images(task.reader, images, canvas, min(plan.workers, _READERS), _part_of(progress, 0.0, 0.7))
+    if joined and options.exposure != "none":
+        exposure = estimate_exposure(survey, images, options.exposure)
+    if joined and options.seam != "none":
+        seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
+        quality = survey.seam_quality(seams.labels)
+        if canvas.period is not None:
+            seams = seams.repeated(round(canvas.period))
+        if options.blend == "feather":
+            seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
+    box, note = whole, ""
     if canvas.cropped_to is not None and options.crop == "auto":
         box = canvas.cropped_to
-    elif survey is not None and options.crop == "auto":
-        find = crop_box if box is None else partial(crop_rows, whole=box)
+    elif options.crop == "auto":
+        find = crop_box if task.turn is None else partial(crop_rows, whole=task.turn)
         cropped_box, note = find(covered_pixels(survey), survey.factor, canvas.size)
         box = cropped_box or box
-    cropped = canvas if box is None else canvas.cropped(box)
-    renderer = replace(renderer, exposure=exposure, seams=seams)
-    tiles = TiledOutput(renderer, box or (0, 0, *canvas.size), plan.tile_size, plan.workers)
-    return Prepared(renderer, cropped, tiles, (Message(note),) if note else ())
+    return Decisions(exposure, seams, box, (Message(note),) if note else (), quality.cropped(box))
 
 
 def _wrap_margin(canvas: Canvas, bands: int) -> int:

@@ -245,8 +245,14 @@ class ImageReader:
 
     def prepared(self, index: int, shrink: float) -> LoadedImage:
         """Read image ``index``, no larger than needed, for an output that shrinks it so much."""
-        reduction = self._reduction(index, shrink)
-        return prepare_image(self(index, reduction), shrink, reduction)
+        return self.prepared_twice(index, shrink, shrink)[0]
+
+    def prepared_twice(self, index: int, shrink: float, finer: float) -> tuple[LoadedImage, LoadedImage]:
+        """Read image ``index`` once for two outputs, of which the second shrinks it less."""
+        reduction = self._reduction(index, finer)
+        image = self(index, reduction)
+        coarse = prepare_image(image, shrink, reduction)
+        return coarse, coarse if finer == shrink else prepare_image(image, finer, reduction)
 
     def nbytes(self, index: int, shrink: float) -> int:
         """Memory that image ``index`` takes at most when it is prepared for such an output, if it was read before."""

@@ -1,8 +1,9 @@
-"""All images on a reduced canvas: what exposure, seams and cropping are decided on."""
+"""All images on a reduced canvas: what exposure, seams and cropping are decided on, and seams are looked at."""
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -12,12 +13,15 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection, overlapping_pairs
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.source_images import ImageReader, PlacedImage
+from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, measure_seams, share_alike
+from rdstitch.compositing.source_images import ImageReader, LoadedImage, PlacedImage
 from rdstitch.compositing.warp import Warp, locate, plan_warps, sample, sample_opacity
+from rdstitch.io.reduction import mean_of_channels
 from rdstitch.system.progress import ShareProgress, unheard
 
 _MAX_IMAGE = 200_000
 _MAX_TOTAL = 16_000_000  # pixels of one image and of all on the reduced canvas; OpenCV finds seams at 100,000
+_MAX_SEEN = 24_000_000  # pixels of all images where their seams are looked at
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,7 @@ class SurveyTile:
     pixels: NDArray[Any]  # (h, w, C): in the image's sample type
     inside: NDArray[np.bool_]  # (h, w), bool
     opacity: Float32Array | None = None  # (h, w), float32: of an image with a mask
+    seen: SeamTile | None = None  # the same, larger, where seams are looked at
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,7 @@ class Survey:
     canvas: Canvas  # the reduced canvas
     warps: tuple[Warp, ...]  # onto the reduced canvas
     tiles: tuple[SurveyTile | None, ...]  # None for an image that is nowhere opaque
+    enlarged: float  # pixels of what seams are looked at on for one of the reduced canvas, along a side
 
     def pairs(self) -> NDArray[np.intp]:
         """Pairs (P, 2) of images that lie over each other; see :func:`overlapping_pairs`."""
@@ -51,6 +57,17 @@ class Survey:
         box = intersection(a.box, b.box)
         assert box is not None
         return a, b, box, cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
+
+    def seam_quality(self, labels: NDArray[np.int32]) -> SeamQuality:
+        """What seams are like, in canvas pixels; ``labels`` are the owners of the reduced canvas."""
+        full = 255.0
+        shown = [tile for tile in self.tiles if tile is not None]
+        if shown and shown[0].pixels.dtype != np.uint8:  # any part of the range may be what such images use
+            low, high = np.mean([np.quantile(t.pixels[t.inside], [0.005, 0.995]) for t in shown], axis=0)
+            full = max(float(high - low), 1e-12)
+        seen = [None if tile is None else tile.seen for tile in self.tiles]
+        quality = measure_seams(seen, labels, self.enlarged, self.factor / self.enlarged, full)
+        return replace(quality, alike=share_alike(seen, self.pairs(), full))
 
 
 def survey_factor(canvas: Canvas) -> int:
@@ -73,25 +90,43 @@ def survey_images(
     factor = survey_factor(canvas)
     small = canvas.reduced(factor)
     warps = tuple(plan_warps(images, small))
+    enlarged = factor / seen_reduction(canvas)
     tiles = []
     with ThreadPoolExecutor(workers) as pool:
-        for tile in pool.map(partial(_survey_tile, reader), range(len(warps)), warps):
+        for tile in pool.map(partial(_survey_tile, reader, enlarged), range(len(warps)), warps):
             tiles.append(tile)
             progress(len(tiles) / len(warps))
-    return Survey(factor, small, warps, tuple(tiles))
+    return Survey(factor, small, warps, tuple(tiles), enlarged)
 
 
-def _survey_tile(reader: ImageReader, index: int, warp: Warp) -> SurveyTile | None:
+def seen_reduction(canvas: Canvas) -> float:
+    """Canvas pixels, along a side, for one of what seams are looked at on."""
+    areas = np.array(canvas.areas(), dtype=np.float64)
+    usual = 1.44 * math.sqrt(float(np.median(areas)))  # the diagonal of an image of 4 to 3
+    return max(1.0, usual / DIAGONAL, math.sqrt(areas.sum() / _MAX_SEEN))
+
+
+def _survey_tile(reader: ImageReader, enlarged: float, index: int, warp: Warp) -> SurveyTile | None:
     """One image, small."""
     geometry = locate(warp, warp.box)
-    image = reader.prepared(index, warp.shrink)
+    finer = warp.enlarged(enlarged)
+    image, larger = reader.prepared_twice(index, warp.shrink, finer.shrink)
     inside, opacity = geometry.inside, sample_opacity(image, geometry)
     if opacity is not None:
         inside = inside & (opacity > 0)
     if not inside.any():
         return None
     pixels = sample(image, geometry, "linear")
-    return SurveyTile(warp.box, pixels.reshape(*inside.shape, -1), inside, opacity)
+    return SurveyTile(warp.box, pixels.reshape(*inside.shape, -1), inside, opacity, _seen(larger, finer))
+
+
+def _seen(image: LoadedImage, warp: Warp) -> SeamTile:
+    """An image, grey, as its seams are looked at."""
+    geometry = locate(warp, warp.box)
+    inside, opacity = geometry.inside, sample_opacity(image, geometry)
+    grey = mean_of_channels(sample(image, geometry, "linear").astype(np.float32))
+    grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), dtype=np.float32)
+    return SeamTile(warp.box, grey, inside if opacity is None else inside & (opacity > 0))
 
 
 # Rectangles are sought with at most this many pixels along the longer side of the canvas.

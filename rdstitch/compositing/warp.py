@@ -131,6 +131,17 @@ class Warp:
         points = self.camera.distort(self.camera.denormalize(np.stack([u, v], axis=-1)))
         return points if self.displacement is None else points + self.displacement(points)
 
+    def enlarged(self, ratio: float) -> Self:
+        """The same onto a canvas with ``ratio`` times as many pixels along each side."""
+        shift = 0.5 * ratio - 0.5
+        back = np.array([[1.0 / ratio, 0.0, -shift / ratio], [0.0, 1.0 / ratio, -shift / ratio], [0.0, 0.0, 1.0]])
+        x0, y0, x1, y1 = (v * ratio for v in self.box)
+        box = math.floor(x0), math.floor(y0), math.ceil(x1), math.ceil(y1)
+        finer = replace(self, box=box, shrink=self.shrink / ratio)
+        if self.surface is None:
+            return replace(finer, from_canvas=self.from_canvas @ back)
+        return replace(finer, surface=replace(self.surface, from_canvas=self.surface.from_canvas @ back))
+
     def contains(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
         """Which measured pixels lie in the image; NaN does not."""
         width, height = self.camera.image_size

@@ -31,7 +31,7 @@ class DaskExecutor(Executor):
         try:
             distributed: Any = import_module("distributed")
         except ImportError as error:
-            raise ArgumentError("--scheduler needs Dask: pip install 'rdstitch[distributed]'") from error
+            raise ArgumentError("--scheduler needs Dask: pip install distributed") from error
         self._killed: type[BaseException] = distributed.KilledWorker
         # What matters ends as an exception; a scheduler that goes away would be logged at length.
         logging.getLogger("distributed").setLevel(logging.CRITICAL)

@@ -196,8 +196,9 @@ def world_file_paths(image: str | Path) -> tuple[Path, ...]:
 
 
 def has_place(positions: Sequence[GpsPosition | None]) -> bool:
-    """Check whether enough images have a position for a place to be expected."""
-    return sum(position is not None for position in positions) >= MIN_POSITIONS
+    """Check whether enough places are known; phones give several images the one that they found last."""
+    known = {(position.latitude, position.longitude) for position in positions if position is not None}
+    return len(known) >= MIN_POSITIONS
 
 
 @dataclass(frozen=True)
@@ -305,8 +306,8 @@ def _placed(
     if used.sum() < max(MIN_POSITIONS, len(names) / 2) or not rms < _MAX_ERROR * spread:
         median = float(np.median(np.abs(off)))
         reason = (
-            f"the {source} contradict the images: they are {_metres(median)} off in the median, and spread over "
-            f"{_metres(spread)}"
+            f"the {source} contradict the images: half of them are {_metres(median)} or more from where the images put "
+            f"them, which is much in an area of {_metres(2.0 * spread)}"
         )
         if not force:
             return None, f"{reason}; --georeference force places it nevertheless"

@@ -282,7 +282,7 @@ def _rasterio(system: str) -> ModuleType:
         import_module("rasterio.warp")
     except ImportError as error:
         raise ArgumentError(
-            f"{system} needs rasterio (pip install 'rdstitch[crs]'); UTM on WGS 84, EPSG:32601 to 32660 and "
+            f"{system} needs rasterio (pip install rasterio); UTM on WGS 84, EPSG:32601 to 32660 and "
             "32701 to 32760, does not"
         ) from error
     return module

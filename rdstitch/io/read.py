@@ -2,13 +2,10 @@
 
 import math
 import re
-import struct
-import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
@@ -22,8 +19,7 @@ from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding,
 from rdstitch.io.read_tiff import read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.system.file_access import open_regular, read_beginning
-from rdstitch.system.late_imports import tifffile
-from rdstitch.system.opencv_state import silent_opencv
+from rdstitch.system.late_imports import imagecodecs, tifffile
 
 _END_OF_IMAGE = b"\xff\xd9"
 _PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
@@ -32,7 +28,6 @@ _OPAQUE = 255
 
 _MAX_DECODED_REDUCTION = 8  # of the JPEG decoder
 _ROWS_AT_A_TIME = 128
-_PNG_PIXEL_CHUNKS = (b"IHDR", b"tRNS", b"IDAT", b"IEND")
 _JPEG = ("JPEG", "MPO")
 _GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 
@@ -124,7 +119,8 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
             with opened_image(file) as opened:
                 metadata = metadata or metadata_of(opened)
                 if magic == PNG_MAGIC and metadata.bit_depth == 16 and opened.mode not in _GREY_16:
-                    samples, alpha = _split(_read_16_bit_png(file, opened.size))
+                    # Pillow would cut 16-bit colour to 8.
+                    samples, alpha = _split(imagecodecs.png_decode(read_beginning(file, _most_bytes(opened.size))))
                 else:
                     factor, decoded = _decoders_share(opened, metadata, reduction), None
                     if opened.format in _JPEG and opened.mode in ("L", "RGB"):
@@ -183,44 +179,11 @@ def _samples(image: Image.Image) -> Pixels:
     return samples
 
 
-def _read_16_bit_png(file: Path, size: tuple[int, int]) -> Pixels:
-    """16-bit colour, which Pillow would cut to 8 bit; damage is found by the checksums, which OpenCV tolerates."""
-    data = memoryview(read_beginning(file, _most_bytes(size)))
-    position, kind = len(PNG_MAGIC), b""
-    kept = [data[:position]]
-    while kind != b"IEND":
-        length, kind = struct.unpack_from(">I4s", data, position)
-        end = position + length + 12
-        (checksum,) = struct.unpack_from(">I", data, end - 4)
-        if zlib.crc32(data[position + 4 : end - 4]) != checksum:
-            raise ValueError("checksum error")
-        # libpng prints complaints about odd colour profiles and the like; it need not see them.
-        if kind in _PNG_PIXEL_CHUNKS:
-            kept.append(data[position:end])
-        position = end
-    return _decode_with_opencv(b"".join(kept))
-
-
-def _decode_with_opencv(data: bytes) -> Pixels:
-    """Samples in RGB(A) order as stored."""
-    with silent_opencv():
-        flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-        samples = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-    if samples is None:
-        raise ValueError("the decoder gives up")
-    if samples.ndim == 3 and samples.shape[2] in (3, 4):
-        # In pieces, since a large image must not be there twice.
-        for top in range(0, len(samples), _ROWS_AT_A_TIME):
-            rows = samples[top : top + _ROWS_AT_A_TIME]
-            rows[..., :3] = rows[..., 2::-1].copy()
-    return samples
-
-
 def _split(samples: Pixels) -> tuple[Pixels, Pixels | None]:
-    """Colour and alpha of an RGBA array."""
-    if samples.ndim == 3 and samples.shape[2] == 4:
-        return samples[..., :3], samples[..., 3]
-    return samples, None
+    """Grey or colours, and alpha, of an array (h, w, 2) or (h, w, 4); any other as it is."""
+    if samples.ndim == 2 or samples.shape[2] == 3:
+        return samples, None
+    return (samples[..., 0] if samples.shape[2] == 2 else samples[..., :3]), samples[..., -1]
 
 
 def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:

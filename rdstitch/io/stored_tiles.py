@@ -118,7 +118,12 @@ def stored_tiles(files: Iterable[Path]) -> list[StoredTile]:
         if file.parent not in folders:
             folders[file.parent] = _micro_manager_folder(file.parent)
         beside = folders[file.parent].get(canonical_name(file.name))
-        for tile in [beside] if beside is not None and len(beside.planes) > 1 else _of_file(file):
+        try:
+            tiles = [beside] if beside is not None and len(beside.planes) > 1 else _of_file(file)
+        except (InputError, OSError):
+            # Whoever reads the file says what is wrong with it.
+            tiles = [StoredTile(file, {(0, 0, 0): Page(file, 0)})]
+        for tile in tiles:
             if tile.position is None and beside is not None:
                 tile = replace(tile, position=beside.position, unit=beside.unit, pixel_size=beside.pixel_size)
             found.setdefault(tile.planes[min(tile.planes)], tile)

@@ -10,7 +10,7 @@ that part. While an image is being made nobody knows where its parts will lie: c
 import struct
 import tempfile
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -273,7 +273,9 @@ def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip]) -> None:
             levels.append(level)
         size = layout.metadata.pixel_size
         units = {} if size is None else {"PhysicalSizeX": size, "PhysicalSizeY": size}
-        names = {key + "Unit": "µm" for key in units}
+        names: dict[str, Any] = {key + "Unit": "µm" for key in units}
+        if apart and len(layout.metadata.channel_names) == layout.channels:
+            names["Channel"] = {"Name": list(layout.metadata.channel_names)}
         identity = uuid.uuid5(uuid.NAMESPACE_OID, f"rdstitch {layout.size} {layout.channels} {layout.dtype}")
         total = sum(level.nbytes for level in levels)
         with tifffile.TiffWriter(path, ome=True, bigtiff=total > 2**31) as tiff:
@@ -301,7 +303,12 @@ def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip]) -> None:
 
 
 def write_cropped_tiff(
-    path: Path, pixels: NDArray[Any], alpha: NDArray[np.uint8] | None, offset: tuple[int, int], size: tuple[int, int]
+    path: Path,
+    pixels: NDArray[Any],
+    alpha: NDArray[np.uint8] | None,
+    offset: tuple[int, int],
+    size: tuple[int, int],
+    extra_tags: Sequence[ExtraTag] = (),
 ) -> None:
     """Write a part (h, w) or (h, w, C) of a canvas of ``size``, its first pixel at ``offset``; alpha is 0 or 255.
 
@@ -326,7 +333,7 @@ def write_cropped_tiff(
         predictor=samples.dtype.kind == "u",
         resolution=(_DPI, _DPI),
         resolutionunit="inch",
-        extratags=[*positions, *whole],
+        extratags=[*positions, *whole, *extra_tags],
         metadata=None,
         software=False,
     )

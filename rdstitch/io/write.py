@@ -18,6 +18,7 @@ from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.io.deepzoom import write_deep_zoom
 from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, as_eight_bit, check_strips, jpeg_pieces, png_pieces
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.ome_zarr import check_zarr, write_ome_zarr
 from rdstitch.io.tiff import OME_SUFFIXES, ExtraTag, write_ome_tiff, write_tiff
 from rdstitch.system.outputs import (
     IMAGE_SUFFIXES,
@@ -25,6 +26,7 @@ from rdstitch.system.outputs import (
     Outputs,
     check_tiles_folder,
     fingerprint,
+    is_zarr,
     naming,
     tiles_folder,
 )
@@ -92,6 +94,9 @@ def write_strips(
         check_tiles_folder(folder, overwrite=True)
         with outputs.writing(folder, is_folder=True) as tiles, outputs.writing(file) as staged:
             write_deep_zoom(staged, tiles, layout, checked)
+    elif is_zarr(file):
+        with outputs.writing(file, is_folder=True) as staged:
+            write_ome_zarr(staged, layout, checked)
     else:
         with outputs.writing(file) as staged:
             if file.name.lower().endswith(OME_SUFFIXES):
@@ -125,7 +130,9 @@ def check_format(path: str | Path, layout: Layout) -> None:
     suffix = Path(path).suffix.lower()
     if suffix not in IMAGE_SUFFIXES:
         raise OutputError(f"{path}: unknown file type '{suffix}'; use one of {' '.join(IMAGE_SUFFIXES)}")
-    if suffix in _TIFF:
+    if suffix == ".zarr":
+        check_zarr(Path(path))
+    if suffix in (*_TIFF, ".zarr"):
         return
     if layout.channels not in (1, 3):
         raise OutputError(f"{path}: {layout.channels} channels do not fit into {suffix[1:]}; write a .tif")

@@ -59,8 +59,9 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
     if alike is None or alike.ordered:
         chosen |= {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _SEQUENCE_NEIGHBOURS, count))}
     if alike is not None:
+        found = (features.counts > 0).tolist()
         best = ((i, j) for i, row in enumerate(alike.most_alike[:, :_RETRIEVED].tolist()) for j in row)
-        chosen |= {(min(pair), max(pair)) for pair in best if features.counts[[*pair]].all()}
+        chosen |= {(min(i, j), max(i, j)) for i, j in best if found[i] and found[j]}
         chosen |= _most_alike(alike, chosen, CANDIDATES * count // 2)
     return sorted(chosen)
 
@@ -161,7 +162,7 @@ def neighbours(
         pair
         for pair in sorted(_nearest_pairs(centres, known, _NEIGHBOURS) - tried)
         if needed(*pair)
-        and max(_share_seen(cameras, homographies, *both) for both in (pair, pair[::-1])) >= _MIN_OVERLAP
+        and any(_share_seen(cameras, homographies, *both) >= _MIN_OVERLAP for both in (pair, pair[::-1]))
     ]
 
 

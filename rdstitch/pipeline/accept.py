@@ -8,8 +8,9 @@ import numpy as np
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.alignment.unaligned import explain_unaligned
+from rdstitch.choices import Purpose
 from rdstitch.errors import PartialResultError, RegistrationError
-from rdstitch.pipeline.aligner import AlignedPairs, Aligner, Purpose, impossible_estimates_fail
+from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, names_of, told_once
 from rdstitch.results.registration import Registration
@@ -35,19 +36,17 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
     Parameters
     ----------
     registration : Registration
-        In pixels of the working size; the result is in those of the images.
+        In pixels of the working size, as the result.
     purpose : str
         As for :func:`rdstitch.pipeline.register.register`.
     """
-    cache = Cache(options.cache)
-    aligner = Aligner.of(registration.sources, options, cache, purpose)
-    aligner, lens_only = replace(aligner, needs_poses=purpose == "trajectory"), purpose == "calibrate"
+    aligner, lens_only = aligner_of(registration, options, purpose), purpose == "calibrate"
     undamaged = None if options.force else _without_damage(registration, aligner)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None
 
     def checked(candidate: Registration) -> tuple[Finding, ...]:
-        return judge(Evidence(candidate, options.threshold, options.threads, cache, lens_only))
+        return judge(Evidence(candidate, options.threshold, options.threads, aligner.cache, purpose))
 
     current, findings = registration, checked(registration)
     first, first_findings = registration, findings
@@ -55,7 +54,7 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
         current, findings = undamaged, judged
     elif _fails(findings) and not options.force:
         another = not lens_only and _may_be_another_plane(findings)
-        plane = _plane_of_most(registration, options, aligner) if another else None
+        plane = plane_of_most(registration, options, aligner) if another else None
         judged = () if plane is None else checked(plane)
         if plane is not None and not any(map(_is_of_the_whole, judged)):
             current, findings = plane, judged
@@ -64,22 +63,33 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
             if not _fails(findings):
                 break
             if any(map(_is_of_the_whole, findings)):
-                raise RefusedError(_told(current, findings))
+                raise RefusedError(at_full_size(_told(current, findings)))
             worst = _worst(current, findings)
             left |= worst
             shrunk = _without(start, left, aligner) if worst else None
             # Where as many images fail as pass, nobody can say which of them are right.
             if shrunk is None or shrunk.alignment.used.sum() <= len(_images(left)):
-                raise RefusedError(_told(first, first_findings))
+                raise RefusedError(at_full_size(_told(first, first_findings)))
             current, findings = shrunk, checked(shrunk)
     if _fails(findings) and not options.force:
-        raise RefusedError(_told(first, first_findings))
+        raise RefusedError(at_full_size(_told(first, first_findings)))
     accepted = _told(current, findings)
     if accepted.failures and not options.force:  # of the alignment itself
-        raise RefusedError(accepted)
+        raise RefusedError(at_full_size(accepted))
     if options.strict and accepted.left_out:
         raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
     return accepted
+
+
+def aligner_of(registration: Registration, options: StitchOptions, purpose: Purpose) -> Aligner:
+    """What aligns the images of a registration anew."""
+    aligner = Aligner.of(registration.sources, options, Cache(options.cache), purpose)
+    return replace(aligner, needs_poses=purpose == "trajectory")
+
+
+def realigned(registration: Registration, aligner: Aligner) -> Registration:
+    """The pairs of a registration aligned by another aligner."""
+    return _aligned_anew(registration, aligner.align(registration.pairs), aligner.paths, {})
 
 
 def _without_damage(registration: Registration, aligner: Aligner) -> Registration | None:
@@ -110,8 +120,8 @@ def _fails(findings: Iterable[Finding]) -> bool:
 
 
 def _told(registration: Registration, findings: Sequence[Finding]) -> Registration:
-    """A registration at full size, with what was found of it in words."""
-    return at_full_size(registration).with_messages(messages_of(findings, registration))
+    """A registration with what was found of it in words."""
+    return registration.with_messages(messages_of(findings, registration))
 
 
 def _may_be_another_plane(findings: Iterable[Finding]) -> bool:
@@ -119,7 +129,7 @@ def _may_be_another_plane(findings: Iterable[Finding]) -> bool:
     return any(found.kind in ("second motion", "undecided motion") or _is_of_the_whole(found) for found in findings)
 
 
-def _plane_of_most(registration: Registration, options: StitchOptions, aligner: Aligner) -> Registration | None:
+def plane_of_most(registration: Registration, options: StitchOptions, aligner: Aligner) -> Registration | None:
     """Of two motions in the images that which may fill most of them; None where that is not to be seen."""
     if registration.static_background:
         return None

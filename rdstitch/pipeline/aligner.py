@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames import stored, turned_alignment, turned_link, turned_tilts, turns
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import Purpose
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import quarter_turn
@@ -28,12 +29,6 @@ from rdstitch.system.cache import Cache
 from rdstitch.system.file_access import canonical_name
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.verification.limits import limit
-
-Purpose = Literal["pano", "mosaic", "calibrate", "trajectory"]
-"""The recipe that a registration is for. In "pano" every image must be readable, and a turn on the spot is taken where
-a plane explains the images as well; for "calibrate" images of a repeated pattern may be off by whole periods of it, and
-doubts about their places do not matter; for "trajectory" poses must be metric, so that the freest model is that of
-planar motion with small tilts."""
 
 _ROUNDS = 2
 """Of registering more pairs and selecting inliers again at most, each by what the one before has shown."""

@@ -40,6 +40,7 @@ from rdstitch.sidecar.write import (
     to_output,
     versions,
 )
+from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
 from rdstitch.system.progress import Progress, silent
@@ -235,14 +236,22 @@ def apply(
     if strict and doubts:
         raise InputError(doubts[0].text)
     given = as_inputs(images, channel_order)
+    if saved.content.get("stage") is not None:
+        given = with_position_folders(given)
     with found_images(given, output=output, every=every, topic=topic) as listed, Outputs(overwrite) as outputs:
         if output is not None:
             check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
-        chosen, matched, said = counterparts(saved, listed.frames, match)
+        given_frames: Sequence[Frame] = listed.frames
+        if (stage := saved.content.get("stage")) is not None:
+            given_frames, _, said = tile_frames(given_frames, stage["z"], stage["time"])
+            doubts += said
+        chosen, matched, said = counterparts(saved, given_frames, match)
         doubts += said
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
         used = _used(saved, sources, left_out, mask, strict=strict)
+        if stage is not None and stage["pixel_um"] is not None:
+            used = {k: replace(s, metadata=replace(s.metadata, pixel_size=stage["pixel_um"])) for k, s in used.items()}
         if flat_field != "off":
             check_size(list(used.values()))
             corrected, said = with_flat_field(list(used.values()), flat_field)
@@ -251,7 +260,8 @@ def apply(
         if output is not None:
             check_world_files([output], list(used.values()), overwrite)
         frames = {index: frame for index, frame in enumerate(chosen) if index in used and frame is not None}
-        lens, said = _lens_of_band(saved, frames, used, progress)
+        # Channels of a microscope have their places in common, not their content.
+        lens, said = (None, []) if stage is not None else _lens_of_band(saved, frames, used, progress)
         doubts += said
         if lens is not None:
             used = {index: replace(source, camera=lens.camera(source.camera)) for index, source in used.items()}

@@ -6,6 +6,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -13,14 +14,19 @@ from rdstitch.compositing import (
     Canvas,
     CompositeOptions,
     CompositePlan,
+    Decisions,
     FileComposite,
+    PlacedImage,
+    SeamQuality,
     compose,
     compose_to_file,
+    decide,
     plan_composite,
 )
 from rdstitch.compositing.boxes import Box
+from rdstitch.compositing.projection import PLANE
 from rdstitch.compositing.tiles import Block, BlockRunner, OutputStrip
-from rdstitch.compositing.upright import Corners
+from rdstitch.compositing.upright_options import Corners
 from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, has_place, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes
@@ -31,7 +37,7 @@ from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages
-from rdstitch.results.messages import Message, names_of, shortened
+from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened
 from rdstitch.results.stitch_result import OutputImage, StitchResult
 from rdstitch.system.cache import Cache, Stored
 from rdstitch.system.outputs import Outputs, check_outputs, text_bytes
@@ -41,6 +47,7 @@ from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
 
 # Reduction of an image of which only the kind of its samples is wanted.
 _PROBE_REDUCTION = 8
+_VISIBLE_CUT = 0.02  # share of the images that is cut away, from which on it is said
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -51,8 +58,38 @@ class Composed(OutputImage):
     written: FileComposite | None = None  # the image in its file
 
 
+@dataclass(frozen=True)
+class Layout:
+    """Images on a canvas, and what was decided on small versions of them."""
+
+    placed: PlacedImages
+    canvas: Canvas
+    images: Sequence[PlacedImage]
+    georeference: Georeference | None
+    not_georeferenced: str  # why
+    decisions: Decisions | None = None
+    photographs: bool = True  # whether seams are to be judged as a person sees them
+
+    @classmethod
+    def of(cls, placed: PlacedImages, options: CompositeOptions) -> Self:
+        """Plan the canvas."""
+        canvas, place, reason = plan_on_map(placed, options)
+        if options.rectangle is not None:
+            canvas = replace(canvas, cropped_to=_box_of_rectangle(placed, options.rectangle, canvas))
+        return cls(placed, canvas, placed.images(canvas.near), place, reason)
+
+    def decided(self, options: CompositeOptions, threads: int) -> Self:
+        """With exposure and seams."""
+        return replace(self, decisions=decide(self.images, self.canvas, replace(options, workers=threads)))
+
+    @property
+    def seams(self) -> SeamQuality:
+        """What its seams are like."""
+        return SeamQuality() if self.decisions is None else self.decisions.quality
+
+
 def compose_images(
-    placed: PlacedImages,
+    placed: PlacedImages | Layout,
     output: str | Path | None,
     options: CompositeOptions,
     threads: int,
@@ -66,6 +103,8 @@ def compose_images(
 
     Parameters
     ----------
+    placed : PlacedImages or Layout
+        A layout where the canvas is planned already.
     output : path or None
         File that the image is written to, a strip at a time, with colour profile and EXIF of the first image, and
         with its place on the Earth where three images have a GPS position; without it the image is made in memory.
@@ -77,34 +116,40 @@ def compose_images(
         Only plan.
     """
     return_freed_memory()
+    layout = placed if isinstance(placed, Layout) else Layout.of(placed, options)
+    placed, canvas, images, place = layout.placed, layout.canvas, layout.images, layout.georeference
     world_files = world_file_paths(output) if output is not None and placed.has_place else ()
-    canvas, place, reason = plan_on_map(placed, options)
-    if options.rectangle is not None:
-        canvas = replace(canvas, cropped_to=_box_of_rectangle(placed, options.rectangle, canvas))
-    notes = [*_masked(placed), *place_messages(place, reason, placed)]
+    notes = [
+        *_masked(placed),
+        *place_messages(place, layout.not_georeferenced, placed),
+        *_cut_away(placed, canvas, options),
+    ]
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)
         check_memory(output, canvas.size, options.max_memory)
-    options = replace(options, workers=threads)
-    images = placed.images(canvas.near)
     composed = Composed(
         canvas=canvas,
         output=None if output is None else Path(output),
         georeference=place,
-        not_georeferenced=reason,
+        not_georeferenced=layout.not_georeferenced,
         messages=tuple(notes),
     )
     if dry_run:
-        return replace(composed, plan=_planned(placed, canvas, options))
+        return replace(composed, plan=_planned(placed, canvas, replace(options, workers=threads)))
+    layout = layout if layout.decisions is not None else layout.decided(options, threads)
+    options = replace(options, workers=threads)
+    if layout.photographs:
+        notes += seam_messages(layout.seams, [str(source.path) for source in placed.sources])
 
     def report(share: float) -> None:
         progress("compositing", round(100 * share), 100)
 
     if output is None:
-        composite = compose(images, canvas, options, report, elsewhere)
+        composite = compose(images, canvas, options, report, elsewhere, layout.decisions)
         place, messages = moved(place, canvas, composite.canvas), (*notes, *composite.messages)
-        return replace(composed, canvas=composite.canvas, composite=composite, georeference=place, messages=messages)
+        composed = replace(composed, canvas=composite.canvas, composite=composite, seams=layout.seams)
+        return replace(composed, georeference=place, messages=messages)
 
     def tags(final: Canvas) -> list[ExtraTag]:
         on_final = moved(place, canvas, final)
@@ -115,7 +160,16 @@ def compose_images(
         scaled = None if options.max_size is not None else metadata.pixel_size / options.scale
         metadata = replace(metadata, pixel_size=scaled)
     written = compose_to_file(
-        output, images, canvas, options, report, elsewhere, metadata=metadata, extra_tags=tags, outputs=outputs
+        output,
+        images,
+        canvas,
+        options,
+        report,
+        elsewhere,
+        layout.decisions,
+        metadata=metadata,
+        extra_tags=tags,
+        outputs=outputs,
     )
     place = moved(place, canvas, written.canvas)
     beside = []
@@ -135,7 +189,40 @@ def compose_images(
         fingerprint=written.fingerprint,
         written=written,
         georeference=place,
+        seams=layout.seams,
     )
+
+
+def _cut_away(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> list[Message]:
+    """How much of the images has no place in the output."""
+    if placed.grid is not None or options.like is not None or options.extent is not None:
+        return []
+    share = canvas.cut_away(placed.cameras, placed.homographies)
+    text = f"{share:.0%} of what the images show is cut away: it would be stretched over {options.max_stretch:g} times"
+    if placed.turned and canvas.projection == PLANE:
+        text += "; --projection cylinder or sphere shows more"
+    return [Message(text, severity="note")] if share > _VISIBLE_CUT else []
+
+
+def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
+    """Where seams are broken, a warning where a person sees it, else a detail; and whether overlaps are unlike."""
+    if seams.contradicted:
+        text = (
+            f"only {seams.alike:.0%} of what the images share looks alike: something that fills a part of them (a "
+            "vehicle, the camera's own mount) may be what was put together; a mask keeps it out"
+        )
+        return [Message(text, code="rival-motion")]
+    if not seams.breaks:
+        return []
+    worst = list({one.images: one for one in reversed(seams.breaks)}.values())[::-1][:MAX_NAMED]
+    told = []
+    for one in worst:
+        (x, y), (first, second) = one.position, names_of(paths[k] for k in one.images)
+        told.append(f"a break of {one.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}")
+    more = f", and {rest} more" if (rest := len(seams.breaks) - len(worst)) else ""
+    text = f"{'; '.join(told)}{more}: something moved, or is nearer than the rest; leave one of the two out, or mask it"
+    images = tuple(dict.fromkeys(paths[k] for one in worst for k in one.images))
+    return [Message(text, images, "warning" if seams.seen else "detail", code="seam-break")]
 
 
 def _planned(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> CompositePlan:

@@ -112,8 +112,9 @@ def check_run(
     """Find out before long work whether all that images of these names become can be written, over nothing read."""
     files = [file for image in images for file in image_files(check_suffix(image))]
     if options.save_camera is not None:
-        from rdstitch.camera_files import CAMERA_SUFFIXES
+        from rdstitch.camera_files import format_of
 
-        files.append(check_suffix(options.save_camera, CAMERA_SUFFIXES))
+        format_of(options.save_camera, options.camera_format)
+        files.append(options.save_camera)
     files += beside.files(names)
     check_outputs(files, options.overwrite, [*inputs, *options.files])

@@ -10,6 +10,7 @@ from typing import Literal
 
 from rdstitch.alignment.frames import stored, turned_alignment
 from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.choices import Purpose
 from rdstitch.errors import OutputError, RdstitchError, RegistrationError
 from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
 from rdstitch.geometry.exif_orientation import quarter_turn
@@ -18,17 +19,14 @@ from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of, with_times
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
-from rdstitch.local_alignment import LocalAlignment
-from rdstitch.pipeline.accept import accept, scale_uncertainty
-from rdstitch.pipeline.aligner import Purpose
+from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty
+from rdstitch.pipeline.choose_layout import LaidOut, choose_layout
 from rdstitch.pipeline.compose import blocks_on, check_world_files, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside, check_run
-from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag
-from rdstitch.pipeline.register import register, with_frontal_reference
-from rdstitch.pipeline.straighten import turned
-from rdstitch.pipeline.whole_pixels import on_whole_pixels
+from rdstitch.pipeline.register import register
+from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, told_once
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_options import StitchOptions
@@ -185,7 +183,7 @@ def mosaic_blocks(
         frames = selected(listed.frames, options.exclude, options.include_only)
         names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
         further = names[1:]
-        found = listed
+        found = replace(listed, outputs=[], notes=())
         while len(frames) > 1 or not results:
             name = names[len(results)]
             try:
@@ -206,7 +204,7 @@ def mosaic_blocks(
             used = [source.frame or Frame(source.path) for source, used in pairs if used]
             done = {(frame.path, frame.number) for frame in used}
             frames = [frame for frame in frames if (frame.path, frame.number) not in done]
-            found = replace(listed, frames=frames)
+            found = replace(found, frames=frames)
             # These are of the first block, or of its reference image.
             options, beside, further = _for_further_blocks(options), NOTHING_BESIDE, []
     return (_without_blocks(results[0], results[1:], [*listed.messages, *refused]), *map(_without_blocks, results[1:]))
@@ -277,12 +275,12 @@ def _stitch_found(
     sources, unread = read_inputs(frames, options, skip_bad=not pano)
     check_world_files(images, sources, options.overwrite)
     check_map(sources, options.composite)
+    purpose: Purpose = "pano" if pano else "mosaic"
     with options.executor(len(sources)) as executor:
         known = [*unread, *listed.messages]
-        accepted = _accepted(sources, known, options, executor, progress, "pano" if pano else "mosaic", beside)
-        registration = on_whole_pixels(with_frontal_reference(accepted, options, always=pano))
-        local = align_registration_locally(registration, options.local_alignment)
-        return compose_registration(registration, local, executor, output, options, progress, beside, outputs)
+        accepted = _accepted(sources, known, options, executor, progress, purpose, beside)
+        chosen = choose_layout(accepted, options, aligner_of(accepted, options, purpose), pano=pano)
+        return compose_registration(chosen, executor, output, options, progress, beside, outputs)
 
 
 @one_opencv_thread()
@@ -319,7 +317,8 @@ def calibrate(
         sources, unread = read_inputs(with_times(listed.frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages]
-            result = _finished(_accepted(sources, known, options, executor, progress, "calibrate", beside))
+            accepted = _accepted(sources, known, options, executor, progress, "calibrate", beside)
+            result = _finished(at_full_size(accepted))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
         return result.with_messages(beside.stage(outputs, result))
@@ -376,7 +375,7 @@ def trajectory(
         sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages, *notes]
-            registration = _accepted(sources, known, options, executor, progress, "trajectory")
+            registration = at_full_size(_accepted(sources, known, options, executor, progress, "trajectory"))
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])
@@ -405,7 +404,10 @@ def _accepted(
     purpose: Purpose,
     beside: FilesBeside = NOTHING_BESIDE,
 ) -> Registration:
-    """Register and check, with what is known of the inputs already; a failure names what could not be read well."""
+    """Register and check, with what is known of the inputs already; a failure names what could not be read well.
+
+    In pixels of the working size.
+    """
     try:
         registration = register(sources, options, executor, purpose=purpose, progress=progress)
         return accept(registration.with_messages(known), options, purpose)
@@ -419,8 +421,7 @@ def _accepted(
 
 
 def compose_registration(
-    registration: Registration,
-    local: LocalAlignment,
+    chosen: LaidOut,
     executor: Executor,
     output: str | Path | None,
     options: StitchOptions,
@@ -429,24 +430,21 @@ def compose_registration(
     outputs: Outputs,
 ) -> StitchResult:
     """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
-    placed, said = turned(PlacedImages.of(registration, local.fields or None), options.composite)
-    if placed.orientation is not None:
-        homographies = placed.orientation @ registration.alignment.homographies
-        registration = replace(registration, alignment=replace(registration.alignment, homographies=homographies))
+    registration = chosen.registration
     composed = compose_images(
-        placed,
+        chosen.layout,
         output,
         options.composite,
         options.threads,
         progress,
         outputs=outputs,
-        elsewhere=blocks_on(executor, placed.sources, options.cache),
+        elsewhere=blocks_on(executor, chosen.layout.placed.sources, options.cache),
         dry_run=options.dry_run,
     )
     result = StitchResult(
-        registration=_finished(registration).with_messages((*said, *composed.messages)),
+        registration=_finished(registration).with_messages((*chosen.messages, *composed.messages)),
         options=options.for_images(len(registration.sources)),
-        local_alignment=local,
+        local_alignment=chosen.local,
         **composed.output_fields,
     )
     if options.dry_run:
@@ -473,4 +471,5 @@ def _save_camera(registration: Registration, options: StitchOptions, outputs: Ou
     if options.save_camera is not None:
         from rdstitch.camera_files import camera_file_text
 
-        outputs.write(options.save_camera, text_bytes(camera_file_text(registration.camera, options.save_camera)))
+        text = camera_file_text(registration.camera, options.save_camera, options.camera_format)
+        outputs.write(options.save_camera, text_bytes(text))

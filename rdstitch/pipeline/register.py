@@ -8,13 +8,14 @@ from functools import partial
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames import frontal_reference, in_frame_of
 from rdstitch.alignment.unaligned import explain_unaligned
+from rdstitch.choices import Purpose
 from rdstitch.features import LightGlue, Matcher, match
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.pipeline.aligner import Aligner, Purpose, close_loops, impossible_estimates_fail
+from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.image_circle import with_image_circle
 from rdstitch.pipeline.settle_repeated_pattern import match_crossings, settle_repeated_pattern
@@ -53,7 +54,7 @@ def register(
     executor : concurrent.futures.Executor
         Where features are detected and pairs are registered; see :func:`rdstitch.executors.open_executor`.
     purpose : str
-        See :data:`rdstitch.pipeline.aligner.Purpose`.
+        See :data:`rdstitch.choices.Purpose`.
     """
     options = options.for_images(len(sources))
     cache = Cache.at(options.cache)

@@ -8,11 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from rdstitch.alignment.frames import stored, turned_alignment
+from rdstitch.alignment.frames import stored, turned_alignment, turns
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import intersection
+from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.trajectory_files import as_csv
@@ -97,7 +98,10 @@ def write_layers(
         for index, warp in enumerate(prepared.renderer.warps):
             box = canvas if whole else intersection(warp.box, canvas) or canvas
             samples, covered, mask = prepared.renderer.layer(index, box)
-            write = partial(write_cropped_tiff, offset=(box[0] - canvas[0], box[1] - canvas[1]), size=size)
+            offset = box[0] - canvas[0], box[1] - canvas[1]
+            shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
+            tags = () if result.georeference is None else result.georeference.after(shift).tiff_tags()
+            write = partial(write_cropped_tiff, offset=offset, size=size, extra_tags=tags)
             alpha, shown = (np.where(where, np.uint8(255), np.uint8(0)) for where in (covered, mask))
             with outputs.writing(files[2 * index]) as staged:
                 write(staged, samples, alpha)
@@ -138,13 +142,14 @@ def poses_table(result: StitchResult, frame: PosesFrame = "enu") -> str:
 
 
 _CONTROL_POINTS = 20  # of a pair; Hugin's own finder takes about as many
+_SAMPLES = 65  # places along a side of the canvas, by which its bounds in another projection are found
 _LARGEST_VIEW = 170.0  # degrees: of a plane seen from one height, which ends at 180
 
 
 def project_of_hugin(result: StitchResult) -> str:
     """The project: images as their files store them, with yaw, pitch and roll, and over a plane with TrX, TrY, TrZ.
 
-    Its panorama is equirectangular, or the plane seen from one height of the reference image.
+    Its panorama is equirectangular, or the plane seen from one height of the reference image, cropped to the output.
     """
     from rdstitch.camera_files.polynomials import HEAD, hugin_lens
 
@@ -155,6 +160,16 @@ def project_of_hugin(result: StitchResult) -> str:
     alignment = turned_alignment(registration.alignment, stored(orientations), None)
     if alignment.poses is None and not alignment.on_sphere:
         raise ArgumentError("Hugin knows no images with a homography of their own; --model pose gives poses")
+    # The axes of the output are those of the upright reference image.
+    k = alignment.reference
+    matrix = (
+        alignment.homographies[k]
+        @ turns(stored(orientations))[k]
+        @ np.linalg.inv(registration.alignment.homographies[k])
+    )
+    if alignment.poses is not None and result.canvas.orientation is not None:
+        matrix = matrix @ np.linalg.inv(result.canvas.orientation)
+    seen = np.tensordot(matrix * np.sign(np.linalg.det(matrix)), _seen_on(result.canvas), axes=1)
     used = np.flatnonzero(alignment.used).tolist()
     number = {k: place for place, k in enumerate(used)}
     lenses: dict[Camera, int] = {}
@@ -182,7 +197,7 @@ def project_of_hugin(result: StitchResult) -> str:
                 f"c n{number[ends[0]]} N{number[ends[1]]} x{x:.4f} y{y:.4f} X{X:.4f} Y{Y:.4f} t0"
                 for (x, y), (X, Y) in zip(*(ends.tolist() for ends in points), strict=True)
             ]
-    parts = [f"{HEAD}{_panorama(alignment, used)}", "m i0", *lines, *variables, "v", *control]
+    parts = [f"{HEAD}{_panorama(alignment, used, seen)}", "m i0", *lines, *variables, "v", *control]
     return "\n".join(parts) + "\n"
 
 
@@ -208,17 +223,38 @@ def _pose(alignment: Alignment, k: int) -> dict[str, float]:
     return {**{name: math.degrees(angle) for name, angle in angles.items()}, **place}
 
 
-def _panorama(alignment: Alignment, used: list[int]) -> str:
-    """The line of the output, at the resolution of the reference image."""
+def _panorama(alignment: Alignment, used: list[int], seen: FloatArray) -> str:
+    """The line of the output, at the resolution of the reference image, cropped to what is ``seen`` (3, N, N)."""
     camera = alignment.cameras[alignment.reference].with_focal()
     focal = camera.focal or 1.0
+    x, y, z = seen
     if alignment.poses is None:
         width = 2 * round(math.pi * focal)
-        return f'p f2 w{width} h{width // 2} v360 n"TIFF_m c:LZW"'
-    reach = camera.scale / focal + np.abs(alignment.poses.position[used]).max(axis=0)
-    half = np.minimum(reach, math.tan(math.radians(_LARGEST_VIEW / 2)))
-    width, height = (2 * math.ceil(side * focal) for side in half.tolist())
-    return f'p f0 w{width} h{height} v{2 * math.degrees(math.atan(width / 2 / focal)):.8g} n"TIFF_m c:LZW"'
+        height = width // 2
+        kind, view = 2, 360.0
+        across = np.unwrap(np.arctan2(x, z), axis=1) * width / (2.0 * math.pi)
+        down = np.arctan2(y, np.hypot(x, z)) * height / math.pi
+        if np.ptp(across, axis=1).max() > 0.99 * width or np.abs(across).max() > width / 2:
+            across = np.array([-width / 2, width / 2])
+    else:
+        reach = camera.scale / focal + np.abs(alignment.poses.position[used]).max(axis=0)
+        half = np.minimum(reach, math.tan(math.radians(_LARGEST_VIEW / 2)))
+        width, height = (2 * math.ceil(side * focal) for side in half.tolist())
+        kind, view = 0, 2 * math.degrees(math.atan(width / 2 / focal))
+        across, down = focal * x / z, focal * y / z
+    left, right = np.clip([np.floor(across.min()), np.ceil(across.max())], -width / 2, width / 2) + width / 2
+    top, bottom = np.clip([np.floor(down.min()), np.ceil(down.max())], -height / 2, height / 2) + height / 2
+    crop = f"S{left:.0f},{right:.0f},{top:.0f},{bottom:.0f}"
+    return f'p f{kind} w{width} h{height} v{view:.8g} {crop} n"TIFF_m c:LZW"'
+
+
+def _seen_on(canvas: Canvas) -> FloatArray:
+    """Directions, or places of the plane (3, N, N), of places all over a canvas."""
+    width, height = canvas.size
+    across, down = (np.linspace(-0.5, side - 0.5, _SAMPLES) for side in (width, height))
+    places = np.stack([*np.meshgrid(across, down), np.ones((_SAMPLES, _SAMPLES))])
+    x, y, _ = np.tensordot(np.linalg.inv(canvas.matrix), places, axes=1)
+    return np.stack(np.broadcast_arrays(*canvas.projection.directions(x, y)))
 
 
 def _in_file(points: FloatArray, upright: Camera, camera: Camera, orientation: int) -> FloatArray:

@@ -1,13 +1,16 @@
 """Tiles on a stage: from files whose places are roughly known to one image, or to a table of places."""
 
 import math
-from collections.abc import Iterable, Sequence
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
 
 from rdstitch.alignment import Alignment
@@ -17,18 +20,22 @@ from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Correspondences
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.inputs.find import FoundImages, found_images
-from rdstitch.inputs.frame import Images, as_inputs
+from rdstitch.inputs.frame import Frame, Images, Named, array_as_image, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import DecodedImage, as_image
 from rdstitch.io.reduction import mean_of_channels
+from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.pipeline.choose_layout import lay_out
 from rdstitch.pipeline.compose import check_world_files, image_files
 from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside
-from rdstitch.pipeline.read_inputs import NO_FLAT_FIELD, check_size, with_flat_field
+from rdstitch.pipeline.read_inputs import NO_FLAT_FIELD, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
-from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened
+from rdstitch.results.messages import MAX_NAMED, Message, left_out, names_of, shortened
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import StitchResult
@@ -36,7 +43,14 @@ from rdstitch.stage.axes import with_axes_shown
 from rdstitch.stage.correlation import coarse_tile
 from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
-from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table
+from rdstitch.stage.positions import (
+    Scan,
+    fiji_list,
+    grid_from_arrays,
+    grid_from_names,
+    grid_from_table,
+    grid_from_tiles,
+)
 from rdstitch.stage.register_tiles import (
     TileRegistration,
     coarse_factor,
@@ -44,6 +58,7 @@ from rdstitch.stage.register_tiles import (
     register_tiles,
     search_radius,
 )
+from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.stage.tile_options import TileOptions
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, text_bytes
@@ -54,34 +69,38 @@ _COMPARED = 32  # overlaps by which a flat field is judged
 
 @one_opencv_thread()
 def tiles(
-    inputs: Images,
+    inputs: Images | Iterable[Any],
     output: str | Path | None = None,
     options: TileOptions | None = None,
     *,
     positions_file: str | Path | None = None,
     progress: Progress = silent,
     beside: FilesBeside = NOTHING_BESIDE,
+    **fields: Any,
 ) -> StitchResult:
     """Stitch tiles taken on a stage, whose places are roughly known.
 
     Parameters
     ----------
-    inputs : path, ndarray, or iterable of them
-        What :func:`rdstitch.mosaic` takes; all of one size.
+    inputs : path, array, or iterable of them
+        What :func:`rdstitch.mosaic` takes; or arrays of NumPy, Dask, Zarr and the like, (H, W) or with channels first
+        or last, read when they are needed; or one array (N, …) of all tiles.
     output : path, optional
         As for :func:`rdstitch.mosaic`.
     options : TileOptions, optional
     positions_file : path, optional
-        CSV file to write the places to as well.
+        CSV file to write the places to as well; Fiji's list of tiles where its name ends in ``.txt``.
     progress, beside
         As for :func:`rdstitch.mosaic`.
+    **fields
+        Fields of the options, instead of those in ``options``: ``tiles(arrays, positions=places, pixel_size=0.65)``.
 
     Raises
     ------
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    options = options or TileOptions()
+    options = replace(options or TileOptions(), **fields)
     stitch = StitchOptions(
         distortion=None if options.distortion == "auto" else options.distortion,
         composite=options.composite,
@@ -89,37 +108,71 @@ def tiles(
         dry_run=options.dry_run,
         workers=options.workers,
     )
-    with found_images(as_inputs(inputs), output=output, topic=options.topic) as listed:
+    with found_images(_as_tiles(inputs), output=output, topic=options.topic) as listed:
         registration, tiled = _registered(listed, output, positions_file, options, progress, beside)
         with Outputs(options.overwrite) as outputs, stitch.executor(len(registration.sources)) as executor:
             _write_beside(outputs, positions_file, options, registration, tiled)
-            local = no_local_alignment("tiles on a stage")
-            return compose_registration(registration, local, executor, output, stitch, progress, beside, outputs)
+            chosen = lay_out(registration, no_local_alignment("tiles on a stage"), stitch.composite)
+            chosen = replace(chosen, layout=replace(chosen.layout, photographs=False))
+            return compose_registration(chosen, executor, output, stitch, progress, beside, outputs)
 
 
 @one_opencv_thread()
 def place_tiles(
-    inputs: Images,
+    inputs: Images | Iterable[Any],
     positions_file: str | Path | None = None,
     options: TileOptions | None = None,
     *,
     progress: Progress = silent,
+    **fields: Any,
 ) -> tuple[TileRegistration, Registration]:
     """Find the places of tiles as :func:`tiles` does, and compose nothing.
 
     Parameters
     ----------
     positions_file : path, optional
-        CSV file to write the places to.
-    inputs, options, progress
+        As for :func:`tiles`.
+    inputs, options, progress, **fields
         As for :func:`tiles`.
     """
-    options = options or TileOptions()
-    with found_images(as_inputs(inputs), topic=options.topic) as listed:
+    options = replace(options or TileOptions(), **fields)
+    with found_images(_as_tiles(inputs), topic=options.topic) as listed:
         registration, tiled = _registered(listed, None, positions_file, options, progress, NOTHING_BESIDE)
     with Outputs(options.overwrite) as outputs:
         _write_beside(outputs, positions_file, options, registration, tiled)
     return tiled, registration
+
+
+def _as_tiles(inputs: Any) -> list[Named]:
+    """What the user gave as a list of files and images."""
+    if not isinstance(inputs, str | os.PathLike | PIL.Image.Image) and getattr(inputs, "ndim", 0) in (3, 4):
+        inputs = [inputs[k] for k in range(len(inputs))]
+    if isinstance(inputs, str | os.PathLike | PIL.Image.Image):
+        return with_position_folders(as_inputs(inputs))
+    return with_position_folders(as_inputs([_as_tile(item, index) for index, item in enumerate(inputs)]))
+
+
+def _as_tile(item: Any, index: int) -> Any:
+    """An array whose channels come first, or that is not in memory, which is read when it is needed; others stay."""
+    if isinstance(item, str | os.PathLike | PIL.Image.Image | Frame) or not hasattr(item, "shape"):
+        return item
+    shape, name = tuple(item.shape), Path(f"image_{index:04d}")
+    planes = len(shape) == 3 and shape[0] < min(shape[1:])
+    if isinstance(item, np.ndarray) and not planes:
+        return item
+    if len(shape) not in (2, 3):
+        raise ArgumentError(f"tile {index}: expected an array of two or three dimensions, not of shape {shape}")
+    height, width, *channels = (*shape[1:], shape[0]) if planes else shape
+    bits = 8 * np.dtype(item.dtype).itemsize
+    metadata = Metadata((width, height), bit_depth=bits, channels=(channels or [1])[0], planes=planes)
+
+    def load() -> DecodedImage:
+        samples = np.asarray(item)
+        if planes:
+            return as_image(name, np.moveaxis(samples, 0, -1), None, metadata)
+        return array_as_image(str(name), samples, "bgr")
+
+    return Frame(name, index, load=load, metadata=metadata)
 
 
 def _registered(
@@ -133,24 +186,82 @@ def _registered(
     """The places of all tiles, once it is clear that everything can be written."""
     _check_outputs(output, positions_file, options, beside, listed)
     guard = InputGuard(options.strict)
+    frames, stored, notes = tile_frames(listed.frames, options.z, options.time)
     limit = options.composite.max_memory
-    sources, unread = read_sources(listed.frames, skip_bad=not options.strict, guard=guard, max_memory=limit)
-    if len(sources) < 2:
-        raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
+    sources, unread = read_sources(frames, skip_bad=not options.strict, guard=guard, max_memory=limit)
     check_world_files([] if output is None else [output], sources, options.overwrite)
-    check_size(sources)
-    sources, illumination = with_flat_field(sources, options.flat_field)
+    sources, odd = _of_one_kind(sources, options.strict)
+    unread += odd
+    while True:
+        if len(sources) < 2:
+            raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
+        try:
+            sources, tiled, said = _placed(sources, stored, options, progress)
+            break
+        except InputError:
+            sources, damaged = _readable(sources)
+            if options.strict or not damaged:
+                raise
+            unread += damaged
+    tiled = replace(tiled, z=options.z, time=options.time)
+    return _registration(sources, tiled).with_messages([*unread, *listed.messages, *notes, *said]), tiled
+
+
+def _of_one_kind(sources: list[Source], strict: bool) -> tuple[list[Source], list[Message]]:
+    """The tiles with as many channels and bits as most have, and why the others are left out."""
+    kinds = []
+    for source in sources:
+        count, planes = source.metadata.channels, source.metadata.planes
+        kinds.append((count if planes else 3 if count > 2 else 1, source.metadata.bit_depth))
+    usual = Counter(kinds).most_common(1)[0][0] if kinds else (1, 8)
+    left = []
+    for source, kind in zip(sources, kinds, strict=True):
+        if kind != usual:
+            text = "has {} of {} bits, but most tiles {} of {}".format(
+                *(part for count, bits in (kind, usual) for part in (_channels(count), bits))
+            )
+            if strict:
+                raise InputError(f"{source.path}: {text}")
+            left.append(left_out(source.path, text))
+    return [source for source, kind in zip(sources, kinds, strict=True) if kind == usual], left
+
+
+def _readable(sources: Sequence[Source]) -> tuple[list[Source], list[Message]]:
+    """The tiles that can be read, and why others cannot."""
+    good, bad = [], []
+    for source in sources:
+        try:
+            source.read()
+            good.append(replace(source, flat_field=None))
+        except InputError as error:
+            bad.append(left_out(source.path, str(error)))
+    return good, bad
+
+
+def _placed(
+    sources: list[Source], stored: Mapping[Path, StoredTile], options: TileOptions, progress: Progress
+) -> tuple[list[Source], TileRegistration, list[Message]]:
+    """The tiles with their illumination taken out, where they are, and what there is to say of that."""
+    if len({source.camera.image_size for source in sources}) > 1:
+        said = [Message("tiles of several sizes have no flat field in common", severity="note", code="flat-field")]
+        if options.flat_field not in ("auto", "off") or isinstance(options.distortion, float):
+            raise ArgumentError("tiles of several sizes have neither a flat field nor a lens in common")
+    else:
+        sources, said = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
-    told = _grid(sources, options)
+    told = _grid(sources, stored, options)
     search, factor = search_radius(told, options.search), coarse_factor(told)
     grid, shown = with_axes_shown(told, lambda index: coarse_tile(read(index), factor), factor, search)
-    said = [Message(f"{told.source} contradicted: {shown}", code="grid-as-shown")] if shown else []
+    if shown:
+        said.append(Message(f"{told.source} contradicted: {shown}", code="grid-as-shown"))
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
     tiled = register_tiles(grid, read, search=search, distortion=options.distortion, progress=progress)
+    for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
+        read(index)
     if options.flat_field == "auto" and sources[0].flat_field is not None and not _overlaps_show(sources, tiled):
-        sources, illumination = [replace(source, flat_field=None) for source in sources], [NO_FLAT_FIELD]
-    return _registration(sources, tiled).with_messages([*unread, *listed.messages, *illumination, *said]), tiled
+        sources, said = [replace(source, flat_field=None) for source in sources], [*said[1:], NO_FLAT_FIELD]
+    return sources, tiled, said
 
 
 def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
@@ -174,7 +285,10 @@ def _write_beside(
 ) -> None:
     """The table of places, and the flat field, where they are wanted."""
     if file is not None:
-        outputs.write(file, text_bytes(places_table([source.name for source in registration.sources], tiled)))
+        names = [source.name for source in registration.sources]
+        places = tiled.adjustment.places - tiled.adjustment.places.min(axis=0)
+        fiji = Path(file).suffix.lower() == ".txt"
+        outputs.write(file, text_bytes(fiji_list(names, places) if fiji else places_table(names, tiled)))
     field = registration.sources[0].flat_field
     if options.save_flat_field is not None and field is not None:
         with outputs.writing(options.save_flat_field) as staged:
@@ -189,7 +303,8 @@ def _check_outputs(
     listed: FoundImages,
 ) -> None:
     """Find out before long work whether everything can be written."""
-    named = [options.positions, None if options.flat_field in ("auto", "off") else options.flat_field]
+    positions = options.positions if isinstance(options.positions, str | os.PathLike) else None
+    named = [positions, None if options.flat_field in ("auto", "off") else options.flat_field]
     written = [] if output is None else image_files(check_suffix(output))
     written += [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
     written += beside.files(frame.name for frame in listed.frames)
@@ -199,25 +314,40 @@ def _check_outputs(
 def _plane(sources: Sequence[Source], channel: int | None, index: int) -> NDArray[Any]:
     """A tile as it is registered."""
     pixels = sources[index].read(keep=True).pixels
+    count = 1 if pixels.ndim == 2 else pixels.shape[2]
+    if channel is not None and channel >= count:
+        raise ArgumentError(f"{sources[index].path}: has {_channels(count)}, none with the number {channel}")
     if pixels.ndim == 2:
         return pixels
     if channel is None:
-        return mean_of_channels(pixels.astype(np.float32)) if pixels.shape[2] <= 4 else pixels.mean(axis=2)
-    if channel >= pixels.shape[2]:
-        raise ArgumentError(f"{sources[index].path}: has {pixels.shape[2]} channels, none with the number {channel}")
+        return mean_of_channels(pixels.astype(np.float32)) if count <= 4 else pixels.mean(axis=2)
     return np.ascontiguousarray(pixels[..., channel])
 
 
-def _grid(sources: Sequence[Source], options: TileOptions) -> TileGrid:
+def _channels(count: int) -> str:
+    return "1 channel" if count == 1 else f"{count} channels"
+
+
+def _grid(sources: Sequence[Source], stored: Mapping[Path, StoredTile], options: TileOptions) -> TileGrid:
     """Where the tiles should be."""
-    size = sources[0].camera.image_size
+    sizes = np.array([source.camera.image_size for source in sources], dtype=np.intp)
+    width, height = sizes.max(axis=0).tolist()
+    size, pixel_size = (width, height), options.pixel_size or sources[0].metadata.pixel_size
     names = [source.name for source in sources]
     if options.grid is not None:
-        grid = grid_from_names(names, options.grid, options.overlap, size)
-        return replace(grid, pixel_size=options.pixel_size or sources[0].metadata.pixel_size)
-    if options.positions is not None:
-        return grid_from_table(names, options.positions, size, options.pixel_size or sources[0].metadata.pixel_size)
-    return grid_from_files([source.path for source in sources], size, options.pixel_size)
+        scan = Scan(options.columns, options.order, options.origin)
+        grid = grid_from_names(names, options.grid, options.overlap, size, scan)
+        grid = replace(grid, pixel_size=pixel_size)
+    elif isinstance(options.positions, str | os.PathLike):
+        grid = grid_from_table(names, options.positions, size, pixel_size)
+    elif options.positions is not None:
+        # Of tiles that are left out the lines are, too.
+        numbers = [source.number(k) for k, source in enumerate(sources)]
+        grid = grid_from_arrays(options.positions, numbers, size, pixel_size)
+    else:
+        told = [stored.get(source.path) or StoredTile(source.path, {}) for source in sources]
+        grid = grid_from_tiles(told, size, options.pixel_size)
+    return grid if (sizes == sizes[0]).all() else replace(grid, own_sizes=sizes)
 
 
 def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registration:
@@ -229,18 +359,22 @@ def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registr
             f"({tiled.grid.source}) or the overlap may be wrong; --search PX looks farther"
         )
     cameras = [replace(source.camera, distortion=fitted.distortion) for source in sources]
-    half = cameras[0].scale
     places = fitted.places - fitted.places[0]
     if fitted.distortion == 0.0:
         # Without a lens to take out every sample can stay as it was measured.
         places = np.rint(places)
+    # Of tiles of several sizes each has its own frame.
+    scales, centers = (np.array([getattr(c, part) for c in cameras]) for part in ("scale", "center"))
     homographies = np.tile(np.eye(3), (len(sources), 1, 1))
-    homographies[:, :2, 2] = places / half
+    homographies[:, [0, 1], [0, 1]] = (scales / scales[0])[:, None]
+    homographies[:, :2, 2] = (places + centers - centers[0]) / scales[0]
     pairs, fits = [], []
     for number, (first, second) in enumerate(links.tiles.tolist()):
         of_pair = links.pair == number
         relation = np.eye(3)
-        relation[:2, 2] = (fitted.places[first] - fitted.places[second]) / half
+        relation[[0, 1], [0, 1]] = scales[first] / scales[second]
+        off = fitted.places[first] - fitted.places[second] + centers[first] - centers[second]
+        relation[:2, 2] = off / scales[second]
         agreeing = fitted.squared[of_pair] / fitted.noise < 16.0
         errors = np.linalg.norm(fitted.residuals[of_pair], axis=1)
         used = bool(fitted.weights[number] > 0.25)

@@ -1,26 +1,28 @@
 """Registered images, turned as the user wants to see them: between registration and canvas."""
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing.upright import (
+from rdstitch.compositing.composite_options import CompositeOptions
+from rdstitch.compositing.upright_options import UprightOptions
+from rdstitch.errors import ArgumentError, LimitError
+from rdstitch.features.line_segments import MEGAPIXELS, line_segments
+from rdstitch.geometry.planar_motion import nearest_rotation
+from rdstitch.pipeline.placed_images import PlacedImages, plan
+from rdstitch.pipeline.vanishing_points import (
     Edges,
     Focal,
     Upright,
-    UprightOptions,
     nearest_axis,
     of_edges,
     of_rectangle,
     of_scene,
     to_axes,
 )
-from rdstitch.errors import ArgumentError
-from rdstitch.features.line_segments import MEGAPIXELS, line_segments
-from rdstitch.geometry.planar_motion import nearest_rotation
-from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.messages import Message
 
 _MAX_IMAGES = 40
@@ -28,15 +30,22 @@ _MIN_LENGTH = 0.03  # of an edge, half diagonals
 _POINTING = 2.0  # pixels: how well people point at places
 _DETECTION = 0.3  # pixels: how well the detector does
 _SURE = 0.01  # relative standard deviation of an aspect ratio that needs no warning
+_MAX_CUT = 0.1  # share of what the images show that straightening may cut away
 _STEEP = math.cos(math.radians(30.0))  # a camera that looks nearer to straight up or down shows nothing upright
 
 
-def turned(placed: PlacedImages, options: UprightOptions) -> tuple[PlacedImages, list[Message]]:
+def turned(placed: PlacedImages, options: CompositeOptions) -> tuple[PlacedImages, list[Message]]:
     """The images as the options turn them, and what the user should know of it.
 
     :attr:`PlacedImages.orientation` says by what.
     """
     matrix, said = _upright(placed, options) if options.upright else (None, [])
+    if matrix is not None and options.straighten == "auto":
+        before, after = (_cut_away(placed, options, turn) for turn in (np.eye(3), matrix))
+        if after > before + _MAX_CUT:
+            text = f"not straightened: {after:.0%} of what the images show would be cut away, and not {before:.0%}"
+            text += "; choose another --projection, or raise --max-stretch"
+            matrix, said = None, [Message(text, code="not-straightened")]
     if (view := options.view) is not None:
         if not placed.turned:
             raise ArgumentError(
@@ -48,8 +57,16 @@ def turned(placed: PlacedImages, options: UprightOptions) -> tuple[PlacedImages,
     return replace(placed, homographies=matrix @ placed.homographies, orientation=matrix), said
 
 
+def _cut_away(placed: PlacedImages, options: CompositeOptions, matrix: FloatArray) -> float:
+    """Share of what the images show that has no place in an output that is turned; all, where it has no canvas."""
+    with suppress(LimitError):
+        canvas = plan(replace(placed, homographies=matrix @ placed.homographies), options)
+        return canvas.cut_away(placed.cameras, matrix @ placed.homographies)
+    return 1.0
+
+
 def turned_anew(
-    placed: PlacedImages, options: UprightOptions, former: UprightOptions
+    placed: PlacedImages, options: CompositeOptions, former: UprightOptions
 ) -> tuple[PlacedImages, list[Message]]:
     """The same of images that other options have turned before."""
     if options.same_turn(former):
@@ -60,7 +77,7 @@ def turned_anew(
     return turned(placed, options)
 
 
-def _upright(placed: PlacedImages, options: UprightOptions) -> tuple[FloatArray | None, list[Message]]:
+def _upright(placed: PlacedImages, options: CompositeOptions) -> tuple[FloatArray | None, list[Message]]:
     """What takes the images to where the scene is upright; None where nothing shows how."""
     if placed.reference is None:
         raise ArgumentError("the reference image is not among the images: nothing can be turned upright")

@@ -14,6 +14,8 @@ from rdstitch.io.preview import read_preview
 from rdstitch.report.lens import lens_curve, votes
 from rdstitch.report.pairs import match_graph, matched, residual_map
 from rdstitch.report.svg import (
+    GREEN,
+    RED,
     YELLOW,
     Content,
     Markup,
@@ -39,6 +41,7 @@ REPORT_SUFFIXES = (".html", ".htm")
 
 _THUMBNAIL, _MOSAIC_SIDE = 200, 1200  # pixels of the longer side
 _MAX_NAMES, _MAX_ROWS = 12, 20
+_OUTLINED = {"stroke_width": 3.0, "paint_order": "stroke"}
 _VIEWPORT = "width=device-width, initial-scale=1"
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 960px; margin: 2em auto; padding: 0 1em; }
@@ -135,7 +138,10 @@ def summary(result: StitchResult | Registration) -> str:
     alignment, camera, reason = registration.alignment, registration.camera, registration.alignment.model_reason
     known = {str(source.path) for source in registration.sources}
     unread = sum(message.images[0] not in known for message in registration.left_out)
+    seen = isinstance(result, StitchResult) and result.seams.seen
     verdict = element("p", "The result passed its own checks.", class_="good")
+    if seen:
+        verdict = element("p", "Seams are broken; the picture below shows where.", class_="bad")
     if not registration.ok:
         failures = "; ".join(message.clause for message in registration.failures)
         verdict = element("p", f"Not to be relied on: {failures}", class_="bad")
@@ -221,12 +227,29 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
         parts.append(element("g", element("title", text), shapes))
         if len(names) <= _MAX_NAMES:
             x, y = min((place.mean(axis=0) for place in places), key=lambda middle: abs(middle[0] - width * scale / 2))
-            style = {"fill": "white", "stroke": "black", "stroke_width": 3.0, "paint_order": "stroke"}
-            parts.append(label(float(x), float(y), text, text_anchor="middle", font_size=14, **style))
+            style = {"fill": "white", "stroke": "black", "text_anchor": "middle", "font_size": 14}
+            parts.append(label(float(x), float(y), text, **style, **_OUTLINED))
+    seams, held = result.seams, 0.35 * result.seams.spacing * scale
+    for (x, y), broken in zip((seams.places + 0.5) * scale, seams.broken, strict=True):
+        parts.append(element("circle", cx=x, cy=y, r=max(held, 1.5), fill=RED if broken else GREEN))
+    for one in seams.breaks[:_MAX_ROWS]:
+        x, y = ((value + 0.5) * scale for value in one.position)
+        parts.append(label(x + 8.0, y, f"{one.length:.0f} px", fill=RED, font_size=14, stroke="white", **_OUTLINED))
     shown = drawing(width * scale, height * scale, parts, "the mosaic")
     page = None if result.output is None else viewer_path(result.output)
     more = "" if page is None else f" {page.name} beside it shows it with zoom."
-    return section("Mosaic", f"{name}{width} x {height} pixels; outlines are those of the images in it.{more}", shown)
+    text = f"{name}{width} x {height} pixels; outlines are those of the images in it, dots the places along the seams "
+    text += f"that have texture on both sides: green where the seam holds, red where it is broken.{more}"
+    return section("Mosaic", text, _broken_seams(result), shown)
+
+
+def _broken_seams(result: StitchResult) -> str:
+    """Whether the seams hold, in one line."""
+    seams = result.seams
+    if not len(seams.places):
+        return ""
+    text = f"{counted(int(seams.broken.sum()), 'place')} of {len(seams.places)} along the seams broken."
+    return element("p", text, class_="bad" if seams.seen else "good")
 
 
 def place(result: StitchResult) -> str:

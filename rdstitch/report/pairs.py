@@ -71,7 +71,7 @@ def match_graph(registration: Registration) -> str:
         "Match graph",
         f"{counted(len(links), 'pair')} over the outlines of {counted(len(used), 'image')}. Thicker lines have more "
         "matches; green ones "
-        "fit well into the whole, red ones badly. The red dot is the reference image.",
+        "fit the result well, red ones badly. The red dot is the reference image.",
         drawing(width, height, parts, "match graph"),
     )
 
@@ -125,7 +125,7 @@ def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
     parts += _match_lines(ends[0][inliers], ends[1][inliers], GREEN, 0.6)
     tall = max(height * scale for (_, height), scale in zip(sizes, scales, strict=True))
     names = " and ".join(source.name for source in sources)
-    agree = f"{fit.inliers} of {int(inliers.sum())} inliers agree with the whole, rms {fit.rms:.2f} pixels"
+    agree = f"{fit.inliers} of {int(inliers.sum())} inliers fit the result, rms {fit.rms:.2f} pixels"
     text = f"{title}: {names}; {agree}"
     return joined(element("h3", text), drawing(2 * _IMAGE_WIDTH + _IMAGE_GAP, tall, parts, text))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Self
 
 from rdstitch.alignment import LENSES, MODELS
-from rdstitch.choices import LensName, ModelName, SolverName
+from rdstitch.choices import CameraFormat, LensName, ModelName, SolverName
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.executors import LOCAL, open_executor
@@ -110,7 +110,9 @@ class StitchOptions:
     force : bool
         Write the image even when the result failed its checks.
     save_camera : path, optional
-        Camera file to write; see rdstitch.camera_files for formats.
+        Camera file to write.
+    camera_format : str
+        Its format, see :mod:`rdstitch.camera_files`; "auto": what its name says.
     dry_run : bool
         Register and plan the compositing; write nothing.
 
@@ -157,6 +159,7 @@ class StitchOptions:
     strict: bool = False
     force: bool = False
     save_camera: Path | None = None
+    camera_format: CameraFormat = "auto"
     dry_run: bool = False
 
     def __post_init__(self) -> None:

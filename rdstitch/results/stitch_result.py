@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing import Canvas, Composite, CompositePlan
+from rdstitch.compositing import Canvas, Composite, CompositePlan, SeamQuality
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference
 from rdstitch.inputs.frame import ChannelOrder, in_order
@@ -44,6 +44,8 @@ class OutputImage:
         Where the output lies on the Earth.
     not_georeferenced : str
         Why that is not known; empty where it is.
+    seams : SeamQuality
+        Where seams hold and where they break; empty without seams.
     """
 
     canvas: Canvas
@@ -53,6 +55,7 @@ class OutputImage:
     fingerprint: Fingerprint | None = None
     georeference: Georeference | None = None
     not_georeferenced: str = "not tried"
+    seams: SeamQuality = field(default_factory=SeamQuality)
 
     @property
     def output_fields(self) -> dict[str, Any]:
@@ -87,7 +90,7 @@ class OutputImage:
         """In RGB order."""
         if self.composite is not None:
             return self.composite.pixels, self.composite.alpha
-        if self.plan is not None or self.output is None or self.output.suffix.lower() == ".dzi":
+        if self.plan is not None or self.output is None or self.output.suffix.lower() in (".dzi", ".zarr"):
             raise ArgumentError("there is no image in memory: stitch without an output, or with one of another type")
         image = read_image(self.output)
         return image.pixels, image.alpha

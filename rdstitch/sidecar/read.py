@@ -251,6 +251,8 @@ class StageRecord(Struct):
 
     source: str
     pixel_um: _Positive | None
+    z: int | Literal["max"] | None
+    time: int | None
     matrix: tuple[Pair, Pair]
     rows_px: list[Pair]
     columns_px: list[Pair]

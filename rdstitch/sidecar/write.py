@@ -67,6 +67,20 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
             "cells": local.cells,
             "held_out_px": {"before": local.before, "after": local.after},
         },
+        "seams": {
+            "places": len(result.seams.places),
+            "broken": int(result.seams.broken.sum()),
+            "breaks": [
+                {
+                    "images": [registration.used_names[k] for k in one.images],
+                    "x": one.position[0],
+                    "y": one.position[1],
+                    "length_px": one.length,
+                    "shift_px": one.size,
+                }
+                for one in result.seams.breaks
+            ],
+        },
         "stage": _stage(registration),
         "images": _images(result),
         "pairs": _pairs(result),
@@ -186,6 +200,8 @@ def _stage(registration: Registration) -> dict[str, Any] | None:
     return {
         "source": grid.source,
         "pixel_um": grid.pixel_size,
+        "z": registration.tiles.z,
+        "time": registration.tiles.time,
         "matrix": model.matrix,
         "rows_px": model.rows,
         "columns_px": model.columns,

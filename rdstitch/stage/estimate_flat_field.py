@@ -8,6 +8,7 @@ The dark level D, which light does not multiply, is where the variance of photon
 light, becomes 0 (photon transfer). Samples that are no counts of light, as of JPEG files, show none, and D is 0.
 """
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,8 @@ from rdstitch.io.reduction import block_mean
 
 LEAST_TILES = 20  # fewer show one flat field as well as another
 LARGEST_ERROR = 0.01  # root mean square, by which two halves of the tiles may differ from their mean
+_PARTS = 4  # of the tiles, by which the error of the dark level is known
+_KNOWN = 3.0  # standard deviations from 0 from which on it is taken out
 _CELLS = 24  # cells along each side of a tile
 _SIDE = 512  # pixels of the longer side that are enough
 _DEGREE = 4  # degree of the polynomial that the logarithm of the illumination is
@@ -37,7 +40,7 @@ class Illumination:
     error: float  # its root mean square error, by how far two halves of the tiles differ
     shading: float  # largest share of the light that is missing
     dark: FloatArray  # (C,)
-    dark_error: FloatArray  # (C,): its standard deviation, by two halves of the tiles
+    dark_error: FloatArray  # (C,): its standard deviation; 0 where the tiles do not show it, and it is 0
 
 
 class _Statistics:
@@ -88,6 +91,8 @@ def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
 
 def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
     """Estimate the flat field and the dark level of tiles."""
+    if count < LEAST_TILES:
+        return Illumination(None, math.inf, 0.0, np.zeros(1), np.zeros(1))
     first = read(0)
     shown = _Statistics(read(index) for index in range(count))
     channels = shown.ground.shape[3]
@@ -103,8 +108,10 @@ def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Il
         ground = shown.ground[..., channel]
         light, variance = shown.light[..., channel], shown.variance[..., channel]
         dark[channel] = _dark_level(light, variance)
-        dark_halves = [_dark_level(light[k::2], variance[k::2]) for k in (0, 1)]
-        dark_error[channel] = abs(dark_halves[0] - dark_halves[1]) / 2.0
+        dark_parts = [_dark_level(light[k::_PARTS], variance[k::_PARTS]) for k in range(_PARTS)]
+        dark_error[channel] = float(np.std(dark_parts, ddof=1)) / math.sqrt(_PARTS)
+        if dark[channel] < _KNOWN * dark_error[channel] or not all(dark_parts):
+            dark[channel] = dark_error[channel] = 0.0
         whole = _fitted(ground - dark[channel])
         halves = [_fitted(ground[k::2] - dark[channel]) for k in (0, 1)]
         gain[..., channel] = np.exp(_surface(whole, x, y))
@@ -116,7 +123,8 @@ def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Il
     good = all(error < min(LARGEST_ERROR, 0.5 * spread) for error, spread in zip(errors, noise, strict=True))
     good = good and bool(np.isfinite(gain).all())
     missing = float(1.0 - (gain.min(axis=(0, 1)) / gain.max(axis=(0, 1))).min())
-    return Illumination(field if good else None, max(errors), missing, dark, dark_error)
+    # As for one of the halves: what both have in common, such as the form of the surface, is not seen between them.
+    return Illumination(field if good else None, math.sqrt(2.0) * max(errors), missing, dark, dark_error)
 
 
 def agrees_with_overlaps(field: FlatField, overlaps: Iterable[tuple[NDArray[Any], NDArray[Any], FloatArray]]) -> bool:
@@ -130,10 +138,10 @@ def agrees_with_overlaps(field: FlatField, overlaps: Iterable[tuple[NDArray[Any]
         (h1, w1), (h2, w2) = first.shape[:2], second.shape[:2]
         here = np.s_[max(0, y) : min(h1, y + h2), max(0, x) : min(w1, x + w2)]
         there = np.s_[max(0, -y) : min(h2, h1 - y), max(0, -x) : min(w2, w1 - x)]
-        parts = [(first[here] - field.dark[0, 0]) if first.ndim == 3 else first[here][..., None] - field.dark[0, 0]]
-        parts.append(
-            (second[there] - field.dark[0, 0]) if second.ndim == 3 else second[there][..., None] - field.dark[0, 0]
-        )
+        parts = [
+            tile[cut].reshape(*tile[cut].shape[:2], -1) - field.dark[0, 0]
+            for tile, cut in ((first, here), (second, there))
+        ]
         height, width = parts[0].shape[:2]
         for rows in np.array_split(np.arange(height), max(1, round(height / h1 * _CELLS))):
             for columns in np.array_split(np.arange(width), max(1, round(width / w1 * _CELLS))):

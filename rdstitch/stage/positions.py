@@ -1,24 +1,29 @@
-"""Nominal places of tiles by what users have: a table, file names, OME-XML, Micro-Manager's metadata."""
+"""Nominal places of tiles by what users have: file names, a table, Fiji's list, arrays, or what the files say."""
 
-import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-import tifffile
+from numpy.typing import ArrayLike
 
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.inputs.tables import by_image, csv_rows
-from rdstitch.io.metadata import read_ome
-from rdstitch.io.opening import TIFF_MAGIC, decoding
+from rdstitch.inputs.tables import by_image, csv_rows, image_name
+from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.stage.grid import TileGrid
-from rdstitch.system.file_access import canonical_name, canonical_text, open_regular, read_text
+from rdstitch.system.file_access import read_text
+
+ScanOrder = Literal["rows", "columns", "snake-rows", "snake-columns"]
+Origin = Literal["top-left", "top-right", "bottom-left", "bottom-right"]
+Positions = str | Path | ArrayLike | Mapping[str, ArrayLike]
 
 _COLUMNS = {"name": "name file filename image", "x": "x xpx", "y": "y ypx", "x_um": "xum", "y_um": "yum"}
-_METADATA_FILE = "metadata.txt"
+_PARTS = {"row": r"\d+", "col": r"\d+", "letter": "[A-Za-z]{1,2}", "number": r"\d+"}
+_PATTERNS = ({"row", "col"}, {"letter", "col"}, {"number"})
+_FIJI = re.compile(r"\s*(?P<name>[^;#]+?)\s*;[^;]*;\s*\(\s*(?P<x>[^,()]+),\s*(?P<y>[^,()]+)(,[^()]*)?\)\s*")
 _HOW = (
     "say where they are: --grid 'r{row}c{col}' --overlap PERCENT for names, or --positions FILE with name,x,y; "
     "OME-TIFF and Micro-Manager files may say it themselves"
@@ -26,114 +31,154 @@ _HOW = (
 
 
 @dataclass(frozen=True)
-class StagePosition:
-    """The place of one tile."""
+class Scan:
+    """How tiles follow each other by their numbers."""
 
-    x: float
-    y: float
-    unit: float | None  # micrometres that these count; None for pixels
-    pixel_size: float | None = None  # micrometres, where the file says it
+    columns: int | None = None  # tiles in a row
+    order: ScanOrder = "rows"
+    origin: Origin = "top-left"
+
+    def cell(self, number: int, count: int) -> tuple[int, int]:
+        """Column and row of a tile, from the origin, of so many."""
+        if self.columns is None:
+            raise ArgumentError("tiles with running numbers need the number of columns, as in --columns 10")
+        along = self.columns if self.order.endswith("rows") else -(-count // self.columns)
+        line, place = divmod(number, along)
+        if self.order.startswith("snake") and line % 2:
+            place = along - 1 - place
+        return (place, line) if self.order.endswith("rows") else (line, place)
 
 
-def grid_from_names(names: Sequence[str], pattern: str, overlap: float, size: tuple[int, int]) -> TileGrid:
-    """Places by rows and columns in file names."""
-    if pattern.count("{row}") != 1 or pattern.count("{col}") != 1:
-        raise ArgumentError(f"the grid '{pattern}' must have {{row}} and {{col}} once each, as in 'r{{row}}c{{col}}'")
+def grid_from_names(
+    names: Sequence[str], pattern: str, overlap: float, size: tuple[int, int], scan: Scan | None = None
+) -> TileGrid:
+    """Places by rows and columns, or running numbers, in file names."""
+    scan = scan or Scan()
+    parts = re.findall(r"\{(\w+)\}", pattern)
+    if set(parts) not in _PATTERNS or len(parts) > len(set(parts)):
+        raise ArgumentError(
+            f"the grid '{pattern}' must have {{row}} and {{col}} once each, as in 'r{{row}}c{{col}}', or {{letter}} "
+            "and {col}, or {number}"
+        )
     if not 0.0 <= overlap < 100.0:
         raise ArgumentError(f"tiles overlap by 0 to less than 100 %, not {overlap:g} %")
-    expression = re.escape(pattern).replace(r"\{row\}", r"(?P<row>\d+)").replace(r"\{col\}", r"(?P<col>\d+)")
-    wanted = re.compile(expression.replace(r"\*", ".*"))
-    cells = []
+    expression = re.escape(pattern).replace(r"\*", ".*")
+    for part in parts:
+        expression = expression.replace(rf"\{{{part}\}}", f"(?P<{part}>{_PARTS[part]})")
+    # A number is whole: not the end of another one.
+    wanted = re.compile(rf"(?<!\d){expression}" if pattern.startswith("{") else expression)
+    found = []
     for name in names:
         fitting = wanted.search(name)
         if fitting is None:
             raise ArgumentError(f"{name}: does not fit the grid '{pattern}'")
-        cells.append((int(fitting["col"]), int(fitting["row"])))
+        found.append(fitting.groupdict())
+    if "number" in parts:
+        numbers = [int(item["number"]) for item in found]
+        first = min(numbers)
+        cells = [scan.cell(number - first, max(numbers) - first + 1) for number in numbers]
+    else:
+        cells = [(int(item["col"]), int(item["row"]) if "row" in item else _number(item["letter"])) for item in found]
     if len(set(cells)) < len(cells):
         twice = next(cell for cell in cells if cells.count(cell) > 1)
         raise ArgumentError(f"several tiles are row {twice[1]}, column {twice[0]}; name those of one channel only")
-    places = np.array(cells, dtype=np.float64) - np.min(cells, axis=0)
-    return TileGrid(places * np.array(size) * (1.0 - overlap / 100.0), size, None, f"file names, {overlap:g} % overlap")
+    places = np.array(cells, dtype=np.float64) * np.array(size) * (1.0 - overlap / 100.0)
+    vertical, horizontal = scan.origin.split("-")
+    places *= (1.0 if horizontal == "left" else -1.0, 1.0 if vertical == "top" else -1.0)
+    return TileGrid(places - places.min(axis=0), size, None, f"file names, {overlap:g} % overlap")
+
+
+def _number(letters: str) -> int:
+    """Rows A, B, … Z, AA, … from 0."""
+    number = 0
+    for letter in letters.upper():
+        number = 26 * number + ord(letter) - ord("A") + 1
+    return number - 1
 
 
 def grid_from_table(
     names: Sequence[str], file: str | Path, size: tuple[int, int], pixel_size: float | None
 ) -> TileGrid:
-    """Places by a CSV file with the columns ``name``, ``x`` and ``y``, pixels, or ``x_um`` and ``y_um``."""
-    rows = by_image(csv_rows(read_text(file), str(file), _COLUMNS, ("name,x,y", "name,x_um,y_um")))
-    pixels = any("x" in row.values for row in rows.values())
-    x, y, unit = ("x", "y", None) if pixels else ("x_um", "y_um", 1.0)
-    table = {name: StagePosition(row.needed(x), row.needed(y), unit) for name, row in rows.items()}
-    missing = [item for item in names if item not in table]
+    """Places by a CSV file with the columns ``name``, ``x`` and ``y``, pixels, or ``x_um`` and ``y_um``.
+
+    Or by Fiji's ``TileConfiguration.txt``, which is in pixels.
+    """
+    text, unit = read_text(file), None
+    table = _fiji_places(text, file)
+    if not table:
+        rows = by_image(csv_rows(text, str(file), _COLUMNS, ("name,x,y", "name,x_um,y_um")))
+        pixels = any("x" in row.values for row in rows.values())
+        x, y, unit = ("x", "y", None) if pixels else ("x_um", "y_um", 1.0)
+        table = {name: (row.needed(x), row.needed(y)) for name, row in rows.items()}
+    missing = [item for item in names if image_name(item) not in table]
     if missing:
         raise InputError(f"{file}: has no line for {missing[0]}; add one with its place")
-    return _grid([table[item] for item in names], size, pixel_size, Path(file).name)
+    places = np.array([table[image_name(item)] for item in names])
+    return _grid(places, unit, size, pixel_size, Path(file).name)
 
 
-def grid_from_files(files: Sequence[Path], size: tuple[int, int], pixel_size: float | None) -> TileGrid:
-    """Places by what the files say: OME-XML, Micro-Manager's tags, or its ``metadata.txt`` beside them."""
-    beside: dict[Path, dict[str, StagePosition]] = {}
-    positions = []
-    for file in files:
-        position = position_of(file)
-        if position is None:
-            folder = file.parent
-            if folder not in beside:
-                beside[folder] = _micro_manager_file(folder / _METADATA_FILE)
-            position = beside[folder].get(canonical_name(file.name))
-        if position is None:
-            raise InputError(f"{file}: does not say where it was taken; {_HOW}")
-        positions.append(position)
-    return _grid(positions, size, pixel_size, "the files' metadata")
+def _fiji_places(text: str, file: str | Path) -> dict[str, tuple[float, float]]:
+    """What Fiji's list of tiles says; nothing of other texts."""
+    table: dict[str, tuple[float, float]] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        if (found := _FIJI.fullmatch(line)) is None:
+            continue
+        name = image_name(found["name"])
+        if name in table:
+            raise InputError(f"{file}: line {number}: {name} is here twice; remove one")
+        try:
+            table[name] = float(found["x"]), float(found["y"])
+        except ValueError:
+            raise InputError(f"{file}: line {number} has no numbers for x and y") from None
+    return table
 
 
-def position_of(file: Path) -> StagePosition | None:
-    """Read where a TIFF file was taken; None where it does not say."""
-    with decoding(file):
-        with open_regular(file) as stream:
-            if stream.read(4) not in TIFF_MAGIC:
-                return None
-            stream.seek(0)
-            with tifffile.TiffFile(stream, name=str(file)) as tiff:
-                ome, tag = tiff.ome_metadata, tiff.pages.first.tags.get("MicroManagerMetadata")
-        told = read_ome(ome)
-        if told is not None and told.position is not None:
-            return StagePosition(*told.position, told.unit, told.pixel_size)
-        return None if tag is None else _micro_manager_position(tag.value)
+def fiji_list(names: Sequence[str], places: FloatArray) -> str:
+    """The places as Fiji's list of tiles."""
+    lines = [f"{name}; ; ({x:.3f}, {y:.3f})" for name, (x, y) in zip(names, places.tolist(), strict=True)]
+    return "\n".join(["# Define the number of dimensions we are working on", "dim = 2", "", *_HEADING, *lines, ""])
 
 
-def _micro_manager_file(file: Path) -> dict[str, StagePosition]:
-    """Places by file name in Micro-Manager's ``metadata.txt``; none where there is no such file."""
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    positions = {}
-    for key, entry in content.items() if isinstance(content, dict) else ():
-        position = _micro_manager_position(entry) if isinstance(entry, dict) else None
-        if position is not None:
-            name = entry.get("FileName") or key.removeprefix("Metadata-")
-            positions[canonical_text(Path(str(name)).name)] = position
-    return positions
+_HEADING = ("# Define the image coordinates",)
 
 
-def _micro_manager_position(entry: Any) -> StagePosition | None:
-    """A place among what Micro-Manager wrote of one image."""
-    try:
-        x, y = float(entry["XPositionUm"]), float(entry["YPositionUm"])
-        size = float(entry.get("PixelSizeUm") or 0.0)
-    except (TypeError, ValueError, LookupError, AttributeError):
-        return None
-    return StagePosition(x, y, 1.0, size or None)
+def grid_from_arrays(
+    positions: Any, numbers: Sequence[int], size: tuple[int, int], pixel_size: float | None
+) -> TileGrid:
+    """Places of tiles by their numbers in an array (N, 2), pixels, or in the columns x and y, or x_um and y_um."""
+    unit = None
+    if isinstance(positions, Mapping) or hasattr(positions, "columns"):
+        pair = next((p for p in (("x", "y"), ("x_um", "y_um")) if all(name in positions for name in p)), None)
+        if pair is None:
+            raise ArgumentError("positions need x and y, pixels, or x_um and y_um, micrometres")
+        unit = 1.0 if pair[0].endswith("um") else None
+        positions = np.stack([np.asarray(positions[name], dtype=np.float64) for name in pair], axis=1)
+    places = np.asarray(positions, dtype=np.float64)
+    if places.ndim != 2 or places.shape[1] != 2 or len(places) <= max(numbers):
+        raise ArgumentError(
+            f"positions must be x and y of each of {max(numbers) + 1} tiles, not of shape {places.shape}"
+        )
+    return _grid(places[list(numbers)], unit, size, pixel_size, "positions")
 
 
-def _grid(positions: Sequence[StagePosition], size: tuple[int, int], pixel_size: float | None, source: str) -> TileGrid:
+def grid_from_tiles(tiles: Sequence[StoredTile], size: tuple[int, int], pixel_size: float | None) -> TileGrid:
+    """Places by what the files say: OME-XML, or Micro-Manager's metadata."""
+    for tile in tiles:
+        if tile.position is None:
+            raise InputError(f"{tile.name}: does not say where it was taken; {_HOW}")
+        if tile.unit != tiles[0].unit:
+            raise InputError(f"{tile.name}: gives its place in another unit than {tiles[0].name}; say with --positions")
+    pixel_size = pixel_size or next((tile.pixel_size for tile in tiles if tile.pixel_size), None)
+    places = np.array([tile.position for tile in tiles], dtype=np.float64)
+    return _grid(places, tiles[0].unit, size, pixel_size, "the files' metadata")
+
+
+def _grid(
+    places: FloatArray, unit: float | None, size: tuple[int, int], pixel_size: float | None, source: str
+) -> TileGrid:
     """Places in pixels, whatever they were given in."""
-    pixel_size = pixel_size or next((item.pixel_size for item in positions if item.pixel_size), None)
-    places = np.array([(item.x, item.y) for item in positions], dtype=np.float64)
-    unit = positions[0].unit
     if unit is not None:
         if pixel_size is None:
             raise InputError(f"{source}: gives micrometres, but no file says how large a pixel is; add --pixel-size UM")
-        places *= unit / pixel_size
+        places = places * (unit / pixel_size)
     return TileGrid(places - places.min(axis=0), size, pixel_size, source)

@@ -66,6 +66,8 @@ class TileRegistration:
     linked: BoolArray
     groups: tuple[tuple[int, ...], ...]  # tiles that links hold together, the largest group first
     search: float  # how far neighbours were looked for, pixels
+    z: int | Literal["max"] | None = None  # z, time: plane and time of the files that were read, where they were chosen
+    time: int | None = None
 
     @property
     def stds(self) -> FloatArray:

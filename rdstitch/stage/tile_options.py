@@ -3,10 +3,12 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
+from rdstitch.io.stored_tiles import ZPlane
+from rdstitch.stage.positions import Origin, Positions, ScanOrder
 
 
 def measured_samples() -> CompositeOptions:
@@ -14,16 +16,23 @@ def measured_samples() -> CompositeOptions:
     return CompositeOptions(exposure="none", seam="none", blend="none")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TileOptions:
     """Options of :func:`rdstitch.tiles`; the command line has the same names and defaults.
 
     Attributes
     ----------
-    positions : path, optional
-        CSV file with the columns name, x, y (pixels) or name, x_um, y_um.
+    positions : path, array, or table, optional
+        CSV file with the columns name, x, y (pixels) or name, x_um, y_um; Fiji's TileConfiguration.txt; or, of each
+        tile in the order given, an array (N, 2) of x and y in pixels, or a dict or data frame with x, y or x_um, y_um.
     grid : str, optional
-        Part of the file names with ``{row}`` and ``{col}``.
+        Part of the file names with ``{row}`` and ``{col}``, ``{letter}`` and ``{col}``, or ``{number}``.
+    columns : int, optional
+        Tiles in a row, with ``{number}``.
+    order : str
+        With ``{number}``: "rows", one after the other; "columns"; "snake-rows", to and fro; "snake-columns".
+    origin : str
+        Corner of the first tile, with ``grid``: "top-left", "top-right", "bottom-left" or "bottom-right".
     overlap : float
         Per cent of a tile that its neighbours show too, with ``grid``.
     pixel_size : float, optional
@@ -32,6 +41,10 @@ class TileOptions:
         How far neighbours may be from where they should be to each other, pixels.
     channel : int, optional
         That is registered, from 0; the mean of all if not given.
+    z : int or "max", optional
+        Plane of a stack, from 0; otherwise the brightest sample of all.
+    time : int, optional
+        Of a time series, from 0; otherwise the first.
     flat_field : str or path
         "auto": from the tiles themselves; "off"; or an image file, whose second page, if it has one, is the dark field.
     save_flat_field : path, optional
@@ -52,12 +65,17 @@ class TileOptions:
         Of a ROS bag, the topic of its images.
     """
 
-    positions: str | Path | None = None
+    positions: Positions | None = None
     grid: str | None = None
+    columns: int | None = None
+    order: ScanOrder = "rows"
+    origin: Origin = "top-left"
     overlap: float = 10.0
     pixel_size: float | None = None
     search: float | None = None
     channel: int | None = None
+    z: ZPlane | None = None
+    time: int | None = None
     flat_field: str | Path = "auto"
     save_flat_field: str | Path | None = None
     distortion: float | Literal["auto"] | None = None
@@ -75,5 +93,10 @@ class TileOptions:
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise ArgumentError(f"{name} must be positive, not {value}")
-        if self.channel is not None and self.channel < 0:
-            raise ArgumentError(f"channels count from 0, not from {self.channel}")
+        for name in ("channel", "z", "time"):
+            value = getattr(self, name)
+            if isinstance(value, int) and value < 0:
+                raise ArgumentError(f"{name} counts from 0, not from {value}")
+        for name, choices in (("order", get_args(ScanOrder)), ("origin", get_args(Origin))):
+            if getattr(self, name) not in choices:
+                raise ArgumentError(f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}")

@@ -122,7 +122,7 @@ def _filesystem(path: str | Path) -> tuple[Any, str]:
     try:
         core = import_module("fsspec.core")
     except ImportError:
-        raise OSError("URLs need the extra remote: pip install 'rdstitch[remote]'") from None
+        raise OSError("URLs need fsspec: pip install 'fsspec[http]'") from None
     system, name = core.url_to_fs(url_of(path))
     return system, name
 

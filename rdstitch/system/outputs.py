@@ -30,7 +30,7 @@ from rdstitch.system.file_access import local_file
 if sys.platform != "win32":
     import fcntl
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi", ".zarr")
 _LEVEL_NAME, _TILE_NAME = re.compile(r"[0-9]{1,2}"), re.compile(r"[0-9]+_[0-9]+\.jpg")
 _LOCK = "lock"
 
@@ -76,7 +76,9 @@ def check_outputs(paths: Sequence[Path], overwrite: bool, inputs: Iterable[str |
 def _check_place(file: Path, overwrite: bool) -> None:
     """What the file system says of one output."""
     folder = file.parent
-    if file.is_dir():
+    if is_zarr(file):
+        check_zarr_folder(file, overwrite)
+    elif file.is_dir():
         raise OutputError(f"{file}: is a folder; name a file in it")
     if not folder.is_dir():
         raise OutputError(f"{file}: the folder {folder} does not exist; create it first")
@@ -84,7 +86,7 @@ def _check_place(file: Path, overwrite: bool) -> None:
         check_tiles_folder(tiles_folder(Path(os.path.realpath(file))), overwrite)
     if file.is_symlink() and not file.exists():
         raise OutputError(f"{file}: is a link to nothing; remove it, or choose another name")
-    if file.exists():
+    if file.exists() and not is_zarr(file):
         if not overwrite:
             raise OutputError(f"{file}: exists already; choose another name or use --overwrite")
         # A link stays, and what it leads to is replaced.
@@ -150,6 +152,25 @@ def check_tiles_folder(folder: Path, overwrite: bool) -> None:
         raise OutputError(f"{folder}: is a link, or holds other files than Deep Zoom tiles; choose another name")
 
 
+def is_zarr(path: str | Path) -> bool:
+    """Whether an image is a folder of chunks."""
+    return Path(path).suffix.lower() == ".zarr"
+
+
+def check_zarr_folder(folder: Path, overwrite: bool) -> None:
+    """Refuse to replace a folder that is to be kept, or that is no image in chunks."""
+    if folder.exists():
+        if not overwrite:
+            raise OutputError(f"{folder}: exists already; choose another name or use --overwrite")
+        if folder.is_symlink() or not folder.is_dir() or not _holds_only_chunks(folder):
+            raise OutputError(f"{folder}: is a link, or holds other files than an OME-Zarr image; choose another name")
+
+
+def _holds_only_chunks(folder: Path) -> bool:
+    """Check whether a folder holds what :func:`write_ome_zarr` writes at its top: levels by number, and .z files."""
+    return all(item.name.startswith(".z") or (item.name.isdecimal() and item.is_dir()) for item in folder.iterdir())
+
+
 def holds_only_tiles(folder: Path) -> bool:
     """Check whether everything in a folder, however deep, is what :func:`write_deep_zoom` writes there."""
     with os.scandir(folder) as levels:
@@ -168,16 +189,20 @@ class Fingerprint:
 
     size: int  # bytes of all files
     # of the file; of a Deep Zoom image that of the list of its files, as ``sha256sum`` prints it (digest, two spaces,
-    # name), in order of names, the description first as ``.dzi``
+    # name), in order of names, the description first as ``.dzi``; of an OME-Zarr image the same of all its files
     sha256: str
 
 
 def fingerprint(image: Path, tiles: Path | None = None) -> Fingerprint:
     """The fingerprint of an image, and of the tiles that belong to it."""
-    if tiles is None:
+    if image.is_dir():
+        tiles, named = image, []
+    elif tiles is None:
         return Fingerprint(image.stat().st_size, _sha256(image))
+    else:
+        named = [(".dzi", image)]
     members = sorted(path for path in tiles.rglob("*") if path.is_file())
-    files = [(".dzi", image), *((file.relative_to(tiles).as_posix(), file) for file in members)]
+    files = [*named, *((file.relative_to(tiles).as_posix(), file) for file in members)]
     listing = "".join(f"{_sha256(file)}  {name}\n" for name, file in files)
     return Fingerprint(sum(file.stat().st_size for _, file in files), hashlib.sha256(listing.encode()).hexdigest())
 
@@ -322,7 +347,7 @@ class Outputs:
 
     @contextmanager
     def writing(self, path: str | Path, *, is_folder: bool = False) -> Iterator[Path]:
-        """Stage a file, or a folder of Deep Zoom tiles; a failure of the file system is one of ``path``.
+        """Stage a file, or a folder of Deep Zoom tiles or chunks; a failure of the file system is one of ``path``.
 
         Yields where to write the file, or the empty folder.
         """
@@ -377,7 +402,8 @@ class Outputs:
             self._folders[place.parent] = TemporaryFolder(place.parent, ".rdstitch-")
         # Tiles are staged just before their description, and are found beside it by its name.
         number = sum(not item.is_folder for item in self._items)
-        staged = self._folders[place.parent].path / f"new{number}{'_files' if is_folder else name.suffix}"
+        suffix = "_files" if is_folder and not is_zarr(name) else name.suffix
+        staged = self._folders[place.parent].path / f"new{number}{suffix}"
         self._items.append(_Item(name, place, staged, is_folder))
         return staged
 
@@ -389,6 +415,8 @@ class Outputs:
             raise _appeared(item.name)
         if not item.is_folder:
             item.staged.chmod(item.place.stat().st_mode & 0o777)
+        elif is_zarr(item.place):
+            check_zarr_folder(item.place, overwrite=True)
         elif not holds_only_tiles(item.place):
             raise OutputError(f"{item.name}: holds other files than Deep Zoom tiles; choose another name")
 

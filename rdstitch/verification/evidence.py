@@ -7,18 +7,13 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.alignment.result import Alignment, LinkFit
+from rdstitch.choices import Purpose
 from rdstitch.matching.two_view import Pair
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import NO_CACHE, Cache
 from rdstitch.verification.limits import limit
-from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps
-from rdstitch.verification.second_motion import (
-    MotionComparison,
-    SecondMotion,
-    compare_motions,
-    find_second_motions,
-    unexplained,
-)
+from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps, share_alike
+from rdstitch.verification.second_motion import SecondMotion, explains, find_second_motions, is_clear
 
 
 @dataclass(frozen=True)
@@ -29,9 +24,19 @@ class Evidence:
     threshold: float  # largest transfer error of an inlier of a pair, pixels
     threads: int = 1  # pairs of images that are compared at the same time
     cache: Cache = NO_CACHE  # of results of earlier runs
-    # only the lens is wanted, so that doubts about the places of images do not make the result fail, and are not
-    # reported where a repeated pattern explains them
-    lens_only: bool = False
+    purpose: Purpose = "mosaic"
+
+    @property
+    def picture(self) -> bool:
+        """Whether a picture is wanted, which its seams judge; only what is placed wrongly must not get there."""
+        return self.purpose in ("pano", "mosaic")
+
+    @property
+    def lens_only(self) -> bool:
+        """Whether only the lens is wanted, so that doubts about the places of images do not make the result fail, and
+        are not reported where a repeated pattern explains them.
+        """
+        return self.purpose == "calibrate"
 
     @property
     def alignment(self) -> Alignment:
@@ -67,19 +72,26 @@ class Evidence:
         return find_second_motions(self.alignment, self.registration.pairs, self.threshold)
 
     @cached_property
-    def compared(self) -> MotionComparison | None:
-        """Which of the two motions is the plane, by the pixels."""
-        return compare_motions(self._images, self.motions, [] if self.alignment.on_sphere else self.checked)
-
-    @cached_property
-    def seen(self) -> Sequence[CheckedLink]:
-        """The checked links; where what moves differently is the smaller part, without what that may explain."""
-        return unexplained(self.checked, self.motions, self.compared)
+    def clear(self) -> bool:
+        """Whether the pixels say that what was aligned is the plane, and what moves differently is not."""
+        return is_clear(self._images, self.motions, [] if self.alignment.on_sphere else self.checked)
 
     @cached_property
     def ambiguous(self) -> dict[Pair, CheckedLink]:
         """Pairs of a repeated pattern, of which nobody can say by how many periods they are apart."""
-        return {link.pair: link for link in self.seen if link.ambiguity.ambiguous and not link.unique}
+        doubtful = [link for link in self.checked if link.ambiguity.ambiguous and not link.unique]
+        moving = {motion.images: motion for motion in self.motions} if doubtful else {}
+        return {
+            link.pair: link
+            for link in doubtful
+            if link.pair not in moving or not explains(self._images, moving[link.pair], link)
+        }
+
+    def looks_right(self, images: Sequence[int]) -> bool:
+        """Whether what an image, or a pair, or all of them if empty, has in common with others is clearly alike."""
+        links = [link for link in self.checked if len({*images} & {*link.pair}) == len(images)]
+        cells = sum(link.agreement.cells for link in links)
+        return cells >= limit("cells") and share_alike(links) >= limit("alike")
 
     @cached_property
     def alike(self) -> float:
@@ -93,10 +105,3 @@ class Evidence:
         images, only overlaps can be wrong, and they are looked at.
         """
         return not self.alignment.on_sphere and int(self.alignment.used.sum()) > 2
-
-    @property
-    def depth(self) -> bool:
-        """Whether the scene has depth: relief, a second motion as small as tree tops have, or any of a turn."""
-        moved = [motion for motion in self.motions if motion.area]
-        near = bool(moved) and (self.alignment.on_sphere or not any(motion.is_far for motion in moved))
-        return self.alignment.relief.found or near

@@ -32,9 +32,9 @@ TEXTS = {
         "two lenses or zooms are mixed: {images2} (λ about {lens2:.3f}) and {images1} ({lens1:.3f}); stitch those of "
         "each on their own",
     ),
-    "matches disagree": ("", "only {inliers} of {count} matches of the pairs agree with the whole"),
-    "image misfits": ("", "only {inliers} of {count} of its matches agree with the whole; {reason}"),
-    "pair misfits": ("", "{both}: only {inliers} of {count} matches agree with the whole; {reason}"),
+    "matches disagree": ("", "only {inliers} of {count} matches fit the places that were found for the images"),
+    "image misfits": ("", "only {inliers} of {count} of its matches fit the place that was found for it; {reason}"),
+    "pair misfits": ("", "{both}: only {inliers} of {count} matches fit the places that were found for them; {reason}"),
     "errors": ("", "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels"),
     "rough": (
         "relief",
@@ -54,12 +54,12 @@ TEXTS = {
     ),
     "shape bent": (
         "shape",
-        "may be off by about {size:.0f} pixels in the whole, though its overlaps agree: the errors have a pattern that "
+        "may be bent by about {size:.0f} pixels from end to end, though neighbours fit: the errors have a pattern that "
         "was not modelled, most likely {cause}",
     ),
     "shape free": (
         "shape",
-        "may be off by about {size:.0f} pixels in the whole, though its overlaps agree: the images cannot exclude "
+        "may be bent by about {size:.0f} pixels from end to end, though neighbours fit: the images cannot exclude "
         "{cause}; give {remedy}",
     ),
     "unlike": (
@@ -83,7 +83,7 @@ TEXTS = {
     ),
     "second motion": (
         "rival-motion",
-        "{moving} (a vehicle, a second plane?); a mask keeps it out",
+        "{moving} (something that moved, or a second surface?); a mask keeps it out",
     ),
     "undecided motion": (
         "rival-motion",
@@ -92,7 +92,7 @@ TEXTS = {
     "two of one lens": (
         "mixed-lenses",
         "{both} fit without the images of another lens, as any two do; if all are of one lens, the scene is not flat, "
-        "and these are off in the whole; add images of this lens",
+        "and these two lie wrongly; add images of this lens",
     ),
     "several cameras": (
         "mixed-lenses",

@@ -1,7 +1,8 @@
 """The rules that a result is judged by, and what is found with them.
 
-A warning is for what puts this result at risk. Where images look alike in the pixels, what their matches say of depth
-or of errors has been hidden by local alignment and seams, and is a detail.
+A warning is for what puts this result at risk. A picture is judged by its seams once it is laid out
+(:mod:`rdstitch.compositing.seam_quality`): only what is placed wrongly fails here, and what matches say of depth or of
+errors is a detail.
 """
 
 import math
@@ -15,8 +16,7 @@ from rdstitch.results.messages import Severity
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
 from rdstitch.verification.limits import limit
-from rdstitch.verification.overlap_check import share_alike
-from rdstitch.verification.second_motion import is_separate, share_of
+from rdstitch.verification.second_motion import share_of
 
 MAX_WARNINGS = 3
 """Lines of one run."""
@@ -54,7 +54,7 @@ def _reason(evidence: Evidence, images: Sequence[int], fits: Sequence[LinkFit], 
     few = [(evidence.registration.sources[k].name, few_features(evidence.registration.keypoints, k)) for k in images]
     if any(why for _, why in few):
         return ", ".join(f"{name} has {why}" for name, why in few if why)
-    why = "they agree with each other: another plane, camera or zoom, or none (trees, walls)?"
+    why = "they fit each other: does it show another surface, or come from another camera or zoom?"
     if sum(fit.count for fit in fits) < limit("few matches"):
         why = "too few to place it: little overlap, or none?"
     return f"{why} {remedy}".strip()
@@ -71,7 +71,7 @@ def _mixed_lenses(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _errors(evidence: Evidence) -> Iterator[Finding]:
-    """Errors of all pairs together; those of rough ground are a warning where the pixels agree."""
+    """Errors of all pairs together; those of a picture count only where its overlaps are no more alike than chance."""
     alignment, threshold = evidence.alignment, evidence.threshold
     rms, relief = alignment.rms, alignment.relief
     if rms <= limit("error") * threshold:
@@ -84,7 +84,10 @@ def _errors(evidence: Evidence) -> Iterator[Finding]:
         relief.found and explained and evidence.alike >= limit("clearly alike")
     )
     values = {"rms": rms, "threshold": threshold}
-    yield Finding("rough", (), "warning", values) if rough else Finding("errors", values=values)
+    if rough or (evidence.picture and evidence.alike >= limit("little alike")):
+        yield Finding("rough", (), "warning", values)
+    else:
+        yield Finding("errors", values=values)
 
 
 def _depth(evidence: Evidence) -> Iterator[Finding]:
@@ -121,18 +124,8 @@ def _size_of_shape(evidence: Evidence) -> float:
 
 
 def _unlike(evidence: Evidence) -> Iterator[Finding]:
-    """Images that were put together and do not look alike there.
-
-    What two images share of a plane looks alike; where something else moves, it may be that which holds them.
-    """
-    least = limit("unlike, undecided" if _undecided(evidence) else "unlike")
-    return _less_alike(evidence, least, "unlike", "failure")
-
-
-def _undecided(evidence: Evidence) -> bool:
-    """Whether something moves differently, and the pixels do not say which of the two is the plane."""
-    compared = evidence.compared
-    return is_separate(evidence.motions) and not (compared is not None and (compared.won or compared.lost))
+    """Images that were put together and are no more alike there than by chance."""
+    return _less_alike(evidence, limit("unlike"), "unlike", "failure")
 
 
 def _little_alike(evidence: Evidence) -> Iterator[Finding]:
@@ -142,7 +135,7 @@ def _little_alike(evidence: Evidence) -> Iterator[Finding]:
 
 def _less_alike(evidence: Evidence, least: float, kind: str, severity: Severity) -> Iterator[Finding]:
     """Pairs of whose cells fewer than a share agree."""
-    for link in evidence.seen:
+    for link in evidence.checked:
         if link.agreement.cells >= limit("cells") and link.agreement.share < least:
             values = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
             yield Finding(kind, link.pair, severity, values)
@@ -157,7 +150,7 @@ def _pattern(evidence: Evidence) -> Iterator[Finding]:
     """A pattern over so many pairs that leaving some of them out proves nothing; or one in which the unique decided."""
     if len(evidence.ambiguous) > limit("pattern") * len(evidence.checked):
         yield Finding("pattern", values={"count": len(evidence.ambiguous), "of": len(evidence.checked)})
-    settled = [link for link in evidence.seen if link.unique]
+    settled = [link for link in evidence.checked if link.unique]
     if settled:
         yield Finding("settled pattern", min(settled, key=lambda link: link.agreement.share).pair, "warning")
 
@@ -166,30 +159,24 @@ def _second_motion(evidence: Evidence) -> Iterator[Finding]:
     """What moves differently: a failure of all images where it may be the plane, as without the one that shows it best
     it would only be harder to see. Of a turn it is parallax, or what moved before the camera.
     """
+    if evidence.picture:
+        return
     motions = evidence.motions
     if evidence.lens_only:  # the same a period of the pattern further on; what is static has a message of its own
         motions = [] if evidence.static else [motion for motion in motions if motion.images not in evidence.ambiguous]
-    share, compared = share_of(motions), evidence.compared
-    if not motions or (share < limit("second motion") and compared is None):
+    share = share_of(motions)
+    if share < limit("second motion"):
         return
-    alike = share_alike(evidence.checked)
-    clear = alike >= limit("filled by a plane") or (
-        share < limit("filled by a plane") and not alike < limit("unlike, undecided")
-    )
-    clear |= evidence.depth and alike >= limit("alike")  # nearer and farther things move differently
-    if compared is not None:
-        clear = compared.won or (clear and not compared.lost)
     worst = max(motions, key=lambda motion: motion.area)
     off = min(worst.disagreement, 2.0 * evidence.alignment.cameras[worst.images[0]].scale)
     values = {"share": share, "place": worst.center, "shown": worst.images, "off": off}
     if evidence.alignment.on_sphere:
         yield Finding("parallax", worst.images, "warning", {"size": off, "share": share})
-    elif evidence.lens_only or (clear and worst.is_far):
+    elif evidence.lens_only or (worst.is_far and evidence.clear):
         yield Finding("second motion", worst.images, "warning", values)
     elif worst.is_far:  # nearer, it is depth
-        yield Finding(
-            "undecided motion", tuple(sorted({k for motion in motions for k in motion.images})), "failure", values
-        )
+        images = tuple(sorted({k for motion in motions for k in motion.images}))
+        yield Finding("undecided motion", images, "failure", values)
 
 
 def _two_left(evidence: Evidence) -> Iterator[Finding]:
@@ -240,12 +227,16 @@ OF_PLACES = {
 as before."""
 
 
+SEEN_AT_SEAMS = {"rough", "relief", "depth of a turn", "little alike"}
+"""Kinds that the seams of a picture show, or do not."""
+
+
 def _bent(evidence: Evidence) -> bool:
     return evidence.flat and _size_of_shape(evidence) < min(2.0 * camera.scale for camera in evidence.alignment.cameras)
 
 
 def _seen(evidence: Evidence) -> bool:
-    """Whether depth leaves breaks that are seen."""
+    """Whether depth leaves the images unlike."""
     return evidence.alike < limit("alike")
 
 
@@ -260,7 +251,7 @@ ALOUD = {
     **dict.fromkeys(("shape unknown", "shape bent", "shape free"), Aloud("flatness", _bent)),
     **dict.fromkeys(("rough", "relief"), Aloud("flatness", lambda evidence: evidence.flat or _seen(evidence))),
     **dict.fromkeys(("parallax", "depth of a turn"), Aloud("flatness", _seen)),
-    "second motion": Aloud("second motion", lambda evidence: evidence.flat or not evidence.depth),
-    "little alike": Aloud("little alike", lambda evidence: not evidence.depth or _seen(evidence)),
+    "second motion": Aloud("second motion"),
+    "little alike": Aloud("little alike", _seen),
 }
 """The gravest first; other kinds are always said, and before these."""

@@ -3,11 +3,9 @@
 A vehicle ahead, a part of the robot, or a second plane has matches that agree with each other and not with the
 alignment. Relief and chance have few of them, spread over nothing; a second motion covers an area of its own.
 
-How much of the overlaps looks alike does not say which is the plane: what moves with the camera is seen by all images,
-and seen whole; the plane behind it is seen by neighbours, and hidden where they overlap. What says it is what
-contradicts a motion. Something that hardly moves is put over nearly all of the next image, and most of that looks
-different: it fills less than half of the images, for certain. The plane is put over a part only, and may fill all that
-is not seen there.
+What contradicts a motion says which is the plane. Something that hardly moves is put over nearly all of the next image,
+and most of that looks different: it fills less than half of the images, for certain. The plane is put over a part only,
+and may fill all that is not seen there.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,9 +22,8 @@ from rdstitch.matching.two_view import PAIRS_ESTIMATED_AT_ONCE, Pair, PairRegist
 from rdstitch.results.registration import Registration
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.verification.limits import limit
-from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, share_alike
+from rdstitch.verification.overlap_check import CheckedLink, ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, overlap_agreement
-from rdstitch.verification.self_similarity import Ambiguity
 
 _AREA_CELLS = 16
 """Cells along the longer side of an image, by which area is counted: texture is not size."""
@@ -134,11 +131,6 @@ def share_of(motions: Sequence[SecondMotion]) -> float:
     return sum(motion.area for motion in motions) / max(sum(motion.area + motion.plane_area for motion in motions), 1)
 
 
-def is_separate(motions: Sequence[SecondMotion]) -> bool:
-    """Whether what moves differently covers a good part of the images, and moves by more than tree tops do."""
-    return share_of(motions) >= limit("second motion") and max(motions, key=lambda motion: motion.area).is_far
-
-
 def fills_at_most(compared: Iterable[Agreement]) -> float:
     """Share of the images of some pairs that is not seen to contradict a motion, in [0, 1]."""
     agreements = list(compared)
@@ -150,75 +142,27 @@ def _may_be_a_plane(agreement: Agreement) -> bool:
     return fills_at_most([agreement]) >= limit("filled by a plane")
 
 
-@dataclass(frozen=True)
-class MotionComparison:
-    """What was aligned and what moves differently, compared with the pixels."""
-
-    # fills_at_most, second_fills_at_most: share of the images that is not seen to contradict the alignment, and what
-    # moves differently, in [0, 1]
-    fills_at_most: float
-    second_fills_at_most: float
-
-    @property
-    def won(self) -> bool:
-        """Whether what was aligned is the plane: it may be, and the other fills less than half of the images."""
-        return not self.lost and self.second_fills_at_most < limit("filled by a plane")
-
-    @property
-    def lost(self) -> bool:
-        """Whether what was aligned is not the plane: it fills less than half of the images."""
-        return self.fills_at_most < limit("filled by a plane")
-
-
-def compare_motions(
-    images: ComparedImages, motions: Sequence[SecondMotion], checked: Sequence[CheckedLink]
-) -> MotionComparison | None:
-    """Compare what was aligned over a plane with what moves differently, by the pixels.
-
-    Only where the latter is a motion of its own and covers a good part; or where what was aligned fills less than half
-    of the images, and something else moves in any of them. None otherwise.
-    """
+def is_clear(images: ComparedImages, motions: Sequence[SecondMotion], checked: Sequence[CheckedLink]) -> bool:
+    """Whether what was aligned may fill more than half of the images, and what moves differently does not."""
     second = {motion.images: motion.relation for motion in motions if motion.relation is not None}
-    separate, far = is_separate(motions), any(motion.relation is not None and motion.is_far for motion in motions)
-    if not checked or not (separate or (far and share_alike(checked) < limit("filled by a plane"))):
-        return None
-    fills = fills_at_most(link.agreement for link in checked)
-    moved = (_moved(images, link.pair, second[link.pair]) for link in checked if link.pair in second)
-    comparison = MotionComparison(fills, fills_at_most(moved))
-    return comparison if separate or comparison.lost else None
+    moved = [_moved(images, link.pair, second[link.pair]) for link in checked if link.pair in second]
+    half, other = limit("filled by a plane"), fills_at_most(moved) if moved else share_of(motions)
+    return fills_at_most(link.agreement for link in checked) >= half and other < half
+
+
+def explains(images: ComparedImages, motion: SecondMotion, link: CheckedLink) -> bool:
+    """Whether a pair fits as well elsewhere because something smaller moved there, not for a pattern."""
+    if motion.relation is None:
+        return False
+    shift = motion.disagreement / max(motion.relation.camera.image_size)
+    near = abs(link.ambiguity.shift - shift) <= limit("same shift")
+    return near and not _may_be_a_plane(_moved(images, link.pair, motion.relation))
 
 
 def _moved(images: ComparedImages, pair: Pair, motion: RadialHomography) -> Agreement:
     """How much of two images looks alike as a motion from one to the other puts them."""
     first = images.placed(pair[0], motion.camera, motion.homography)
     return overlap_agreement(first, images.placed(pair[1], motion.camera2, np.eye(3)))
-
-
-def unexplained(
-    checked: Sequence[CheckedLink], motions: Sequence[SecondMotion], compared: MotionComparison | None
-) -> Sequence[CheckedLink]:
-    """The same links, without what second motions that are the smaller part may explain.
-
-    What does not look alike may be what moves; and a pair that fits as well where its second motion puts it shows no
-    repeated pattern, but that.
-    """
-    if compared is None or not compared.won:
-        return checked
-    shifts = {
-        motion.images: motion.disagreement / max(motion.relation.camera.image_size)
-        for motion in motions
-        if motion.relation is not None
-    }
-    return [
-        replace(
-            link,
-            agreement=Agreement(0, 0),
-            ambiguity=Ambiguity(link.ambiguity.here, 0.0, 0.0)
-            if abs(link.ambiguity.shift - shifts.get(link.pair, np.inf)) <= limit("same shift")
-            else link.ambiguity,
-        )
-        for link in checked
-    ]
 
 
 def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRegistration] | None:
@@ -238,9 +182,9 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
     candidates = [(pair, motion, _moved(images, pair, motion)) for pair, motion in first.items()]
     if all(_may_be_a_plane(agreement) for *_, agreement in candidates):
         return None
-    lens = float(np.median([m.distortion for m in first.values() if np.isfinite(m.distortion_std)] or [0.0]))
     rests = {pair: np.flatnonzero(~motion.inliers) for pair, motion in first.items()}
-    second = _strongest_motions(alignment, pairs, rests, lens, threshold)
+    # λ of the first ones may be that of a vehicle, whose image hardly changes.
+    second = _strongest_motions(alignment, pairs, rests, None, threshold)
     candidates += [(pair, motion, _moved(images, pair, motion)) for pair, motion in second.items()]
     fills = [fills_at_most([agreement]) for *_, agreement in candidates]
     best: dict[Pair, RadialHomography] = {}
@@ -255,5 +199,5 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
 
 
 def _no_plane(pair: PairRegistration) -> RadialHomography:
-    relation, reason = pair.relation, "what the two share fills less than half of them (a vehicle?)"
+    relation, reason = pair.relation, "what the two share fills less than half of them (something that moved?)"
     return RadialHomography.failed(reason, relation.camera, relation.camera2, len(relation.inliers))

@@ -52,15 +52,22 @@ def judge(evidence: Evidence) -> tuple[Finding, ...]:
     else:
         disagreeing = {(f.images[0], f.images[1]): f for f in rules.disagreeing_pairs(evidence)}
         of_matches += [disagreeing[pair] for pair in decisive_pairs(disagreeing, evidence.used, count)]
+    of_matches = [finding for finding in of_matches if not _is_depth(finding, evidence)]
     if of_matches:
         return tuple(of_matches)
-    suspicions = {(f.images[0], f.images[1]): f for find in rules.OF_PAIRS for f in find(evidence)}
+    found = [finding for find in rules.OF_PAIRS for finding in find(evidence) if not _is_depth(finding, evidence)]
+    suspicions = {(finding.images[0], finding.images[1]): finding for finding in found}
     hanging = [] if lens_only or evidence.static else decisive_pairs(suspicions, evidence.used, count)
     whole = [finding for find in rules.OF_THE_WHOLE for finding in find(evidence)]
     whole = [f for f in whole if not (f.kind == "little alike" and f.images in suspicions)]
     every = [*(suspicions[pair] for pair in hanging), *whole]
     every += _outvoted([f for pair, f in suspicions.items() if pair not in hanging])
     return _aloud([f for f in every if not (lens_only and f.kind in rules.OF_PLACES)], evidence)
+
+
+def _is_depth(finding: Finding, evidence: Evidence) -> bool:
+    """Whether matches of a picture disagree where its images look alike: the scene has depth, or something moved."""
+    return evidence.picture and "inliers" in finding.values and evidence.looks_right(finding.images)
 
 
 def decisive_pairs(suspicious: Collection[Pair], used: Sequence[LinkFit], count: int) -> list[Pair]:
@@ -89,6 +96,7 @@ def _aloud(findings: Sequence[Finding], evidence: Evidence) -> tuple[Finding, ..
     for k in sorted(range(len(findings)), key=lambda k: rank.get(findings[k].kind, -1)):
         rule = rules.ALOUD.get(findings[k].kind, rules.Aloud(findings[k].kind))
         speaks = findings[k].severity == "warning" and rule.topic not in topics and rule.speaks(evidence)
+        speaks = speaks and not (evidence.picture and findings[k].kind in rules.SEEN_AT_SEAMS)
         if speaks and len(aloud) < rules.MAX_WARNINGS:
             aloud.add(k)
             topics.add(rule.topic)

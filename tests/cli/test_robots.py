@@ -210,7 +210,7 @@ def test_what_is_no_bag_is_named(rdstitch: Run, tmp_path: Path, monkeypatch: pyt
     bag.write_bytes(b"#ROSBAG V2.0\nbroken")
     rdstitch("mosaic", bag, "-o", tmp_path / "out.png", *CACHED, status=3, told="broken.bag")
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
-    assert "rdstitch[ros]" in rdstitch("mosaic", bag, "-o", tmp_path / "out.png", *CACHED, status=3).line
+    assert "pip install rosbags" in rdstitch("mosaic", bag, "-o", tmp_path / "out.png", *CACHED, status=3).line
 
 
 def test_a_calibrated_focal_length_is_as_sure_as_it_was(rdstitch: Run, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from rdstitch_cli.terminal import Reporter
 )
 @options.inputs
 @option("-o --output", options.IMAGE, of="calibrate", required=True)
+@options.camera_format
 @options.every
 @options.topic
 @options.registration
@@ -54,7 +55,7 @@ def calibrate(
     report_registration(registration, reporter, (lambda: plain(registration.camera.as_dict())) if as_json else None)
     for line in (
         *describe_camera(registration.alignment, registration.camera),
-        *export_note(registration.camera, output),
+        *export_note(registration.camera, output, wanted.camera_format),
     ):
         reporter.note(line)
     reporter.made(f"{output}: {registration.summary}")

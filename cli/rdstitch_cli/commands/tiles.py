@@ -9,9 +9,12 @@ from rdstitch.errors import PartialResultError
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
 from rdstitch_cli.option_texts import option
-from rdstitch_cli.parameter_types import LENS, RealNumber, WholeNumber
+from rdstitch_cli.parameter_types import LENS, RealNumber, WholeNumber, word_or_number
 from rdstitch_cli.stitching import composite_fields, files_beside, report_registration, summarize
 from rdstitch_cli.terminal import Reporter
+
+ORDERS = ("rows", "columns", "snake-rows", "snake-columns")
+ORIGINS = ("top-left", "top-right", "bottom-left", "bottom-right")
 
 if TYPE_CHECKING:
     from rdstitch.stage import TileRegistration
@@ -24,6 +27,10 @@ if TYPE_CHECKING:
   rdstitch tiles slide/*.tif --positions stage.csv -o slide.dzi
   rdstitch tiles ome/ --channel 0 -o slide.ome.tif --report slide.html
   rdstitch tiles slide/ --grid 'r{row}c{col}' --positions-only places.csv
+  rdstitch tiles plate/ --grid '{letter}{col}' --overlap 8 -o plate.ome.tif                   # A01, A02, …
+  rdstitch tiles sem/ --grid 'img_{number}' --columns 12 --order snake-rows -o sem.tif
+  rdstitch tiles sem/ --grid 'img_{number}' --columns 12 --origin bottom-left -o sem.tif
+  rdstitch tiles slide/ --positions TileConfiguration.txt --z max -o slide.ome.zarr
 """,
 )
 @options.inputs
@@ -31,11 +38,16 @@ if TYPE_CHECKING:
 @options.overwrite
 @option("--grid")
 @option("--overlap", RealNumber(0.0, 100.0), 10.0)
+@option("--columns", WholeNumber(1))
+@option("--order", ORDERS, "rows")
+@option("--origin", ORIGINS, "top-left")
 @option("--positions", options.IMAGE, of="tiles")
 @option("--positions-only", options.IMAGE)
 @option("--pixel-size", RealNumber(0.0))
 @option("--search", RealNumber(0.0))
 @option("--channel", WholeNumber(0))
+@option("--z", word_or_number(("max",), 0, 1_000_000))
+@option("--time", WholeNumber(0))
 @options.flat_field
 @option("--save-flat-field", options.IMAGE)
 @option("--lambda", LENS, dest="distortion")

@@ -164,7 +164,7 @@ def test_images_without_connection_are_named() -> None:
         for message in explain_unaligned(found, [f"{k}.png" for k in range(9)], [900] * 9, {})
     }
     assert list(reasons) == [("6.png",), ("7.png",), ("8.png",)]
-    assert reasons["6.png",].startswith("in block 2 of 2, whose 2 images overlap with none of the others")
+    assert reasons["6.png",].startswith("in block 2 of 2, whose 2 images overlap too little with the others")
     assert reasons["7.png",] == reasons["6.png",]
     assert "no reliable overlap" in reasons["8.png",]
     blurred = explain_unaligned(found, [f"{k}.png" for k in range(9)], [900] * 8 + [290], {})
@@ -222,6 +222,26 @@ def test_the_reference_image_is_the_frame() -> None:
     np.testing.assert_allclose(found.homographies[4], np.eye(3), atol=1e-12)
     rigid = _run(given, model="rigid", reference=4)
     np.testing.assert_allclose([rigid.poses.yaw[4], *rigid.poses.position[4], rigid.poses.height[4]], [0, 0, 0, 1])
+
+
+def test_a_reduced_image_is_the_reference_only_where_it_is_named() -> None:
+    given = scene(grid(3, 1, (0.4, 0.3), 0.2, np.random.default_rng(13)), rng=np.random.default_rng(14))
+    middle = _run(given, model="similarity").reference
+    small = given.cameras[middle].resized((320, 240))
+    cameras = [small if k == middle else camera for k, camera in enumerate(given.cameras)]
+    half = {True: 0.5, False: 1.0}
+    links = [
+        replace(
+            link,
+            points1=(link.points1 + 0.5) * half[link.image1 == middle] - 0.5,
+            points2=(link.points2 + 0.5) * half[link.image2 == middle] - 0.5,
+        )
+        for link in given.links
+    ]
+    reduced = replace(given, cameras=cameras, links=links)
+    assert middle == 1
+    assert _run(reduced, model="similarity").reference in (0, 2)
+    assert _run(reduced, model="similarity", reference=middle).reference == middle
 
 
 def test_any_image_can_become_the_frame_after_the_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from xml.etree import ElementTree
 
 import cv2
@@ -18,6 +18,7 @@ import pytest
 from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import export_note, load_camera, read_camera_file, save_camera
 from rdstitch.camera_files.polynomials import fitted_polynomial
+from rdstitch.choices import CameraFormat
 from rdstitch.errors import InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
@@ -605,3 +606,9 @@ def test_a_lens_of_any_sign_keeps_its_scale_at_the_unit_radius(distortion: float
     scale, moved = fitted_polynomial(camera, 1224.0, powers).moved()
     assert scale * (1.0 - sum(moved)) == pytest.approx(1.0)
     assert 0.5 < scale < 2.0
+
+
+@pytest.mark.parametrize("camera_format", [name for name in get_args(CameraFormat) if name != "auto"])
+def test_a_format_needs_no_name(camera_format: CameraFormat, tmp_path: Path) -> None:
+    save_camera(CAMERAS[0], tmp_path / "lens", camera_format)
+    assert load_camera(tmp_path / "lens").distortion == pytest.approx(CAMERAS[0].distortion, abs=0.01)

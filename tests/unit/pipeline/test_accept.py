@@ -20,6 +20,7 @@ from rdstitch.matching.links import Link
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.pipeline.accept import _without, accept
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, reselect_inliers, select_by_whole_lens
+from rdstitch.pipeline.recipes import mosaic
 from rdstitch.pipeline.register import register
 from rdstitch.results.messages import Message, left_out
 from rdstitch.results.stitch_options import StitchOptions
@@ -81,10 +82,12 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
     sources = _read(frames)
     with open_executor(1, len(sources)) as executor:
         found = register(sources, OPTIONS, executor)
-        accepted = accept(found, OPTIONS)
-    steps = [np.diff(k.alignment.homographies[:, 0, 2]) for k in (found, accepted)]
+        accepted = accept(found, OPTIONS, "trajectory")
+    picture = mosaic(frames, None, replace(OPTIONS, focal=380.0)).registration
+    steps = [np.diff(k.alignment.homographies[:, 0, 2]) for k in (found, accepted, picture)]
     assert np.all(np.abs(steps[0]) < 0.2)  # heights above the ground: what drives ahead moves by a sixth
     assert np.all(np.abs(steps[1]) > 0.7)
+    assert np.all(np.abs(steps[2]) > 0.7)  # by its seams
     (message,) = (message for message in accepted.messages if message.severity != "detail")
     assert (message.code, message.severity) == ("rival-motion", "warning")
 

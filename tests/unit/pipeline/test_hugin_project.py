@@ -52,6 +52,12 @@ def _rays(image: dict[str, str], points: FloatArray) -> FloatArray:
     return met
 
 
+def _border(width: float, height: float) -> FloatArray:
+    t = np.linspace(0.0, 1.0, 50)[:, None]
+    corners = np.array([(0, 0), (width - 1, 0), (width - 1, height - 1), (0, height - 1)])
+    return np.concatenate([a + t * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
+
+
 def _plane(folder: Path) -> list[Path]:
     """One of the images is held upright, as EXIF says."""
     paths = flight(3, 3, 2, distortion=-0.1).write(folder)
@@ -90,11 +96,24 @@ def test_control_points_meet(taken: Callable[[Path], list[Path]], tmp_path: Path
     ]
     focal = result.registration.camera.with_focal().focal
     assert np.median(off) * focal < 1.0
+    # The output is a crop of the panorama: it reaches as far as the images.
+    (panorama,) = (line for line in text.splitlines() if line.startswith("p "))
+    crop = [int(value) for value in re.search(r" S(\d+),(\d+),(\d+),(\d+) ", panorama).groups()]
+    width, height = (int(value) for value in re.search(r" w(\d+) h(\d+) ", panorama).groups())
+    ends = np.concatenate([_rays(image, _border(float(image["w"]), float(image["h"]))) for image in resolved])
+    if taken is _turn:
+        longitude, latitude = np.arctan2(ends[:, 0], ends[:, 2]), np.arcsin(ends[:, 1])
+        ends = np.column_stack([longitude * width / (2 * np.pi), latitude * height / np.pi])
+    else:
+        ends = ends[:, :2] * focal
+    ends += np.array([width / 2, height / 2])
+    bounds = np.stack([ends.min(axis=0), ends.max(axis=0)])
+    np.testing.assert_allclose(crop, np.clip(bounds, 0, (width, height)).T.ravel(), atol=4.0)
     lens = read_camera_file(tmp_path / "a.pto").camera
     assert lens.nearest_distortion == pytest.approx(result.distortion, abs=0.01)
     if (tool := shutil.which("pano_trafo")) is not None:
-        ends = [[c[n], c[x], c[y]] for c in control for n, x, y in (("n", "x", "y"), ("N", "X", "Y"))]
-        given = "\n".join(map(" ".join, ends))
+        pairs = [[c[n], c[x], c[y]] for c in control for n, x, y in (("n", "x", "y"), ("N", "X", "Y"))]
+        given = "\n".join(map(" ".join, pairs))
         done = subprocess.run([tool, str(tmp_path / "a.pto")], input=given, capture_output=True, text=True, check=True)
         places = np.array([line.split()[:2] for line in done.stdout.splitlines()], dtype=np.float64)
         assert np.median(np.linalg.norm(places[::2] - places[1::2], axis=1)) < 1.5

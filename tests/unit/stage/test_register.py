@@ -13,13 +13,14 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.source import read_sources
 from rdstitch.io.flat_field import FlatField, read_flat_field
+from rdstitch.io.stored_tiles import stored_tiles
 from rdstitch.pipeline.read_inputs import with_flat_field
 from rdstitch.stage import TileRegistration, register_tiles
 from rdstitch.stage.axes import with_axes_shown
 from rdstitch.stage.correlation import Overlap, coarse_tile, correlate
 from rdstitch.stage.estimate_flat_field import estimate_illumination
 from rdstitch.stage.grid import TileGrid
-from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table
+from rdstitch.stage.positions import Scan, grid_from_names, grid_from_table, grid_from_tiles
 from tests.stage_grid import Specimen, StageGrid
 
 
@@ -76,6 +77,16 @@ def test_names_give_rows_and_columns() -> None:
     assert sorted(map(tuple, grid.neighbours(4.0).tolist())) == [(0, 1), (0, 2)]
 
 
+def test_running_numbers_go_to_and_fro_from_a_corner() -> None:
+    names = [f"img_{k:03d}.tif" for k in range(5, 11)]
+    grid = grid_from_names(names, "img_{number}", 0.0, (10, 10), Scan(3, "snake-rows", "bottom-left"))
+    np.testing.assert_array_equal(grid.places, [(0, 10), (10, 10), (20, 10), (20, 0), (10, 0), (0, 0)])
+    down = grid_from_names(names, "img_{number}", 0.0, (10, 10), Scan(3, "snake-columns", "top-right"))
+    np.testing.assert_array_equal(down.places, [(20, 0), (20, 10), (10, 10), (10, 0), (0, 0), (0, 10)])
+    plate = grid_from_names(["plate_A01.tif", "plate_B02.tif"], "{letter}{col}", 0.0, (10, 10))
+    np.testing.assert_array_equal(plate.places, [(0, 0), (10, 10)])
+
+
 @pytest.mark.parametrize(
     ("pattern", "names"), [("r{row}", ["r1"]), ("r{row}c{col}", ["r1c1", "x"]), ("r{row}c{col}", ["r1c1_a", "r1c1_b"])]
 )
@@ -105,7 +116,7 @@ def test_ome_tiff_says_where_it_was_taken(tmp_path: Path) -> None:
             "Plane": {"PositionX": 0.0225 * k, "PositionXUnit": "mm", "PositionY": 1.0, "PositionYUnit": "mm"},
         }
         tifffile.imwrite(file, np.zeros((80, 100), np.uint16), ome=True, metadata=metadata)
-    grid = grid_from_files(files, SIZE, None)
+    grid = grid_from_tiles(stored_tiles(files), SIZE, None)
     np.testing.assert_allclose(grid.places, [(0, 0), (90, 0)])
     assert grid.pixel_size == 0.25
 
@@ -124,10 +135,10 @@ def test_micro_manager_says_it_beside_the_files(tmp_path: Path) -> None:
     files = [tmp_path / f"img_{k}.tif" for k in range(2)]
     for file in files:
         tifffile.imwrite(file, np.zeros((80, 100), np.uint16))
-    np.testing.assert_allclose(grid_from_files(files, SIZE, None).places, [(90, 0), (0, 0)])
+    np.testing.assert_allclose(grid_from_tiles(stored_tiles(files), SIZE, None).places, [(90, 0), (0, 0)])
     (tmp_path / "metadata.txt").unlink()
     with pytest.raises(InputError, match="--grid"):
-        grid_from_files(files, SIZE, None)
+        grid_from_tiles(stored_tiles(files), SIZE, None)
 
 
 @pytest.mark.parametrize("matrix", [((0, 1), (1, 0)), ((1, 0), (0, -1)), ((-1, 0), (0, -1))])

@@ -353,7 +353,7 @@ def test_addresses_of_nothing(flight: str, name: str, message: str) -> None:
 
 def test_a_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
-    with pytest.raises(InputError, match=r"URLs need the extra remote: pip install 'rdstitch\[remote\]'"):
+    with pytest.raises(InputError, match=r"URLs need fsspec: pip install 'fsspec\[http\]'"):
         read_metadata(Path("s3://bucket/a.jpg"))
 
 

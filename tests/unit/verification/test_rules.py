@@ -17,12 +17,12 @@ from rdstitch.verification.findings import TEXTS, Finding, messages_of
 from rdstitch.verification.limits import LIMITS
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
-from rdstitch.verification.second_motion import MotionComparison, SecondMotion
+from rdstitch.verification.second_motion import SecondMotion
 from rdstitch.verification.self_similarity import Ambiguity
 from rdstitch.verification.verdict import _aloud
 
 CAMERA = Camera((400, 300))
-GOOD: Any = SimpleNamespace(alike=0.8, flat=True, depth=False, alignment=None)
+GOOD: Any = SimpleNamespace(alike=0.8, flat=True, picture=False, alignment=None)
 SHAPED: Any = SimpleNamespace(
     **{**vars(GOOD), "alignment": SimpleNamespace(shape=SimpleNamespace(shift=6.0, shift_std=8.0), cameras=[CAMERA])}
 )
@@ -42,8 +42,7 @@ def test_what_is_not_said_is_a_detail() -> None:
     assert note == Finding("parallax", (0, 1), "detail", {"size": 3.0})
 
 
-DEEP = _with(GOOD, depth=True)
-TURNED = _with(DEEP, flat=False)
+TURNED = _with(GOOD, flat=False)
 UNLIKE = _with(TURNED, alike=0.1)
 SMALL = _with(SHAPED, alignment=SimpleNamespace(shape=SimpleNamespace(shift=1e4, shift_std=8.0), cameras=[CAMERA]))
 
@@ -58,10 +57,9 @@ SMALL = _with(SHAPED, alignment=SimpleNamespace(shape=SimpleNamespace(shift=1e4,
         (SHAPED, ["relief"], ["relief"]),
         (SHAPED, ["relief", "shape bent"], ["shape bent"]),  # one line says that the plane may be none
         (SMALL, ["shape bent"], []),  # by more than an image
+        (_with(UNLIKE, picture=True), ["relief", "little alike"], []),  # its seams are looked at
         (SHAPED, ["second motion"], ["second motion"]),
-        (TURNED, ["second motion"], []),  # depth is no vehicle
-        (SHAPED, ["little alike"], ["little alike"]),
-        (DEEP, ["little alike"], []),  # a seam among trees
+        (UNLIKE, ["little alike"], ["little alike"]),
     ],
 )
 def test_what_is_said_aloud(found: Any, kinds: list[str], said: list[str]) -> None:
@@ -87,16 +85,11 @@ def test_every_kind_has_a_sentence_and_every_threshold_its_unit_and_source() -> 
 MOTION = SecondMotion((0, 1), 46, 54, (30.0, 40.0), 120.0)
 
 
-def _of_motions(motion: SecondMotion, alike: float, compared: MotionComparison | None = None, **changed: Any) -> Any:
+def _of_motions(motion: SecondMotion, **changed: Any) -> Any:
     """Severity and words of what is said of a second motion."""
-    checked = [
-        CheckedLink(
-            LinkFit(0, 1, 9, 9, 0.5, True), Agreement(1000, round(1000 * np.nan_to_num(alike))), Ambiguity(1, 0, 0)
-        )
-    ]
     found = SimpleNamespace(
-        motions=[motion], compared=compared, checked=[] if np.isnan(alike) else checked, static=False,
-        lens_only=False, ambiguous={}, depth=False, alignment=SimpleNamespace(cameras=[CAMERA] * 2, on_sphere=False),
+        motions=[motion], clear=True, static=False, lens_only=False, picture=False, ambiguous={},
+        alignment=SimpleNamespace(cameras=[CAMERA] * 2, on_sphere=False),
     )  # fmt: skip
     registration: Any = SimpleNamespace(sources=[SimpleNamespace(path=f"folder/{name}.png") for name in "ab"])
     said = messages_of(rules._second_motion(_with(found, **changed)), registration)
@@ -105,64 +98,30 @@ def _of_motions(motion: SecondMotion, alike: float, compared: MotionComparison |
 
 def test_of_a_turn_a_second_motion_is_parallax() -> None:
     turn = SimpleNamespace(cameras=[CAMERA] * 2, on_sphere=True)
-    ((severity, text),) = _of_motions(SecondMotion((0, 1), 51, 49, (8.0, 9.0), 40.0), 0.3, alignment=turn)
+    ((severity, text),) = _of_motions(SecondMotion((0, 1), 51, 49, (8.0, 9.0), 40.0), alignment=turn)
     assert severity == "warning"
     assert "(parallax)" in text
 
 
 @pytest.mark.parametrize(
-    ("area", "alike", "severity"),
-    [
-        (9, 0.2, None),
-        (11, 0.9, "warning"),
-        (11, np.nan, "warning"),
-        (11, 0.37, "failure"),
-        (44, 0.41, "warning"),
-        (51, 0.49, "failure"),
-        (51, np.nan, "failure"),
-        (51, 0.51, "warning"),  # more than half of what is shared looks alike, whatever has more matches
-    ],
+    ("area", "clear", "severity"), [(9, False, None), (11, True, "warning"), (11, False, "failure")]
 )
-def test_area_and_agreement_decide(area: int, alike: float, severity: str | None) -> None:
-    said = _of_motions(replace(MOTION, area=area, plane_area=100 - area), alike)
+def test_of_a_motion_with_an_area_the_pixels_decide(area: int, clear: bool, severity: str | None) -> None:
+    said = _of_motions(replace(MOTION, area=area, plane_area=100 - area), clear=clear)
     assert [how for how, _ in said] == ([] if severity is None else [severity])
-
-
-@pytest.mark.parametrize(
-    ("area", "alike", "fills", "second", "severity"),
-    [
-        (46, 0.2, 0.7, 0.3, "warning"),  # it holds wherever the other does not, which is the smaller one
-        (46, 0.2, 0.7, 0.6, "failure"),
-        (46, 0.6, 0.7, 0.6, "warning"),
-        (20, 0.6, 0.4, 0.3, "failure"),  # most of the images contradict it, however much of the overlaps looks alike
-        (5, 0.45, 0.4, 1.0, "failure"),
-    ],
-)
-def test_what_fills_less_than_half_of_the_images_fails(
-    area: int, alike: float, fills: float, second: float, severity: str
-) -> None:
-    compared = MotionComparison(fills, second)
-    ((how, _),) = _of_motions(replace(MOTION, area=area, plane_area=100 - area), alike, compared)
-    assert how == severity
-
-
-@pytest.mark.parametrize(("alike", "severity"), [(0.24, "failure"), (0.26, "warning")])
-def test_what_is_nearer_or_farther_is_no_second_plane(alike: float, severity: str) -> None:
-    """Where the scene has depth and the overlaps look alike; without depth neither of the two is clear."""
-    assert [how for how, _ in _of_motions(MOTION, alike, depth=True)] == [severity]
-    assert [how for how, _ in _of_motions(MOTION, alike)] == ["failure"]
+    assert _of_motions(replace(MOTION, area=area, plane_area=100 - area), clear=clear, picture=True) == []
 
 
 def test_the_place_is_named_and_no_distance_is_larger_than_an_image() -> None:
-    ((_, text),) = _of_motions(MOTION, 0.8)
+    ((_, text),) = _of_motions(MOTION)
     for part in ("46%", "(30, 40) of a.png", "b.png", "120 pixels", "a mask keeps it out"):
         assert part in text
-    ((_, text),) = _of_motions(replace(MOTION, disagreement=np.inf), 0.8)
+    ((_, text),) = _of_motions(replace(MOTION, disagreement=np.inf))
     assert "by 500 pixels" in text
 
 
 def test_a_second_motion_does_not_spoil_the_lens() -> None:
-    ((how, _),) = _of_motions(MOTION, 0.1, lens_only=True)
+    ((how, _),) = _of_motions(MOTION, clear=False, lens_only=True)
     assert how == "warning"
 
 
@@ -182,7 +141,7 @@ def _misfits(registration: Any) -> list[Message]:
     ("registration", "reason"),
     [
         (_registration(39), "too few to place it: little overlap, or none? stitch them on their own"),
-        (_registration(41), "another plane, camera or zoom, or none (trees, walls)? stitch them on their own"),
+        (_registration(41), "another surface, or come from another camera or zoom? stitch them on their own"),
         (_registration(41, keypoints=(900, 200, 900)), "b.jpg has less than a third of the features that others have"),
     ],
 )
@@ -195,7 +154,7 @@ def test_a_pair_whose_matches_agree_with_each_other_only_is_named(registration: 
 
 def test_images_of_whose_matches_two_fifths_disagree_are_named() -> None:
     first, second = _misfits(_registration(100, agree=0.55, keypoints=(900, 200, 900)))
-    assert "only 55 of 100 of its matches agree with the whole; they agree with each other" in first.text
+    assert "only 55 of 100 of its matches fit the place that was found for it; they fit each other" in first.text
     assert "b.jpg has less than a third of the features that others have (blurred?)" in second.text
     assert second.images == ("folder/b.jpg",)
     assert _misfits(_registration(100, agree=0.65)) == []
@@ -251,31 +210,12 @@ def test_images_without_a_mask_among_others_are_named() -> None:
     assert _texts(masked[0], _source("x.png"), _source("y.png")) == ["2 of 3 images have no mask: x.png, y.png"]
 
 
-@pytest.mark.parametrize(
-    ("off", "area", "relief", "on_sphere", "depth"),
-    [
-        (20.0, 40, False, False, True),  # less than a twentieth of the diagonal of 500 pixels: nearer things
-        (30.0, 40, False, False, False),  # a vehicle
-        (30.0, 40, False, True, True),
-        (30.0, 40, True, False, True),
-        (0.0, 0, False, True, False),
-    ],
-)
-def test_depth_is_relief_or_a_motion_as_small_as_that_of_tree_tops(
-    off: float, area: int, relief: bool, on_sphere: bool, depth: bool
-) -> None:
-    relation = RadialHomography(np.eye(3), CAMERA, CAMERA, np.ones(20, dtype=np.bool_))
-    alignment = SimpleNamespace(relief=SimpleNamespace(found=relief), on_sphere=on_sphere)
-    found = SimpleNamespace(alignment=alignment, motions=[SecondMotion((0, 1), area, 60, (0.0, 0.0), off, relation)])
-    assert Evidence.depth.__get__(found) is depth
-
-
 def test_what_moves_by_no_more_than_tree_tops_rivals_no_plane() -> None:
     relation = RadialHomography(np.eye(3), CAMERA, CAMERA, np.ones(20, dtype=np.bool_))
     near, far = (SecondMotion((0, 1), 46, 54, (30.0, 40.0), off, relation) for off in (20.0, 30.0))
-    assert [how for how, _ in _of_motions(far, 0.3)] == ["failure"]
-    assert _of_motions(near, 0.3) == _of_motions(near, 0.9) == []
-    assert [how for how, _ in _of_motions(near, 0.3, lens_only=True)] == ["warning"]  # depth looks like a lens
+    assert [how for how, _ in _of_motions(far, clear=False)] == ["failure"]
+    assert _of_motions(near, clear=False) == []
+    assert [how for how, _ in _of_motions(near, clear=False, lens_only=True)] == ["warning"]  # depth looks like a lens
 
 
 @pytest.mark.parametrize(("doubtful", "severity"), [(True, "warning"), (False, "detail")])
@@ -313,7 +253,7 @@ def _kinds(findings: Any) -> list[str]:
 def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kind: str | None) -> None:
     ground = SimpleNamespace(found=relief is not None, size=relief or 0.0)
     alignment = SimpleNamespace(rms=rms, relief=ground, cameras=[Camera((400, 300)), Camera((40, 30))])
-    found: Any = SimpleNamespace(alignment=alignment, threshold=3.0, alike=alike)
+    found: Any = SimpleNamespace(alignment=alignment, threshold=3.0, alike=alike, picture=False)
     findings = list(rules._errors(found))
     assert _kinds(findings) == ([] if kind is None else [kind])
     for finding in findings:
@@ -328,7 +268,7 @@ def _checked(cells: int, share: float, pair: tuple[int, int] = (0, 1), *, unique
 
 def test_of_pairs_that_unique_places_decided_the_least_alike_is_named() -> None:
     seen = [_checked(100, 0.5, unique=True), _checked(100, 0.3, (1, 2), unique=True), _checked(100, 0.1, (2, 3))]
-    (finding,) = rules._pattern(SimpleNamespace(ambiguous={}, checked=seen, seen=seen))  # type: ignore[arg-type]
+    (finding,) = rules._pattern(SimpleNamespace(ambiguous={}, checked=seen))  # type: ignore[arg-type]
     assert (finding.kind, finding.images) == ("settled pattern", (1, 2))
 
 

@@ -1,0 +1,335 @@
+"""Whether the seams hold: what a person sees where one image of the output ends and the next begins.
+
+Along every border of two images, windows of both are compared. A seam is broken where the two differ at the border
+itself, and either fit clearly better with one of them moved, or lines of one do not go on in the other. What differs
+beside the border does not count: a seam that goes around a moving object holds.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection
+from rdstitch.system.late_imports import csgraph, sparse
+
+DIAGONAL = 1000.0
+"""Pixels of an image's diagonal at which seams are looked at: about what a screen shows of it."""
+
+_HALF, _REACH, _STEP = 12, 16, 8  # half a window, how far it is searched for, and how far windows are apart
+_BORDER = 2  # pixels on either side of a seam at which a difference shows
+# Of the range of grey levels: standard deviation in a window that has texture, and of a difference that is seen.
+_CONTRAST = 6.0 / 255.0
+_ALIKE, _GAIN, _MOVED = 0.75, 0.2, 3.0  # correlation of a moved window, its lead, and by how much it is moved
+_UNLIKE = 0.4  # correlation below which edges on both sides are not the same
+_COARSER, _CELL, _MIN_CELLS = 3, 13, 8  # overlaps are compared so many times smaller, in cells; fewer say nothing
+_MIN_ALIKE = 0.5  # share of the overlaps that what fills less than half of the images cannot reach
+# Coherence of edges (0: all directions, 1: one) from which on a person sees them end: leaves and gravel hide a seam.
+_DIRECTED = 0.4
+_MAX_SHARE, _MIN_BROKEN = 0.05, 3  # of the places that may be broken before a person sees it
+_MAX_LENGTH = 0.045  # of a break that a person does not see, diagonals of an image
+_SURELY_ALIKE = 0.9  # correlation of windows that need not be moved
+
+
+@dataclass(frozen=True)
+class SeamTile:
+    """One image where seams are looked at."""
+
+    box: Box  # on the canvas of the tiles
+    grey: Float32Array  # (h, w)
+    inside: BoolArray  # (h, w)
+
+
+@dataclass(frozen=True)
+class SeamBreak:
+    """A stretch of a seam whose two sides do not fit."""
+
+    images: tuple[int, int]
+    position: tuple[float, float]  # its middle, pixels of the output
+    length: float  # along the seam, pixels of the output
+    size: float  # by how much its content is shifted, pixels of the output; NaN where it does not match at all
+
+
+@dataclass(frozen=True)
+class SeamQuality:
+    """The seams of an output, place by place."""
+
+    # (N, 2): places along the seams at which both images have texture, pixels of the output
+    places: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    broken: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (N,)
+    breaks: tuple[SeamBreak, ...] = ()  # the longest first
+    spacing: float = math.inf  # of the places, pixels of the output
+    alike: float = math.nan  # share of the overlaps that looks alike, [0, 1]; NaN where there is nothing to compare
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether most of what the images share does not look alike: it may be something else that holds them."""
+        return self.alike < _MIN_ALIKE
+
+    @property
+    def share(self) -> float:
+        """Share of the places that is broken, [0, 1]."""
+        return float(self.broken.mean()) if len(self.broken) else 0.0
+
+    @property
+    def seen(self) -> bool:
+        """Whether a person sees that seams are broken: a long break, or many."""
+        longest = self.breaks[0].length if self.breaks else 0.0
+        many = self.share > _MAX_SHARE and self.broken.sum() >= _MIN_BROKEN
+        return many or longest > _MAX_LENGTH * DIAGONAL / _STEP * self.spacing
+
+    def cropped(self, box: Box) -> "SeamQuality":
+        """The same of a part of the output."""
+        corner, last = np.array(box[:2]), np.array(box[2:]) - 0.5
+        within = ((self.places >= corner - 0.5) & (self.places < last)).all(axis=1)
+        kept = [
+            replace(one, position=(one.position[0] - box[0], one.position[1] - box[1]))
+            for one in self.breaks
+            if box[0] - 0.5 <= one.position[0] < box[2] - 0.5 and box[1] - 0.5 <= one.position[1] < box[3] - 0.5
+        ]
+        return replace(self, places=self.places[within] - corner, broken=self.broken[within], breaks=tuple(kept))
+
+
+def measure_seams(
+    tiles: Sequence[SeamTile | None],
+    labels: NDArray[np.int32],
+    label_size: float,
+    unit: float,
+    full: float = 255.0,
+) -> SeamQuality:
+    """Compare both sides of all seams.
+
+    Parameters
+    ----------
+    labels : ndarray of shape (h, w), int32
+        Owner of each pixel of a reduced canvas; -1 where there is none.
+    label_size : float
+        Pixels of the tiles for one of the labels.
+    unit : float
+        Pixels of the output for one of the tiles.
+    full : float
+        Grey level of white.
+    """
+    contrast = _CONTRAST * full
+    pairs, at = _border_places(labels, label_size)
+    rows = []
+    clear: dict[int, list[BoolArray]] = {}
+    for pair in np.unique(pairs, axis=0):
+        first, second = (tiles[k] for k in pair)
+        if first is None or second is None:
+            continue
+        for k, tile in zip(pair.tolist(), (first, second), strict=True):
+            if k not in clear:
+                clear[k] = [_eroded(tile.inside, _HALF + reach) for reach in (_REACH, _REACH // 2)]
+        here = at[(pairs == pair).all(axis=1)]
+        border = _on_border(labels, label_size, pair)
+        rows.append((pair, _compared(first, second, [clear[k] for k in pair.tolist()], here, border, contrast)))
+    found = [(pair, *row) for pair, part in rows for row in part]
+    if not found:
+        return SeamQuality(spacing=_STEP * unit)
+    images = np.array([row[0] for row in found])
+    places, broken = np.array([row[1] for row in found]), np.array([row[2] for row in found])
+    size = np.array([row[3] for row in found])
+    breaks = _breaks(images, places, broken, size, unit)
+    return SeamQuality((places + 0.5) * unit - 0.5, broken, breaks, _STEP * unit)
+
+
+def share_alike(tiles: Sequence[SeamTile | None], pairs: IntArray, full: float = 255.0) -> float:
+    """Share of the overlaps of pairs (P, 2) that looks alike in place, a few pixels more or less; NaN without any."""
+    small = [None if tile is None else _smaller(tile) for tile in tiles]
+    cells = alike = 0
+    for i, j in pairs.tolist():
+        first, second = small[i], small[j]
+        if first is None or second is None or (box := intersection(first.box, second.box)) is None:
+            continue
+        parts = [(cut(tile.grey, tile.box, box), cut(tile.inside, tile.box, box)) for tile in (first, second)]
+        rows, columns = (n // _CELL for n in parts[0][0].shape)
+
+        def in_cells(values: NDArray[Any], rows: int = rows, columns: int = columns) -> NDArray[Any]:
+            whole = values[: rows * _CELL, : columns * _CELL].reshape(rows, _CELL, columns, _CELL)
+            return whole.swapaxes(1, 2).reshape(-1, _CELL, _CELL)
+
+        (grey1, inside1), (grey2, inside2) = ([in_cells(values) for values in part] for part in parts)
+        known = (inside1 & inside2).all(axis=(1, 2))
+        known &= np.minimum(grey1.std(axis=(1, 2)), grey2.std(axis=(1, 2))) > _CONTRAST * full
+        cells += int(known.sum())
+        alike += int((_correlation(grey1[known], grey2[known]) > _UNLIKE).sum())
+    return alike / cells if cells >= _MIN_CELLS else math.nan
+
+
+def _smaller(tile: SeamTile) -> SeamTile:
+    """A tile with larger pixels, which begin where they do on the whole canvas."""
+    x, y = (-start % _COARSER for start in tile.box[:2])
+    rows, columns = (n // _COARSER for n in (tile.grey.shape[0] - y, tile.grey.shape[1] - x))
+    part = np.s_[y : y + rows * _COARSER, x : x + columns * _COARSER]
+    left, top = (tile.box[0] + x) // _COARSER, (tile.box[1] + y) // _COARSER
+    shape = rows, _COARSER, columns, _COARSER
+    grey = tile.grey[part].reshape(shape).mean(axis=(1, 3))
+    inside: BoolArray = np.asarray(tile.inside[part].reshape(shape).all(axis=(1, 3)))
+    return SeamTile((left, top, left + columns, top + rows), grey, inside)
+
+
+def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArray, FloatArray]:
+    """Pairs of owners (N, 2), the smaller first, and places of their borders (N, 2) on the canvas of the tiles."""
+    found = []
+    for first, second, right, down in ((labels[:, :-1], labels[:, 1:], 0.5, 0.0), (labels[:-1], labels[1:], 0.0, 0.5)):
+        y, x = np.nonzero((first != second) & (first >= 0) & (second >= 0))
+        owners = np.sort(np.column_stack([first[y, x], second[y, x]]), axis=1)
+        at = (np.column_stack([x + right, y + down]) + 0.5) * label_size - 0.5
+        found.append(np.column_stack([owners, at]))
+    every = np.concatenate(found)
+    keys = np.column_stack([every[:, :2], np.floor(every[:, 2:] / _STEP)]).astype(np.int64)
+    order = np.lexsort((every[:, 3], every[:, 2], *keys.T[::-1]))
+    every, keys = every[order], keys[order]
+    starts = np.flatnonzero(np.concatenate([[True], (keys[1:] != keys[:-1]).any(axis=1)])) if len(keys) else order
+    middle = (starts + np.append(starts[1:], len(keys))) // 2 if len(keys) else order
+    return every[middle, :2].astype(np.intp), every[middle, 2:]
+
+
+def _eroded(inside: BoolArray, radius: int) -> BoolArray:
+    """Where a window of this radius lies inside."""
+    kernel = np.ones((2 * radius + 1,) * 2, np.uint8)
+    return cv2.erode(inside.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0
+
+
+def _compared(
+    first: SeamTile,
+    second: SeamTile,
+    clear: Sequence[Sequence[BoolArray]],
+    at: FloatArray,
+    border: Callable[[IntArray], BoolArray],
+    contrast: float,
+) -> list[tuple[FloatArray, bool, float]]:
+    """Of the places (N, 2) of one border that can be compared: where, whether broken, and by how much shifted."""
+    whole = np.rint(at).astype(np.intp)
+    reaches = np.zeros(len(at), dtype=np.intp)
+    for one, two, reach in reversed(list(zip(*clear, (_REACH, _REACH // 2), strict=True))):
+        reaches[_looked_up(one, first.box, whole) & _looked_up(two, second.box, whole)] = reach
+    at, whole, reaches = at[reaches > 0], whole[reaches > 0], reaches[reaches > 0]
+    if not len(at):
+        return []
+    windows1, windows2 = _windows(first, whole), _windows(second, whole)
+    spread = np.stack([windows1.std(axis=(1, 2)), windows2.std(axis=(1, 2))])
+    differ = _difference(windows1, windows2, border(whole))
+    alike = _correlation(windows1, windows2)
+    result = []
+    for k in range(len(at)):
+        shift, broken = math.nan, False
+        if spread[:, k].max() < contrast:
+            continue
+        if spread[:, k].min() < contrast:  # one side is empty of what the other has
+            broken = bool(differ[k] > 2.0 * contrast)
+        elif differ[k] > contrast and alike[k] < _SURELY_ALIKE:
+            best, shift = _best_shift(first, second, whole[k], int(reaches[k]))
+            moved = shift > _MOVED and best > _ALIKE and best - alike[k] > _GAIN
+            edges, directions = zip(_edges(windows1[k]), _edges(windows2[k]), strict=True)
+            unlike = alike[k] < _UNLIKE and max(edges) > contrast and max(directions) > _DIRECTED
+            broken = bool(moved or unlike)
+            shift = shift if moved else math.nan
+        result.append((at[k], broken, shift if broken else 0.0))
+    return result
+
+
+def _looked_up(mask: BoolArray, box: Box, whole: IntArray) -> BoolArray:
+    """The mask on a box at places (N, 2) of the canvas; False beyond."""
+    x, y = whole[:, 0] - box[0], whole[:, 1] - box[1]
+    height, width = mask.shape
+    within = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    return np.asarray(within & mask[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)])
+
+
+def _windows(tile: SeamTile, whole: IntArray) -> Float32Array:
+    """Windows (N, side, side) of a tile around places (N, 2) of the canvas."""
+    side = 2 * _HALF + 1
+    x, y = (whole - tile.box[:2] - _HALF).T
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(tile.grey, (side, side))[y, x])
+
+
+def _on_border(labels: NDArray[np.int32], label_size: float, pair: IntArray) -> Callable[[IntArray], BoolArray]:
+    """Which pixels (N, side, side) of windows around places (N, 2) are near both owners."""
+
+    def border(whole: IntArray) -> BoolArray:
+        offsets = np.arange(-_HALF - _BORDER, _HALF + _BORDER + 1)
+        x, y = ((whole[:, k, None] + offsets + 0.5) / label_size for k in (0, 1))
+        columns = np.clip(x.astype(np.intp), 0, labels.shape[1] - 1)
+        rows = np.clip(y.astype(np.intp), 0, labels.shape[0] - 1)
+        owners = labels[rows[:, :, None], columns[:, None, :]]
+        side, near = 2 * _HALF + 1, np.ones((len(whole), 2 * _HALF + 1, 2 * _HALF + 1), dtype=np.bool_)
+        for owner in pair:
+            owned = owners == owner
+            across = np.logical_or.reduce([owned[:, :, k : k + side] for k in range(2 * _BORDER + 1)])
+            near &= np.logical_or.reduce([across[:, k : k + side] for k in range(2 * _BORDER + 1)])
+        return near
+
+    return border
+
+
+def _difference(windows1: Float32Array, windows2: Float32Array, mask: BoolArray) -> FloatArray:
+    """Standard deviation of what two windows differ by where the mask is, but for brightness and some contrast."""
+    count = np.maximum(mask.sum(axis=(1, 2)), 1)
+
+    def mean(values: Any) -> FloatArray:
+        return np.asarray((values * mask).sum(axis=(1, 2)) / count, dtype=np.float64)
+
+    u, v = (w - mean(w)[:, None, None] for w in (windows1, windows2))
+    uu, vv, uv = mean(u * u), mean(v * v), mean(u * v)
+    larger, smaller = np.maximum(uu, vv), np.minimum(uu, vv)
+    gain = np.clip(uv / np.maximum(larger, 1e-9), 0.5, 1.0)
+    return np.sqrt(np.maximum(smaller - 2.0 * gain * uv + gain**2 * larger, 0.0))
+
+
+def _correlation(windows1: Float32Array, windows2: Float32Array) -> FloatArray:
+    """Normalized correlation of windows (N, h, w)."""
+    u, v = (w - w.mean(axis=(1, 2), keepdims=True) for w in (windows1, windows2))
+    norms = np.sqrt((u * u).sum(axis=(1, 2)) * (v * v).sum(axis=(1, 2)))
+    return np.asarray((u * v).sum(axis=(1, 2)) / np.maximum(norms, 1e-9), dtype=np.float64)
+
+
+def _best_shift(first: SeamTile, second: SeamTile, at: IntArray, reach: int) -> tuple[float, float]:
+    """Highest correlation of windows at any shift, and its length; NaN where the way back is another."""
+    found = []
+    for one, other in ((first, second), (second, first)):
+        x, y = at - one.box[:2]
+        u, v = at - other.box[:2]
+        wide = other.grey[v - _HALF - reach : v + _HALF + reach + 1, u - _HALF - reach : u + _HALF + reach + 1]
+        window = one.grey[y - _HALF : y + _HALF + 1, x - _HALF : x + _HALF + 1]
+        scores = cv2.matchTemplate(np.ascontiguousarray(wide), np.ascontiguousarray(window), cv2.TM_CCOEFF_NORMED)
+        _, best, _, place = cv2.minMaxLoc(scores)
+        found.append((best, np.array(place) - reach))
+    (best, there), (_, back) = found
+    return best, float(np.hypot(*there)) if np.hypot(*(there + back)) <= 2 else math.nan
+
+
+def _edges(window: Float32Array) -> tuple[float, float]:
+    """The strong edges of a window, grey levels a pixel, and how much they have one direction, [0, 1]."""
+    x, y = (cv2.Sobel(window, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
+    xx, yy, xy = (float((u * v).sum()) for u, v in ((x, x), (y, y), (x, y)))
+    return float(np.quantile(np.hypot(x, y), 0.9)), math.hypot(xx - yy, 2.0 * xy) / max(xx + yy, 1e-9)
+
+
+def _breaks(
+    images: IntArray, places: FloatArray, broken: BoolArray, size: FloatArray, unit: float
+) -> tuple[SeamBreak, ...]:
+    """Broken places of one border that follow each other, as one."""
+    chosen = np.flatnonzero(broken)
+    at, pairs = places[chosen], images[chosen]
+    near = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1)) <= 2.2 * _STEP
+    near &= (pairs[:, None] == pairs[None]).all(axis=2)
+    _, group = csgraph.connected_components(sparse.csr_array(near), directed=False)
+    breaks = []
+    for k in range(int(group.max(initial=-1)) + 1):
+        members = group == k
+        length = float(np.hypot(*np.ptp(at[members], axis=0))) + _STEP
+        middle = at[members][np.argmin(np.hypot(*(at[members] - at[members].mean(axis=0)).T))]
+        known = size[chosen][members]
+        known = known[np.isfinite(known)]
+        x, y = ((middle + 0.5) * unit - 0.5).tolist()
+        i, j = pairs[members][0].tolist()
+        shift = float(np.median(known)) * unit if len(known) else math.nan
+        breaks.append(SeamBreak((i, j), (x, y), length * unit, shift))
+    return tuple(sorted(breaks, key=lambda one: -one.length))

@@ -1,0 +1,76 @@
+"""OME-Zarr (NGFF 0.4) from strips, chunk by chunk, for napari, QuPath, Fiji and notebooks.
+
+An image's channels are planes, and each level is half as large as the one before; memory is that of a few strips.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rdstitch.errors import OutputError
+from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, pyramid, pyramid_sizes
+
+_SMALLEST = 512  # pixels of the longer side of the last level, at most
+_COLOURS = ("FFFFFF", "FF00FF", "00FF00", "00FFFF", "FFFF00", "FF8000")
+_RGB = ("FF0000", "00FF00", "0000FF")
+
+
+def check_zarr(path: Path) -> None:
+    """Refuse an OME-Zarr image before long work where the package that writes it is missing."""
+    try:
+        import zarr  # noqa: F401
+    except ImportError:
+        raise OutputError(
+            f"{path}: OME-Zarr needs the package zarr; install it with: pip install 'rdstitch[zarr]'"
+        ) from None
+
+
+def write_ome_zarr(folder: Path, layout: Layout, strips: Iterable[Strip]) -> None:
+    """Write an image into a folder; what no image covers is 0."""
+    import zarr
+
+    sizes = pyramid_sizes(layout.size, _SMALLEST)
+    group = zarr.open_group(folder, mode="w", zarr_format=2)
+    shown = (pixels if alpha is None else np.where(alpha[..., None] > 0, pixels, 0) for pixels, alpha in strips)
+    for number, ((width, height), passing) in enumerate(pyramid(sizes, shown, folder.parent, transparent=False)):
+        level = group.create_array(
+            str(number),
+            shape=(layout.channels, height, width),
+            chunks=(1, min(STRIP_ROWS, height), min(STRIP_ROWS, width)),
+            dtype=layout.dtype,
+            chunk_key_encoding={"name": "v2", "separator": "/"},
+        )
+        top = 0
+        for rows in passing:
+            level[:, top : top + len(rows)] = np.moveaxis(rows, -1, 0)
+            top += len(rows)
+    group.attrs.update(_attributes(layout, len(sizes)))
+
+
+def _attributes(layout: Layout, levels: int) -> dict[str, Any]:
+    """What NGFF says of the axes, the size of a pixel and the channels."""
+    size = layout.metadata.pixel_size
+    unit = {} if size is None else {"unit": "micrometer"}
+    axes = [{"name": "c", "type": "channel"}, *({"name": axis, "type": "space", **unit} for axis in "yx")]
+    datasets = []
+    for number in range(levels):
+        pixel, shift = (size or 1.0) * 2**number, (size or 1.0) * (2**number - 1) / 2.0
+        steps = [{"type": "scale", "scale": [1.0, pixel, pixel]}]
+        steps += [{"type": "translation", "translation": [0.0, shift, shift]}] if number else []
+        datasets.append({"path": str(number), "coordinateTransformations": steps})
+    colours = _RGB if layout.channels == 3 and not layout.metadata.planes else _COLOURS
+    names = layout.metadata.channel_names or [str(k) for k in range(layout.channels)]
+    top = 1.0 if layout.dtype.kind == "f" else float(np.iinfo(layout.dtype).max)
+    window = {"min": 0.0, "max": top, "start": 0.0, "end": top}
+    return {
+        "multiscales": [{"version": "0.4", "name": "image", "axes": axes, "datasets": datasets, "type": "mean"}],
+        "omero": {
+            "version": "0.4",
+            "channels": [
+                {"label": name, "color": colours[k % len(colours)], "active": True, "window": window}
+                for k, name in zip(range(layout.channels), names, strict=False)
+            ],
+        },
+    }

@@ -1,0 +1,166 @@
+"""Stage: the layout of a picture, judged by its seams.
+
+Where those of the most probable layout are seen to break, or it stretches what it shows as nobody would, other
+hypotheses that join the same images are laid out at the size that seams are found at, and the one of which a person
+sees the least is taken: without local alignment, a turn of the camera, a plane, free homographies, and, where something
+fills a good part of the images and moves of its own, what lies behind it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rdstitch.alignment.result import Alignment
+from rdstitch.compositing.composite_options import CompositeOptions
+from rdstitch.compositing.projection import PLANE
+from rdstitch.errors import ArgumentError, LimitError, RdstitchError, RegistrationError
+from rdstitch.local_alignment import LocalAlignment, no_local_alignment
+from rdstitch.pipeline.accept import plane_of_most, realigned
+from rdstitch.pipeline.aligner import Aligner
+from rdstitch.pipeline.compose import Layout
+from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
+from rdstitch.pipeline.register import with_frontal_reference
+from rdstitch.pipeline.straighten import turned
+from rdstitch.pipeline.whole_pixels import on_whole_pixels
+from rdstitch.pipeline.working_size import at_full_size
+from rdstitch.results.messages import Message
+from rdstitch.results.registration import Registration
+from rdstitch.results.stitch_options import StitchOptions
+
+_MODELS = ("rotation", "pose", "homography")
+"""What a camera can have done: turned, moved over a plane, or anything that joins images of a plane."""
+
+_MAX_MAGNIFICATION, _MAX_ASPECT = 4.0, 2.0
+"""Of a place over the median one, and of its two directions: those of a plane seen 60 degrees off its normal."""
+
+_CLEARLY = 0.5
+"""Share of the broken places up to which another layout is clearly better."""
+
+_GRID = np.stack(np.meshgrid(*[[0.02, 0.25, 0.5, 0.75, 0.98]] * 2), axis=-1).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class LaidOut:
+    """A registration in the frame of the output, with its layout."""
+
+    registration: Registration
+    local: LocalAlignment
+    layout: Layout
+    messages: tuple[Message, ...] = ()
+
+    @property
+    def faults(self) -> tuple[bool, int]:
+        """What speaks against it: overlaps that do not look alike; and broken seams and stretched places, 0 to 2."""
+        seams = self.layout.seams
+        return seams.contradicted, int(seams.seen) + int(_is_stretched(self.layout))
+
+    @property
+    def clipped(self) -> int:
+        """Number of images of which only the near part is drawn."""
+        return sum(part is not None for part in self.layout.canvas.near)
+
+    @property
+    def broken(self) -> int:
+        """Number of places at which its seams are broken; they are as far apart in every layout."""
+        return int(self.layout.seams.broken.sum())
+
+
+def lay_out(registration: Registration, local: LocalAlignment, options: CompositeOptions) -> LaidOut:
+    """Images of a registration on the canvas of the output."""
+    placed, said = turned(PlacedImages.of(registration, local.fields or None), options)
+    if placed.orientation is not None:
+        homographies = placed.orientation @ registration.alignment.homographies
+        registration = replace(registration, alignment=replace(registration.alignment, homographies=homographies))
+    return LaidOut(registration, local, Layout.of(placed, options), tuple(said))
+
+
+def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner, *, pano: bool) -> LaidOut:
+    """The layout whose seams hold, or break the least.
+
+    Parameters
+    ----------
+    registration : Registration
+        In pixels of the working size.
+    pano : bool
+        Whether the output is always in the frame of an image.
+    """
+
+    def laid(candidate: Registration, local: LocalAlignment | None = None) -> LaidOut:
+        whole = on_whole_pixels(with_frontal_reference(at_full_size(candidate), options, always=pano))
+        local = align_registration_locally(whole, options.local_alignment) if local is None else local
+        one = lay_out(whole, local, options.composite)
+        return one if options.dry_run else replace(one, layout=one.layout.decided(options.composite, options.threads))
+
+    failed: RdstitchError | None = None
+    tried: list[LaidOut] = []
+    try:
+        tried.append(laid(registration))
+    except LimitError as error:
+        failed = error
+    if options.dry_run or (tried and not any(tried[0].faults)):
+        return _first(tried, failed)
+    if tried and tried[0].local.fields and options.local_alignment == "auto":
+        tried.append(laid(registration, no_local_alignment("seams hold better without it")))
+    for other in _others(registration, options, aligner):
+        try:
+            tried.append(laid(other))
+        except (LimitError, ArgumentError):
+            continue
+    first = _first(tried, failed)
+    whole = [one for one in tried if one.clipped <= first.clipped]
+    best = min(whole, key=lambda one: (one.faults, one.broken))
+    if failed is None and best.faults == first.faults and best.broken > _CLEARLY * first.broken:
+        return first
+    return best
+
+
+def _first(tried: list[LaidOut], failed: RdstitchError | None) -> LaidOut:
+    if tried:
+        return tried[0]
+    assert failed is not None
+    raise failed
+
+
+def _others(registration: Registration, options: StitchOptions, aligner: Aligner) -> Iterator[Registration]:
+    """Other registrations that use every image that this one does."""
+    alignment = registration.alignment
+    if options.model == "auto":
+        for name in _MODELS:
+            if name == alignment.model:
+                continue
+            decided = replace(aligner.options, model=name)
+            try:
+                other = realigned(registration, replace(aligner, options=decided))
+            except RegistrationError:
+                continue
+            if _joins(other.alignment, alignment):
+                yield other
+    plane = plane_of_most(registration, options, aligner)
+    if plane is not None and _joins(plane.alignment, alignment):
+        yield plane
+
+
+def _joins(other: Alignment, alignment: Alignment) -> bool:
+    """Whether another alignment uses all images of one."""
+    return bool((other.used >= alignment.used).all())
+
+
+def _is_stretched(layout: Layout) -> bool:
+    """Whether a plane shows some places much larger than most, or much longer than wide."""
+    canvas = layout.canvas
+    if canvas.projection != PLANE:
+        return False
+    magnification = []
+    for image in layout.images:
+        size = np.array(image.camera.image_size)
+        at, step = _GRID * size, 1e-3 * size[1]
+        middle, right, down = (
+            canvas.place(image.camera, image.homography, at + d) for d in ((0, 0), (step, 0), (0, step))
+        )
+        shown = np.isfinite(middle + right + down).all(axis=1)
+        jacobian = np.stack([right - middle, down - middle], axis=-1)[shown] / step
+        magnification.append(np.linalg.svd(jacobian, compute_uv=False))
+    every = np.concatenate(magnification)
+    largest = float(every[:, 0].max() / np.median(every[:, 0]))
+    return largest > _MAX_MAGNIFICATION or float(np.median(every[:, 0] / every[:, 1])) > _MAX_ASPECT

@@ -1,0 +1,87 @@
+"""Breaks along seams: content that is shifted, and objects that are cut; not what a seam goes around."""
+
+import numpy as np
+import pytest
+
+from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.compositing.seam_quality import SeamQuality, SeamTile, measure_seams
+from rdstitch.synthetic.textures import ground
+
+SIZE = (400, 300)
+SCENE = ground((600, 500), seed=3, channels=1).region(0, 0, 600, 500)[..., 0].astype(np.float32)
+SCENE *= np.float32(255.0 / SCENE.max())
+
+
+def _tile(pixels: Float32Array, box: Box) -> SeamTile:
+    return SeamTile(box, np.ascontiguousarray(pixels), np.ones(pixels.shape, dtype=np.bool_))
+
+
+def _quality(second: Float32Array, *, label_size: float = 1.0, unit: float = 1.0) -> SeamQuality:
+    """Two images on 400 x 300 pixels, the first on the left of x = 200."""
+    first = _tile(SCENE[: SIZE[1], : SIZE[0]], (0, 0, *SIZE))
+    columns, rows = (round(n / label_size) for n in SIZE)
+    labels = np.zeros((rows, columns), dtype=np.int32)
+    labels[:, columns // 2 :] = 1
+    return measure_seams([first, _tile(second, (0, 0, *SIZE))], labels, label_size, unit)
+
+
+def _shifted(right: int, down: int, within: tuple[int, int] = (0, SIZE[1])) -> Float32Array:
+    """The scene, whose rows within a range are shifted."""
+    pixels = SCENE[: SIZE[1], : SIZE[0]].copy()
+    top, bottom = within
+    pixels[top:bottom] = np.roll(SCENE, (down, right), (0, 1))[top:bottom, : SIZE[0]]
+    return pixels
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.8])
+def test_seams_of_images_that_fit_hold_whatever_their_brightness(gain: float) -> None:
+    quality = _quality(gain * _shifted(0, 0) + 10.0)
+    assert len(quality.places) > 25
+    assert not quality.broken.any()
+    assert not quality.seen
+
+
+@pytest.mark.parametrize("label_size", [1.0, 2.0, 2.5])
+def test_content_that_is_shifted_at_a_seam_is_a_break_with_its_place_and_size(label_size: float) -> None:
+    quality = _quality(_shifted(3, 8, (100, 200)), label_size=label_size, unit=4.0)
+    longest = quality.breaks[0]
+    assert longest.images == (0, 1)
+    np.testing.assert_allclose(longest.position, (800.0, 600.0), atol=100.0)
+    assert 4.0 * 70.0 < longest.length < 4.0 * 130.0
+    assert longest.size == pytest.approx(4.0 * np.hypot(3, 8), abs=4.0)
+    assert quality.seen
+    assert not quality.broken[np.abs(quality.places[:, 1] - 600.0) > 4.0 * 70.0].any()
+
+
+def test_what_a_seam_goes_around_is_no_break() -> None:
+    """Something moved ten pixels beside it."""
+    pixels = _shifted(0, 0)
+    pixels[100:200, 212:300] = _shifted(40, 60)[100:200, 212:300]
+    assert not _quality(pixels).broken.any()
+
+
+def test_an_object_that_is_cut_in_half_is_a_break() -> None:
+    """The second image has it; there the first one is empty."""
+    scene: Float32Array = np.full((SIZE[1], SIZE[0]), 120.0, dtype=np.float32)
+    first, second = scene.copy(), scene.copy()
+    second[100:200, 150:250] = np.where(np.indices((100, 100)).sum(axis=0) % 40 < 20, np.float32(40), np.float32(220))
+    labels = np.repeat((np.arange(SIZE[0]) >= 200).astype(np.int32)[None], SIZE[1], axis=0)
+    quality = measure_seams([_tile(image, (0, 0, *SIZE)) for image in (first, second)], labels, 1.0, 1.0)
+    assert quality.seen
+    assert all(90.0 < y < 210.0 for _, y in quality.places[quality.broken])
+
+
+def test_what_is_left_of_a_crop_is_counted_from_its_corner() -> None:
+    quality = _quality(_shifted(3, 8, (100, 200)))
+    part = quality.cropped((150, 80, 300, 300))
+    x, y = quality.breaks[0].position
+    assert part.breaks[0].position == (x - 150, y - 80)
+    assert len(part.places) == int((quality.places[:, 1] >= 80).sum())
+    assert quality.cropped((0, 0, 100, 300)).breaks == ()
+
+
+def test_nothing_is_said_of_images_without_texture_or_without_neighbours() -> None:
+    flat: Float32Array = np.zeros((SIZE[1], SIZE[0]), dtype=np.float32)
+    labels = np.repeat((np.arange(SIZE[0]) >= 200).astype(np.int32)[None], SIZE[1], axis=0)
+    assert not len(measure_seams([_tile(flat, (0, 0, *SIZE))] * 2, labels, 1.0, 1.0).places)
+    assert not measure_seams([_tile(flat, (0, 0, *SIZE)), None], labels, 1.0, 1.0).seen

@@ -1,0 +1,125 @@
+"""Tiles as microscopes' programs write them, made here by tifffile."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from rdstitch.errors import ArgumentError
+from rdstitch.inputs.frame import Frame
+from rdstitch.io.stored_tiles import stored_tiles
+from rdstitch.stage.tile_frames import tile_frames, with_position_folders
+
+SHAPE = (12, 16)
+
+
+def _planes(*counts: int) -> NDArray[np.uint16]:
+    """Planes that are told apart by their value."""
+    numbers = np.arange(int(np.prod(counts)), dtype=np.uint16).reshape(*counts, 1, 1)
+    return np.broadcast_to(numbers, (*counts, *SHAPE)).copy()
+
+
+def test_planes_of_a_hyperstack_are_found_by_channel_z_and_time(tmp_path: Path) -> None:
+    file = tmp_path / "a.tif"
+    tifffile.imwrite(
+        file, _planes(2, 3, 4), imagej=True, metadata={"axes": "TZCYX", "unit": "um"}, resolution=(2.0, 2.0)
+    )
+    (tile,) = stored_tiles([file])
+    assert (tile.counts, tile.pixel_size) == ((4, 3, 2), 0.5)
+    np.testing.assert_array_equal(tile.read(1, 1)[0][0, 0], [16, 17, 18, 19])
+    np.testing.assert_array_equal(tile.read("max", 0)[0][0, 0], [8, 9, 10, 11])
+
+
+@pytest.mark.parametrize(("z", "time"), [(3, None), (None, 2)])
+def test_planes_that_are_not_there_are_refused_by_name(tmp_path: Path, z: int | None, time: int | None) -> None:
+    file = tmp_path / "a.tif"
+    tifffile.imwrite(file, _planes(2, 3), imagej=True, metadata={"axes": "TZYX"})
+    with pytest.raises(ArgumentError, match=r"a\.tif: has \d"):
+        tile_frames([Frame(file)], z, time)
+    frames, _, notes = tile_frames([Frame(file)], None, None)
+    assert [frame.path for frame in frames] == [file]
+    assert [message.text.partition(":")[0] for message in notes] == ["files hold 3 z planes", "files hold 2 times"]
+
+
+def _ome(images: str, uuid: str = "urn:uuid:1") -> str:
+    return f'<OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06" UUID="{uuid}">{images}</OME>'
+
+
+def _image(number: int, data: str, label: str = "") -> str:
+    plane = f'<Plane TheC="0" TheZ="0" TheT="0" PositionX="{number}" PositionY="7" PositionXUnit="mm"/>'
+    return (
+        f'<Image ID="Image:{number}"><Pixels ID="Pixels:{number}" DimensionOrder="XYZCT" Type="uint16" SizeX="16" '
+        f'SizeY="12" SizeZ="1" SizeC="2" SizeT="1" PhysicalSizeX="0.5"><Channel ID="C:0" Name="DAPI"/>'
+        f'<Channel ID="C:1" Name="GFP"/>{data}{"" if label else plane}</Pixels>{label}</Image>'
+    )
+
+
+def test_of_a_set_each_file_is_the_image_that_names_it(tmp_path: Path) -> None:
+    data = '<TiffData IFD="0" PlaneCount="2"><UUID FileName="{0}.ome.tif">urn:uuid:{0}</UUID></TiffData>'
+    xml = [_ome("".join(_image(k, data.format(k)) for k in range(3)), f"urn:uuid:{n}") for n in range(3)]
+    files = [tmp_path / f"{n}.ome.tif" for n in range(3)]
+    for n, file in enumerate(files):
+        tifffile.imwrite(file, _planes(2) + 10 * n, description=xml[n], metadata=None, photometric="minisblack")
+    files.append(files[2].rename(tmp_path / "renamed.ome.tif"))
+    del files[2]
+    tiles = stored_tiles(files)
+    assert [tile.position for tile in tiles] == [(0.0, 7.0), (1.0, 7.0), (2.0, 7.0)]
+    assert {(tile.unit, tile.pixel_size, tile.channel_names) for tile in tiles} == {(1e3, 0.5, ("DAPI", "GFP"))}
+    assert [tile.read(0, 0)[0][0, 0].tolist() for tile in tiles] == [[0, 1], [10, 11], [20, 21]]
+
+
+def test_series_of_one_file_are_tiles_of_their_own_and_labels_say_where(tmp_path: Path) -> None:
+    file = tmp_path / "all.ome.tif"
+    label = '<StageLabel Name="p" X="{0}" Y="1" XUnit="µm" YUnit="µm"/>'
+    images = (_image(k, f'<TiffData IFD="{2 * k}" PlaneCount="2"/>', label.format(5 * k)) for k in range(2))
+    tifffile.imwrite(
+        file, _planes(4), description=_ome("".join(images)).encode(), metadata=None, photometric="minisblack"
+    )
+    tiles = stored_tiles([file])
+    assert [tile.name.name for tile in tiles] == ["all.ome.tif#0", "all.ome.tif#1"]
+    assert [(tile.position, tile.unit) for tile in tiles] == [((0.0, 1.0), 1.0), ((5.0, 1.0), 1.0)]
+    assert tiles[1].read(0, 0)[0][0, 0].tolist() == [2, 3]
+
+
+def test_micro_manager_says_it_in_a_tag_or_beside_folders(tmp_path: Path) -> None:
+    tag = {"XPositionUm": 3.0, "YPositionUm": 4.0, "PixelSizeUm": 0.65, "Channel": "GFP"}
+    file = tmp_path / "one.tif"
+    text = json.dumps(tag)
+    tifffile.imwrite(file, _planes(1)[0], metadata=None, extratags=[(51123, 2, len(text) + 1, text, True)])
+    (tile,) = stored_tiles([file])
+    assert (tile.position, tile.unit, tile.pixel_size, tile.is_plain) == ((3.0, 4.0), 1.0, 0.65, True)
+    root = tmp_path / "run"
+    for position in range(2):
+        (folder := root / f"1-Pos_{position:03d}").mkdir(parents=True)
+        entries = {}
+        for channel in range(2):
+            name = f"img_channel{channel:03d}_z000.tif"
+            tifffile.imwrite(folder / name, _planes(4)[2 * position + channel])
+            about = {
+                "FileName": name,
+                "ChannelIndex": channel,
+                "SliceIndex": 0,
+                "FrameIndex": 0,
+                "Channel": f"c{channel}",
+            }
+            entries[f"Metadata-Default/{name}"] = {**about, **tag, "XPositionUm": 10.0 * position}
+        (folder / "metadata.txt").write_text(json.dumps(entries), encoding="utf-8")
+    folders = with_position_folders([root])
+    assert [Path(str(folder)).name for folder in folders] == ["1-Pos_000", "1-Pos_001"]
+    tiles = stored_tiles(sorted(root.glob("*/*.tif")))
+    assert [(tile.name.name, tile.position) for tile in tiles] == [
+        ("1-Pos_000", (0.0, 4.0)),
+        ("1-Pos_001", (10.0, 4.0)),
+    ]
+    assert tiles[1].read(0, 0)[0][0, 0].tolist() == [2, 3]
+
+
+def test_an_overview_beside_an_image_is_no_plane(tmp_path: Path) -> None:
+    file = tmp_path / "pyramid.tif"
+    with tifffile.TiffWriter(file) as tiff:
+        tiff.write(_planes(1)[0], metadata=None, photometric="minisblack")
+        tiff.write(_planes(1)[0, ::2, ::2], subfiletype=1, metadata=None)
+    assert stored_tiles([file])[0].is_plain

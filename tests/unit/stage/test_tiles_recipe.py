@@ -1,0 +1,118 @@
+"""``rdstitch.tiles`` on arrays and on files that are not all alike."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+import rdstitch
+from rdstitch.errors import InputError
+from tests.stage_grid import StageGrid
+
+STAGE = StageGrid(rows=2, columns=3, tile=256, overlap=0.2, content=0.9, backlash=2.0, seed=5)
+TILES = np.stack([STAGE.render(index) for index in range(6)])
+
+
+def _errors(result: rdstitch.StitchResult, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+    assert result.registration.tiles is not None
+    off = result.registration.tiles.adjustment.places - wanted
+    return np.asarray(np.linalg.norm(off - np.median(off, axis=0), axis=1))
+
+
+class _Lazy:
+    """An array of another library: it has a shape and a type, and is read when it is wanted."""
+
+    def __init__(self, array: NDArray[np.uint16]) -> None:
+        self.array, self.shape, self.dtype, self.reads = array, array.shape, array.dtype, 0
+
+    def __array__(self, dtype: object = None, copy: object = None) -> NDArray[np.uint16]:
+        self.reads += 1
+        return self.array
+
+
+def test_arrays_of_any_library_with_positions() -> None:
+    result = rdstitch.tiles(TILES, positions=STAGE.nominal, pixel_size=0.5)
+    assert _errors(result, STAGE.places).max() < 0.5
+    lazy = [_Lazy(np.stack([tile, tile // 2])) for tile in TILES]
+    table = {"x_um": STAGE.nominal[:, 0] / 2, "y_um": STAGE.nominal[:, 1] / 2}
+    again = rdstitch.tiles(lazy, positions=table, pixel_size=0.5, channel=0)
+    assert _errors(again, STAGE.places).max() < 0.5
+    assert again.image.shape == (*result.image.shape[:2], 2)
+    np.testing.assert_array_equal(again.image[..., 0], result.image.reshape(result.image.shape[:2]))
+    assert min(item.reads for item in lazy) > 0
+
+
+def _write(folder: Path) -> list[Path]:
+    return STAGE.write(folder)
+
+
+def test_a_truncated_tile_and_a_coloured_one_are_left_out_by_name(tmp_path: Path) -> None:
+    files = _write(tmp_path)
+    tifffile.imwrite(files[2], np.repeat(TILES[2][..., None], 3, axis=2), photometric="rgb")
+    files[5].write_bytes(files[5].read_bytes()[:60_000])
+    result = rdstitch.tiles(tmp_path, grid="r{row}c{col}", overlap=20.0)
+    assert sorted(Path(message.images[0]).name for message in result.registration.left_out) == [
+        "r00c02.tif",
+        "r01c02.tif",
+    ]
+    assert _errors(result, STAGE.places[[0, 1, 3, 4]]).max() < 0.5
+    with pytest.raises(InputError, match="r0"):
+        rdstitch.tiles(tmp_path, grid="r{row}c{col}", overlap=20.0, strict=True)
+
+
+def test_tiles_of_several_sizes_lie_where_they_are(tmp_path: Path) -> None:
+    files = _write(tmp_path)
+    tifffile.imwrite(files[4], TILES[4][:230, :250])
+    result = rdstitch.tiles(tmp_path, positions=tmp_path / "positions.csv")
+    assert _errors(result, STAGE.places).max() < 0.5
+    assert result.registration.tiles is not None
+    assert result.registration.tiles.linked.all()
+    mosaic = result.image.reshape(result.image.shape[:2])
+    places = result.registration.tiles.adjustment.places
+    x, y = np.rint(places[4] - places.min(axis=0)).astype(int) + 80
+    near = [mosaic[y + v : y + v + 60, x + u : x + u + 60] for v in (-1, 0, 1) for u in (-1, 0, 1)]
+    assert any(np.array_equal(part, TILES[4][80:140, 80:140]) for part in near)
+
+
+def test_another_channel_keeps_the_frame_whatever_tiles_it_lacks(tmp_path: Path) -> None:
+    files = _write(tmp_path / "a")
+    rdstitch.tiles(tmp_path / "a", tmp_path / "a.ome.tif", grid="r{row}c{col}", overlap=20.0, pixel_size=0.65)
+    (tmp_path / "b").mkdir()
+    for file in files[1:]:
+        tifffile.imwrite(tmp_path / "b" / file.name, tifffile.imread(file) // 2)
+    rdstitch.apply(tmp_path / "a.ome.tif.json", tmp_path / "b", tmp_path / "b.ome.tif")
+    with tifffile.TiffFile(tmp_path / "a.ome.tif") as one, tifffile.TiffFile(tmp_path / "b.ome.tif") as two:
+        first, second = one.asarray(), two.asarray()
+        assert 'PhysicalSizeX="0.65"' in str(two.ome_metadata)
+    assert first.shape == second.shape
+    # Where the tile is missing its neighbours reach farther.
+    same = second[second > 0] == first[second > 0] // 2
+    assert 0.9 < same.mean() < 1.0
+
+
+def test_all_channels_go_into_one_ome_zarr(tmp_path: Path) -> None:
+    zarr = pytest.importorskip("zarr")
+    folder = tmp_path / "tiles"
+    folder.mkdir()
+    for index, tile in enumerate(TILES):
+        metadata = {
+            "axes": "CYX",
+            "Channel": {"Name": ["DAPI", "GFP"]},
+            "PhysicalSizeX": 0.5,
+            "PhysicalSizeXUnit": "µm",
+        }
+        metadata["Plane"] = {f"Position{axis}": [STAGE.nominal[index, k] / 2] * 2 for k, axis in enumerate("XY")}
+        tifffile.imwrite(folder / f"{index}.ome.tif", np.stack([tile, tile // 2]), metadata=metadata)
+    output = tmp_path / "all.ome.zarr"
+    rdstitch.tiles(folder, output, channel=0)
+    group = zarr.open_group(output, mode="r")
+    about = dict(group.attrs)
+    assert [channel["label"] for channel in about["omero"]["channels"]] == ["DAPI", "GFP"]
+    assert about["multiscales"][0]["datasets"][0]["coordinateTransformations"][0]["scale"] == [1.0, 0.5, 0.5]
+    image = group["0"][:]
+    np.testing.assert_array_equal(image[1], image[0] // 2)
+    rdstitch.tiles(folder, tmp_path / "all.ome.tif", channel=0)
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "all.ome.tif"), image)
+    rdstitch.tiles(folder, output, channel=0, overwrite=True)
