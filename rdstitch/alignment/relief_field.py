@@ -146,22 +146,23 @@ class ReliefField:
 
     response: LinearResponse
 
-    def covariance(self) -> FloatArray:
-        """Covariance (S, S) of the shared parameters by relief.
+    def steps(self) -> tuple[FloatArray, FloatArray]:
+        """Steps of the free pose parameters (F, K) and the shared ones (S, K) by relief; ``x x'`` is its covariance.
 
         By relief of the heights at which it leaves the agreement of errors that was found, at every distance, beyond
         that of independent errors. These agree less than not at all, since the parameters absorb what they have in
         common.
         """
-        count = len(self.response.normal.gradient_shared)
+        normal = self.response.normal
         agreement, std = self._agreement()
         if not len(agreement) or agreement[0] <= 0.0:
-            return np.zeros((count, count))
+            return np.zeros((len(normal.gradient_poses), 0)), np.zeros((len(normal.gradient_shared), 0))
         step = _WAVES // _BANDS
         answers = [self._answers(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
-        power = _spectrum(np.stack([left for left, _ in answers], axis=1), agreement, std)
-        covariance: FloatArray = np.einsum("b,bst->st", power, np.stack([moved for _, moved in answers]))
-        return covariance
+        power = _spectrum(np.stack([left for left, *_ in answers], axis=1), agreement, std)
+        scale = np.repeat(np.sqrt(power / (2 * step)), 2 * step)
+        poses, shared = (np.concatenate([answer[k] for answer in answers], axis=1) for k in (1, 2))
+        return poses * scale, shared * scale
 
     def _agreement(self) -> tuple[FloatArray, FloatArray]:
         """Mean products (D,) of the errors at each distance, px², beyond what the absorption of independent errors
@@ -183,9 +184,9 @@ class ReliefField:
             agreement[k], std[k] = mean - independent[k], np.sqrt((by_link**2).sum()) / len(first)
         return agreement, std
 
-    def _answers(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray]:
-        """Agreement (D,) at each distance, px², that fields leave, and products (S, S) of the steps of the shared
-        parameters, both in the mean over the fields.
+    def _answers(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Agreement (D,) at each distance, px², that fields leave in the mean, and the steps that answer each (F, C)
+        and (S, C).
         """
         poses, shared = self.response.steps_of(fields, columns)
         agreement = np.zeros(len(self._pairs))
@@ -195,7 +196,7 @@ class ReliefField:
                 chosen = slice(*np.searchsorted(first, [part.rows.start, part.rows.stop]).tolist())
                 a, b = (left[rows[chosen] - part.rows.start] for rows in (first, second))
                 agreement[k] += float(np.einsum("mic,mic->", a, b)) / (len(first) * columns)
-        return agreement, shared @ shared.T / columns
+        return agreement, poses, shared
 
     def _waves(self, start: int, count: int) -> Fields:
         """Sines and cosines of some of the waves, from the ``start``-th."""

@@ -62,7 +62,8 @@ def sandwich_covariances(
     errors = 2 * int((response.weight > 0.0).sum())
     absorbed = errors / max(errors - count, 0.25 * errors)
     noise = absorbed * _by_keypoints(observations, influence)
-    correlated = _at_least(priors + noise + _by_relief(adjuster, adjusted), by_images)
+    by_relief = _relief(adjuster, adjusted).steps()[1]
+    correlated = _at_least(priors + noise + by_relief @ by_relief.T, by_images)
     information = response.normal.shared_information()
     independent = replace(adjuster, overdispersion=1.0).normal_equations(adjusted).shared_information()
     derivative = adjuster.named_parameters(adjusted.parameters.shared)[1]
@@ -76,15 +77,15 @@ def sandwich_covariances(
     return result
 
 
-def _by_relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> FloatArray:
-    """Covariance (S, S) of the shared parameters by relief, of as many matches of each link as show its waves."""
+def _relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> ReliefField:
+    """What relief does, by as many matches of each link as show its waves."""
     observations = adjuster.observations
     few = observations.thinned(max(_ENOUGH // max(len(observations), 1), _MIN_MATCHES_PER_LINK))
     share = len(few.points1) / max(len(observations.points1), 1)
     if share < 1.0:  # each counts for several beside the priors
         adjuster = replace(adjuster, observations=few, overdispersion=adjuster.overdispersion * share)
         adjusted = replace(adjusted, adjuster=adjuster)
-    return ReliefField(LinearResponse.of(adjuster, adjusted)).covariance()
+    return ReliefField(LinearResponse.of(adjuster, adjusted))
 
 
 def _influence(response: LinearResponse) -> tuple[FloatArray, FloatArray]:
@@ -235,7 +236,12 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
         covariance[:size, :size][np.ix_(rows, across)] = inner
         return covariance
 
-    of_images, with_first = np.empty((2, count, 4, 4))
+    steps_of_poses, steps_of_shared = _relief(adjuster, fit.adjusted).steps()
+    by_relief = np.zeros((count, size + shared, steps_of_shared.shape[1]))
+    by_relief[:, :size][free] = steps_of_poses
+    by_relief[:, size:] = steps_of_shared
+    moved = jacobian @ by_relief
+    of_images, with_first = moved @ moved.transpose(0, 2, 1), moved @ moved[0].T
     step = max(1, _COLUMNS // size)
     for start in range(0, count, step):
         images = range(start, min(start + step, count))
@@ -245,8 +251,8 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
         poses = normal.responses(gradient, np.zeros((shared, len(wanted))))[0]
         columns = {int(k): place for place, k in enumerate(wanted)}
         for k in images:
-            of_images[k] = jacobian[k] @ block(k, k, poses, columns) @ jacobian[k].T
-            with_first[k] = (jacobian[0] @ block(0, k, poses, columns) @ jacobian[k].T).T
+            of_images[k] += jacobian[k] @ block(k, k, poses, columns) @ jacobian[k].T
+            with_first[k] += (jacobian[0] @ block(0, k, poses, columns) @ jacobian[k].T).T
     return of_images, with_first
 
 

@@ -182,9 +182,9 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
     candidates = [(pair, motion, _moved(images, pair, motion)) for pair, motion in first.items()]
     if all(_may_be_a_plane(agreement) for *_, agreement in candidates):
         return None
-    lens = float(np.median([m.distortion for m in first.values() if np.isfinite(m.distortion_std)] or [0.0]))
     rests = {pair: np.flatnonzero(~motion.inliers) for pair, motion in first.items()}
-    second = _strongest_motions(alignment, pairs, rests, lens, threshold)
+    # λ of the first ones may be that of a vehicle, whose image hardly changes.
+    second = _strongest_motions(alignment, pairs, rests, None, threshold)
     candidates += [(pair, motion, _moved(images, pair, motion)) for pair, motion in second.items()]
     fills = [fills_at_most([agreement]) for *_, agreement in candidates]
     best: dict[Pair, RadialHomography] = {}

@@ -6,6 +6,8 @@ from functools import partial
 import numpy as np
 import pytest
 
+import rdstitch
+from examples.benchmarks.consistency import OPTIONS, errors, rendered
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import PlanarPoses
@@ -88,3 +90,11 @@ def test_the_table_has_them_in_its_own_axes_and_units(frame: TrajectoryFrame, si
     np.testing.assert_allclose(table["cov_height_height"], path.covariance[:, 2, 2], rtol=1e-8)
     np.testing.assert_allclose(table["cov_yaw_deg_yaw_deg"], degrees**2 * path.covariance[:, 3, 3], rtol=1e-8)
     np.testing.assert_allclose(table["y"], sign * path.position[:, 1], atol=1e-9)
+
+
+def test_hills_under_a_whole_image_are_in_the_uncertainty_of_its_height() -> None:
+    """Noise alone would put the height 4 standard deviations away."""
+    sequence = rendered("relief", 2)
+    options = replace(OPTIONS, pose_covariance=True)
+    stitched = rdstitch.mosaic([sequence.frame(k) for k in range(len(sequence))], None, options)
+    assert (errors(sequence, stitched.registration.alignment)["pose"] < 3.0).all()

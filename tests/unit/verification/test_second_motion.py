@@ -131,6 +131,22 @@ def test_every_pair_is_moved_as_its_plane_does(monkeypatch: pytest.MonkeyPatch) 
         np.testing.assert_allclose(moved, [[200.0 - STEP, 150.0]], atol=0.5)
 
 
+def test_what_drives_ahead_says_nothing_of_the_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It hardly moves, so that λ = 0 explains it; the plane behind it shows the lens."""
+    lens = Camera(SIZE, distortion=-0.03)
+    pairs = []
+    for first in range(2):
+        pair = _pair(first, first + 1, 60, 90)
+        matched = pair.correspondences
+        matched.points2[:60] = lens.distort(lens.undistort(matched.points1[:60]) - (STEP, 0.0))
+        pairs.append(pair)
+    found = planes_of_pairs(_registration(monkeypatch, _images(0.35, 3), [0, 0, 0], tuple(pairs)), 3.0)
+    assert found is not None
+    for pair in found:
+        assert pair.relation.distortion == pytest.approx(-0.03, abs=0.005)
+        assert pair.relation.inliers[:60].all()
+
+
 def test_a_pair_with_nothing_but_what_drives_ahead_is_no_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     found = planes_of_pairs(_registration(monkeypatch, _images(0.35), [0, 0], (_pair(0, 1, 0, 60),)), 3.0)
     assert not found[0].relation
