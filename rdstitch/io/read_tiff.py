@@ -65,7 +65,7 @@ def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[Pix
         alpha, data = data[..., alphas[0]], np.delete(data, alphas[0], axis=2)
         if page.extrasamples[alphas[0]] == _ASSOCIATED:
             colours = _straight(colours, alpha, full)
-        masks.append(_as_uint8(alpha, full))
+        masks.append(as_opacity(alpha, full))
     samples = _grey_or_rgb(page, kind, colours, full)
     if kind not in _INDIRECT:
         if data.shape[2]:
@@ -124,7 +124,7 @@ def _mask(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> NDArray[np.ui
         same = (other.imagelength, other.imagewidth) == (page.imagelength, page.imagewidth)
         if other.subfiletype == _MASK and same and other.samplesperpixel == 1:
             stored = other.asarray()
-            return _as_uint8(stored, 2**other.bitspersample - 1)
+            return as_opacity(stored, 2**other.bitspersample - 1)
     return None
 
 
@@ -140,8 +140,8 @@ def _lacks_data(page: "tifffile.TiffPage", stored: Pixels) -> NDArray[np.bool_] 
     return np.asarray(equal.all(axis=2) if stored.dtype.kind in "bu" else equal.any(axis=2))
 
 
-def _as_uint8(alpha: Pixels, full: float) -> NDArray[np.uint8]:
-    """Alpha of any sample type as 0..255."""
+def as_opacity(alpha: Pixels, full: float) -> NDArray[np.uint8]:
+    """Alpha of any sample type, which is ``full`` where the image is opaque, as 0..255."""
     if alpha.dtype == np.uint8 and full == _OPAQUE:
         return np.asarray(alpha, dtype=np.uint8)
     share = np.clip(np.nan_to_num(alpha.astype(np.float32) / full), 0.0, 1.0)
