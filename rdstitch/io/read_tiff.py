@@ -56,9 +56,6 @@ def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[Pix
         raise ValueError(f"has {stored.shape[2]} of {count} bands")
     full = 2**bits - 1 if stored.dtype.kind in "bu" else np.iinfo(stored.dtype).max if stored.dtype.kind == "i" else 1.0
     masks = [_mask(tiff, page)]
-    if (empty := _lacks_data(page, stored)) is not None:
-        stored[empty] = 0
-        masks.append(np.where(empty, np.uint8(0), np.uint8(_OPAQUE)))
     colours, data = stored[..., :count], stored[..., count:]
     alphas = [n for n, meaning in enumerate(page.extrasamples) if meaning in (_ASSOCIATED, _UNASSOCIATED)]
     if alphas:
@@ -66,6 +63,9 @@ def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[Pix
         if page.extrasamples[alphas[0]] == _ASSOCIATED:
             colours = _straight(colours, alpha, full)
         masks.append(as_opacity(alpha, full))
+    if (empty := _lacks_data(page, colours, data)) is not None:
+        colours[empty] = data[empty] = 0
+        masks.append(np.where(empty, np.uint8(0), np.uint8(_OPAQUE)))
     samples = _grey_or_rgb(page, kind, colours, full)
     if kind not in _INDIRECT:
         if data.shape[2]:
@@ -128,16 +128,16 @@ def _mask(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> NDArray[np.ui
     return None
 
 
-def _lacks_data(page: "tifffile.TiffPage", stored: Pixels) -> NDArray[np.bool_] | None:
+def _lacks_data(page: "tifffile.TiffPage", *bands: Pixels) -> NDArray[np.bool_] | None:
     """Where a page has GDAL's NODATA; of counts, where all bands have it, since in one it may be part of a colour."""
-    tag = page.tags.get(_NODATA)
+    tag, kind = page.tags.get(_NODATA), bands[0].dtype.kind
     try:
         number = float(str(tag.value).strip("\0 ")) if tag is not None else np.nan
-        nodata = stored.dtype.type(int(number) if stored.dtype.kind in "bui" else number)
+        nodata = bands[0].dtype.type(int(number) if kind in "bui" else number)
     except (ValueError, OverflowError):  # no number, or none that the samples can have
         return None
-    equal = stored == nodata
-    return np.asarray(equal.all(axis=2) if stored.dtype.kind in "bu" else equal.any(axis=2))
+    equal = np.concatenate([part == nodata for part in bands], axis=2)
+    return np.asarray(equal.all(axis=2) if kind in "bu" else equal.any(axis=2))
 
 
 def as_opacity(alpha: Pixels, full: float) -> NDArray[np.uint8]:
