@@ -100,9 +100,7 @@ class Aligner:
         megapixels = options.features.for_images(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
         orientations = tuple(quarter_turn(source.metadata.orientation) for source in sources)
-        layout_matters = purpose in ("pano", "mosaic")
-        decided = alignment_options(sources, options)
-        decided = replace(decided, prefer_turn=purpose == "pano", layout_matters=layout_matters)
+        decided = replace(alignment_options(sources, options), purpose=purpose)
         return cls(paths, cameras, decided, cache, options.threshold, orientations=orientations)
 
     @property
