@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from rdstitch.pipeline.follow import FollowedPoses as FollowedPoses
     from rdstitch.pipeline.follow import Pose as Pose
     from rdstitch.pipeline.follow import Tracker as Tracker
+    from rdstitch.pipeline.output_plan import FilesBeside as FilesBeside
     from rdstitch.pipeline.recipes import calibrate as calibrate
     from rdstitch.pipeline.recipes import mosaic as mosaic
     from rdstitch.pipeline.recipes import mosaic_blocks as mosaic_blocks
@@ -64,6 +65,7 @@ _HOMES = {
         "rdstitch.pipeline.apply_sidecar": "Recomposition apply",
         "rdstitch.pipeline.composer": "Composer",
         "rdstitch.pipeline.follow": "FollowedPoses Pose Tracker",
+        "rdstitch.pipeline.output_plan": "FilesBeside",
         "rdstitch.pipeline.result_files": "write_layers",
         "rdstitch.pipeline.recipes": "calibrate mosaic mosaic_blocks pano trajectory",
         "rdstitch.pipeline.stage_tiles": "place_tiles tiles",

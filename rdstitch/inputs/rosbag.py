@@ -5,20 +5,22 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.camera_files import CameraFile, camera_of_content, load_camera
 from rdstitch.errors import InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.keyframes import Wanted, wanted_frames
 from rdstitch.io.video import write_frame
 from rdstitch.system.file_access import read_beginning
+
+if TYPE_CHECKING:
+    from rdstitch.camera_files import CameraFile
 
 _SUFFIXES = (".bag", ".db3", ".mcap")
 _DESCRIPTION, _KEY, _HEADER = "metadata.yaml", b"rosbag2_bagfile_information", 4096
@@ -91,12 +93,14 @@ def images_in_bag(path: Path, folder: Path, every: int, topic: str | None = None
         yield from _Messages.of(reader, path, topic).frames(folder, Wanted(every))
 
 
-def camera_in_bag(path: Path, topic: str | None = None) -> tuple[CameraFile, str] | None:
+def camera_in_bag(path: Path, topic: str | None = None) -> "tuple[CameraFile, str] | None":
     """The calibration that the bag has for a topic of images, and its own topic; None where it has none.
 
     That is the one beside the images, ``/camera/camera_info`` for ``/camera/image_raw``, or else the only one. Of
     images that are rectified already (``image_rect``) it is that of the rectified camera.
     """
+    from rdstitch.camera_files import camera_of_content
+
     with opened_bag(path) as reader:
         connections = [c for c in reader.connections if c.msgtype == _CAMERA_INFO]
         images = _chosen_topic(path, _image_topics(reader), topic)
@@ -120,6 +124,8 @@ def camera_in_bag(path: Path, topic: str | None = None) -> tuple[CameraFile, str
 
 def camera_in(path: str | Path) -> Camera:
     """The camera of a camera file, or of a bag that has its calibration."""
+    from rdstitch.camera_files import load_camera
+
     if not is_bag(Path(path)):
         return load_camera(path)
     if (found := camera_in_bag(Path(path))) is None:

@@ -1,13 +1,16 @@
 """Colours that are no RGB: CIELAB and inks become sRGB, which is what images without a profile are taken for."""
 
 import io
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageCms
+from PIL import Image
 
 from rdstitch.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from PIL import ImageCms
 
 _ROWS_AT_A_TIME = 128
 _WHITE = np.array([0.9642, 1.0, 0.8249])  # of D50, to which CIELAB in TIFF and in profiles refers
@@ -51,8 +54,10 @@ def _srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> FloatArray:
     return samples
 
 
-def ink_transform(profile: bytes) -> ImageCms.ImageCmsTransform | None:
+def ink_transform(profile: bytes) -> "ImageCms.ImageCmsTransform | None":
     """Give what a colour profile of inks (CMYK) makes of them in sRGB; None where it cannot be used."""
+    from PIL import ImageCms
+
     try:
         return ImageCms.buildTransform(io.BytesIO(profile), ImageCms.createProfile("sRGB"), "CMYK", "RGB")
     except (ImageCms.PyCMSError, ImportError):
@@ -63,7 +68,11 @@ def without_inks(image: Image.Image) -> Image.Image:
     """An image of inks in sRGB, by its colour profile where it has one; any other as it is."""
     profile = image.info.get("icc_profile")
     transform = ink_transform(profile) if image.mode == "CMYK" and isinstance(profile, bytes) else None
-    return image if transform is None else ImageCms.applyTransform(image, transform) or image
+    if transform is None:
+        return image
+    from PIL import ImageCms
+
+    return ImageCms.applyTransform(image, transform) or image
 
 
 def colour_space(profile: bytes) -> bytes:

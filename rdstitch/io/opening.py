@@ -20,20 +20,7 @@ from typing import IO, Any, BinaryIO
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import (
-    BmpImagePlugin,
-    ExifTags,
-    GifImagePlugin,
-    Image,
-    ImageFile,
-    Jpeg2KImagePlugin,
-    JpegImagePlugin,
-    PngImagePlugin,
-    PpmImagePlugin,
-    TgaImagePlugin,
-    UnidentifiedImageError,
-    WebPImagePlugin,
-)
+from PIL import ExifTags, Image, ImageFile, UnidentifiedImageError
 
 from rdstitch.errors import InputError
 from rdstitch.system.file_access import is_url, open_regular, remote_status
@@ -74,16 +61,16 @@ _DAMAGE = (
 TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
-# Pillow opens some forty formats, and starts Ghostscript for one of them, whatever a file is called.
-_FORMATS: dict[bytes, Factory] = {
-    b"\xff\xd8\xff": JpegImagePlugin.jpeg_factory,
-    PNG_MAGIC: PngImagePlugin.PngImageFile,
-    b"RIFF": WebPImagePlugin.WebPImageFile,
-    b"BM": BmpImagePlugin.BmpImageFile,
-    b"GIF8": GifImagePlugin.GifImageFile,
-    b"\xff\x4f\xff\x51": Jpeg2KImagePlugin.Jpeg2KImageFile,
-    b"\0\0\0\x0cjP  \r\n\x87\n": Jpeg2KImagePlugin.Jpeg2KImageFile,
-    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), PpmImagePlugin.PpmImageFile),
+# What reads which format, by its first bytes: Pillow opens some forty, and starts Ghostscript for one, whatever a
+# file is called. Readers are imported when they are needed.
+_FORMATS = {
+    b"\xff\xd8\xff": "PIL.JpegImagePlugin.jpeg_factory",
+    PNG_MAGIC: "PIL.PngImagePlugin.PngImageFile",
+    b"RIFF": "PIL.WebPImagePlugin.WebPImageFile",
+    b"BM": "PIL.BmpImagePlugin.BmpImageFile",
+    b"GIF8": "PIL.GifImagePlugin.GifImageFile",
+    **dict.fromkeys((b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP  \r\n\x87\n"), "PIL.Jpeg2KImagePlugin.Jpeg2KImageFile"),
+    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), "PIL.PpmImagePlugin.PpmImageFile"),
 }
 
 _MAX_MAGIC = max(map(len, _FORMATS))
@@ -200,9 +187,9 @@ def _factory(file: Path, stream: BinaryIO) -> Factory:
     """Give what opens the format of a file, by its first bytes."""
     beginning = stream.read(_MAX_MAGIC)
     stream.seek(0)
-    for magic, factory in _FORMATS.items():
+    for magic, reader in _FORMATS.items():
         if beginning.startswith(magic):
-            return factory
+            return _imported(reader)
     if beginning[4:8] == b"ftyp":
         if beginning[8:12] in (b"avif", b"avis"):
             return _avif_factory(file)
@@ -210,7 +197,7 @@ def _factory(file: Path, stream: BinaryIO) -> Factory:
         heif: Factory = _package("pillow_heif", file).HeifImageFile
         return heif
     if file.suffix.lower() == ".tga":  # has no magic
-        return TgaImagePlugin.TgaImageFile
+        return _imported("PIL.TgaImagePlugin.TgaImageFile")
     raise InputError(f"{file}: not an image in a supported format: {_NAMES}")
 
 
@@ -221,13 +208,18 @@ def _check_reader(path: Path) -> None:
             _package(package, path)
 
 
+def _imported(name: str) -> Factory:
+    module, _, attribute = name.rpartition(".")
+    factory: Factory = getattr(import_module(module), attribute)
+    return factory
+
+
 def _avif_factory(path: Path) -> Factory:
     """Give what opens AVIF: Pillow, since version 11.3."""
     try:
-        factory: Factory = import_module("PIL.AvifImagePlugin").AvifImageFile
+        return _imported("PIL.AvifImagePlugin.AvifImageFile")
     except ImportError:
         raise InputError(f"{path}: AVIF needs Pillow 11.3 or newer; or convert it to JPEG or TIFF") from None
-    return factory
 
 
 def is_raw(path: Path) -> bool:

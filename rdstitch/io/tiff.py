@@ -10,7 +10,7 @@ that part. While an image is being made nobody knows where its parts will lie: c
 import struct
 import tempfile
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -303,7 +303,12 @@ def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip]) -> None:
 
 
 def write_cropped_tiff(
-    path: Path, pixels: NDArray[Any], alpha: NDArray[np.uint8] | None, offset: tuple[int, int], size: tuple[int, int]
+    path: Path,
+    pixels: NDArray[Any],
+    alpha: NDArray[np.uint8] | None,
+    offset: tuple[int, int],
+    size: tuple[int, int],
+    extra_tags: Sequence[ExtraTag] = (),
 ) -> None:
     """Write a part (h, w) or (h, w, C) of a canvas of ``size``, its first pixel at ``offset``; alpha is 0 or 255.
 
@@ -328,7 +333,7 @@ def write_cropped_tiff(
         predictor=samples.dtype.kind == "u",
         resolution=(_DPI, _DPI),
         resolutionunit="inch",
-        extratags=[*positions, *whole],
+        extratags=[*positions, *whole, *extra_tags],
         metadata=None,
         software=False,
     )

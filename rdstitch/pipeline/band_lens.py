@@ -13,7 +13,6 @@ from functools import partial
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
@@ -21,6 +20,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.inputs.source import Source
 from rdstitch.results.messages import Message
+from rdstitch.system.late_imports import optimize
 
 _MAX_IMAGES = 8  # that are compared
 _COARSE_SIDE = 512  # pixels
@@ -165,7 +165,7 @@ def _fit(camera: Camera, shifts: Sequence[_Shifts]) -> BandLens | None:
         off: FloatArray = np.nan_to_num(seen(parameters) - others, nan=1e3).ravel()
         return off
 
-    result = least_squares(residuals, start, loss="cauchy", f_scale=_AGREEING / 3.0, x_scale=0.01, max_nfev=50)
+    result = optimize.least_squares(residuals, start, loss="cauchy", f_scale=_AGREEING / 3.0, x_scale=0.01, max_nfev=50)
     off = np.linalg.norm(residuals(result.x).reshape(-1, 2), axis=1)
     if (off < _AGREEING).mean() < _ENOUGH:
         return None

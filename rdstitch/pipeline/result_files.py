@@ -98,7 +98,10 @@ def write_layers(
         for index, warp in enumerate(prepared.renderer.warps):
             box = canvas if whole else intersection(warp.box, canvas) or canvas
             samples, covered, mask = prepared.renderer.layer(index, box)
-            write = partial(write_cropped_tiff, offset=(box[0] - canvas[0], box[1] - canvas[1]), size=size)
+            offset = box[0] - canvas[0], box[1] - canvas[1]
+            shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
+            tags = () if result.georeference is None else result.georeference.after(shift).tiff_tags()
+            write = partial(write_cropped_tiff, offset=offset, size=size, extra_tags=tags)
             alpha, shown = (np.where(where, np.uint8(255), np.uint8(0)) for where in (covered, mask))
             with outputs.writing(files[2 * index]) as staged:
                 write(staged, samples, alpha)

@@ -5,6 +5,7 @@ import shutil
 from hashlib import sha256
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -213,3 +214,17 @@ def test_a_page_of_an_earlier_run_is_called_older(
     rdstitch(*arguments)
     monkeypatch.setattr("rdstitch.pipeline.compose.viewer_page", lambda *_: 1 // 0)
     assert "the file of this name is older" in rdstitch(*arguments).err
+
+
+def test_layers_lie_where_the_output_does(rdstitch: Run, located: Path, tmp_path: Path) -> None:
+    import rasterio
+
+    rdstitch("mosaic", located / "flight", "-o", tmp_path / "field.tif", "--layers", tmp_path / "layers", *CACHED)
+    with rasterio.open(tmp_path / "field.tif") as output:
+        for layer in (tmp_path / "layers").iterdir():
+            with rasterio.open(layer) as image, Image.open(layer) as file:
+                assert image.crs == output.crs
+                # TIFF's own positions, as enblend reads them.
+                tags = dict(file.getexif())
+                at = [round(float(tags[tag]) * float(tags[282])) for tag in (287, 286)]
+                np.testing.assert_allclose(image.xy(0, 0), output.xy(*at), atol=1e-4)
