@@ -119,6 +119,7 @@ def test_masks_are_found_by_the_names_of_images(tmp_path: Path) -> None:
 
 def test_masks_of_images_of_one_name_are_in_folders_of_their_names(tmp_path: Path) -> None:
     for name in ("left/a.png", "right/a.png", "masks/left/a.png", "masks/a.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         save(tmp_path / name, np.full((30, 40), 255, np.uint8))
     frames = find_images([tmp_path / "left", tmp_path / "right"]).frames
     masked = with_masks(read_sources(frames, skip_bad=False)[0], tmp_path / "masks")
