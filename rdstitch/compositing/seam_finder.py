@@ -1,7 +1,7 @@
 """Seams: which image each pixel of the output comes from, decided on the reduced canvas.
 
 "voronoi": where the borders of two images are equally far, so that each image gives its middle. "graphcut": round
-that line, within a band, along the path on which the two images differ least (Kwatra et al. 2003, with OpenCV's
+that line, within a wide band, along the path on which the two images differ least (Kwatra et al. 2003, with OpenCV's
 cut), so that what moved or stands out of the plane is taken from one of them whole. Images are added one after the
 other, so that memory is that of one label per pixel of the reduced canvas.
 """
@@ -23,8 +23,9 @@ from rdstitch.system.progress import ShareProgress, unheard
 
 NO_OWNER = -1
 
-# Band in which a seam may wander: the new image's share of both border weights.
-_MIN_SHARE, _MAX_SHARE = 0.2, 0.8
+# Band in which a seam may wander: the new image's share of both border weights. Its edges count as such a difference of
+# brightness: where nothing differs, a seam keeps to the middle, and what moves is gone round on either side.
+_MIN_SHARE, _MAX_SHARE, _ASIDE = 0.1, 0.9, 0.04
 _AROUND_FREE = 2
 # What a difference of edges, a pixel, counts beside one of brightness, and the root of the largest cost of a pixel, in
 # that of the length of a seam; OpenCV's cut keeps to what it must separate up to a cost of 10,000.
@@ -163,7 +164,7 @@ def _cut(
     won = surely_new.copy()
     for part in _parts(free) if apart else [_around(free)]:
         masks = [(free | sure)[part].astype(np.uint8) * np.uint8(255) for sure in (surely_old, surely_new)]
-        won[part] |= free[part] & _graph_cut(_visibility(pixels[part], below[part]), masks)
+        won[part] |= free[part] & _graph_cut(_visibility(pixels[part], below[part], share[part]), masks)
     return won
 
 
@@ -187,17 +188,19 @@ def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:
     )
 
 
-def _visibility(first: NDArray[Any], second: NDArray[Any]) -> Float32Array:
+def _visibility(first: NDArray[Any], second: NDArray[Any], share: Float32Array) -> Float32Array:
     """How much a seam shows at each pixel (h, w): the square of what two images differ by in brightness and in edges.
 
-    One broken edge shows more than many small differences.
+    One broken edge shows more than many small differences. ``share`` of both border weights says how far it is from the
+    middle.
     """
     difference = first.astype(np.float32) - second
     # A product is much faster than a mean over a short axis.
     mean = np.full(first.shape[2], 1.0 / (first.shape[2] * full_scale(first.dtype)), dtype=np.float32)
     grey = difference @ mean
     edges = sum(np.abs(cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=_EDGES / 8)) for dx in (1, 0))
-    return np.asarray((_VISIBLE * np.minimum(np.abs(difference) @ mean + edges, 1.0)) ** 2, dtype=np.float32)
+    shown, aside = np.abs(difference) @ mean + edges, _ASIDE * (2.0 * share - 1.0)
+    return np.asarray(_VISIBLE**2 * np.minimum(shown**2 + aside**2, 1.0), dtype=np.float32)
 
 
 def _graph_cut(cost: Float32Array, masks: list[NDArray[np.uint8]]) -> NDArray[np.bool_]:

@@ -117,7 +117,15 @@ def _survey_tile(reader: ImageReader, enlarged: float, index: int, warp: Warp) -
     if not inside.any():
         return None
     pixels = sample(image, geometry, "linear")
-    return SurveyTile(warp.box, pixels.reshape(*inside.shape, -1), inside, opacity, _seen(larger, finer))
+    # An image across the edge of a full turn has the whole width, and most of that is empty.
+    columns = np.flatnonzero(inside.any(axis=0))
+    widest = max(np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1), key=len)
+    part = replace(
+        warp, box=(warp.box[0] + int(widest[0]), warp.box[1], warp.box[0] + int(widest[-1]) + 1, warp.box[3])
+    )
+    return SurveyTile(
+        warp.box, pixels.reshape(*inside.shape, -1), inside, opacity, _seen(larger, part.enlarged(enlarged))
+    )
 
 
 def _seen(image: LoadedImage, warp: Warp) -> SeamTile:

@@ -184,6 +184,28 @@ def test_a_seam_avoids_fine_detail_that_is_off_by_a_pixel() -> None:
     assert (found == off).all(axis=-1)[right].mean() > 0.99
 
 
+@pytest.mark.parametrize("taken_by", [0, 1])
+@pytest.mark.parametrize("x", [150, 210, 240])
+def test_a_seam_goes_round_what_moves(x: int, taken_by: int) -> None:
+    """Somebody, hardly unlike the ground, whom one image shows anywhere in the overlap: seen whole, or not at all."""
+    (width, height), lens, move = SIZE, Camera(SIZE), np.eye(3)
+    move[0, 2] = 120 / lens.scale
+    texture = (255.0 * ground((width + 120, height), x).region(0, 0, width + 120, height)).astype(np.uint8)
+    mask = cv2.ellipse(np.zeros(texture.shape[:2], np.uint8), (x, 105), (28, 60), 0, 0, 360, 1, -1) > 0
+    person = np.clip(0.35 * texture + 0.45 * texture.mean(), 0, 255).astype(np.uint8)
+    frames = [texture[:, :width].copy(), texture[:, 120:].copy()]
+    part = np.s_[:, 120 * taken_by : 120 * taken_by + width]
+    frames[taken_by][mask[part]] = person[part][mask[part]]
+    homographies = np.stack([np.eye(3), move])
+    images = place_images([partial(as_image, frame) for frame in frames], [lens, lens], homographies)
+    options = CompositeOptions(exposure="none", blend="none")
+    found = compose(images, plan_canvas([lens, lens], homographies), options).pixels.astype(int)
+    away, there = (np.abs(found - what).max(axis=2) for what in (texture, person))
+    clear = mask & (np.abs(texture.astype(int) - person).max(axis=2) > 6)
+    shown = float((there < away)[clear].mean())
+    assert min(shown, 1.0 - shown) < 0.02
+
+
 _WIDTH, _HEIGHT, _COUNT = 200, 150, 5
 
 

@@ -1,0 +1,83 @@
+"""Layouts that are chosen by their seams, and what is said of those that break."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rdstitch.compositing import SeamBreak, SeamQuality, plan_canvas
+from rdstitch.geometry.camera import Camera
+from rdstitch.io import write_image
+from rdstitch.pipeline.choose_layout import _is_stretched
+from rdstitch.pipeline.compose import seam_messages
+from rdstitch.pipeline.recipes import mosaic, pano
+from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.synthetic.textures import ground
+
+
+def test_where_a_part_of_the_scene_is_nearer_one_line_says_where_its_lines_break(tmp_path: Path) -> None:
+    light = ground((760, 480), seed=5).region(0, 0, 760, 480)
+    scene = np.rint(light * (255.0 / light.max())).astype(np.uint8)
+    for top in range(340, 470, 30):  # kerbs
+        scene[top : top + 8] = 255 * (top % 60 == 40)
+    near = np.roll(scene, (13, 9), (0, 1))
+    second = np.concatenate([scene[:330], near[330:]])[:, 240:]
+    paths = [tmp_path / name for name in ("a.png", "b.png")]
+    for path, pixels in zip(paths, (scene[:, :520], second), strict=True):
+        write_image(path, pixels)
+    result = pano(paths, options=StitchOptions(local_alignment="off"))
+    assert result.ok
+    (warning,) = [message for message in result.messages if message.severity == "warning"]
+    assert warning.code == "seam-break"
+    longest = result.seams.breaks[0]
+    assert (
+        "a break of {:.0f} pixels at ({:.0f}, {:.0f}), between".format(longest.length, *longest.position)
+        in warning.text
+    )
+    assert (result.seams.places[result.seams.broken, 1] > 300).all()
+
+
+def test_what_a_homography_stretches_is_laid_out_as_a_turn(shared_data: Callable[[str], Path]) -> None:
+    result = mosaic([shared_data("cases/picture_smear_school")])
+    assert result.registration.alignment.model == "rotation"
+    assert not result.seams.seen
+    assert result.registration.alignment.used.all()
+
+
+def _planned(third_row: tuple[float, float]) -> Any:
+    """Two images on a plane; the second is seen obliquely."""
+    camera = Camera((400, 300))
+    oblique = np.eye(3)
+    oblique[2, :2] = third_row
+    images = [SimpleNamespace(camera=camera, homography=matrix) for matrix in (np.eye(3), oblique)]
+    return SimpleNamespace(images=images, canvas=plan_canvas([camera] * 2, [np.eye(3), oblique]))
+
+
+@pytest.mark.parametrize(("tilt", "stretched"), [(0.0, False), (0.4, False), (0.9, True)])
+def test_a_plane_seen_from_the_side_is_stretched(tilt: float, stretched: bool) -> None:
+    assert _is_stretched(_planned((tilt, 0.0))) is stretched
+
+
+def _quality(*breaks: SeamBreak, alike: float = 0.9) -> SeamQuality:
+    return SeamQuality(np.zeros((100, 2)), np.arange(100) < len(breaks), breaks, 8.0, alike)
+
+
+def _break(pair: tuple[int, int], length: float) -> SeamBreak:
+    return SeamBreak(pair, (10.0, 20.0), length, 5.0)
+
+
+def test_a_break_that_a_person_sees_is_one_warning_and_others_a_detail() -> None:
+    paths = ["in/a.jpg", "in/b.jpg", "in/c.jpg"]
+    assert seam_messages(_quality(), paths) == []
+    (detail,) = seam_messages(_quality(_break((0, 1), 44.0)), paths)
+    assert detail.severity == "detail"
+    (warning,) = seam_messages(_quality(_break((1, 2), 46.0), _break((1, 2), 30.0), _break((0, 1), 9.0)), paths)
+    assert warning.severity == "warning"
+    assert warning.images == ("in/b.jpg", "in/c.jpg", "in/a.jpg")
+    assert "a break of 46 pixels at (10, 20), between b.jpg and c.jpg; a break of 9 pixels" in warning.text
+    assert "and 1 more" in warning.text
+    (unlike,) = seam_messages(_quality(alike=0.49), paths)
+    assert (unlike.severity, unlike.code) == ("warning", "rival-motion")
