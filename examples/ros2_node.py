@@ -62,9 +62,7 @@ def odometry(pose: rdstitch.Pose) -> dict[str, Any]:
                 "position": {"x": x, "y": y, "z": z},
                 "orientation": {"x": 0.0, "y": 0.0, "z": math.sin(pose.yaw / 2), "w": math.cos(pose.yaw / 2)},
             },
-            "covariance": [1e6 if i % 7 == 0 else 0.0 for i in range(36)]
-            if covariance is None
-            else covariance.ravel().tolist(),
+            "covariance": covariance.ravel().tolist(),
         },
     }
 
