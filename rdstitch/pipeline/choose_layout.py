@@ -27,6 +27,7 @@ from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.verification.verdict import RefusedError
 
 _MODELS = ("rotation", "pose", "homography")
 """What a camera can have done: turned, moved over a plane, or anything that joins images of a plane."""
@@ -36,6 +37,11 @@ _MAX_MAGNIFICATION, _MAX_ASPECT = 4.0, 2.0
 
 _CLEARLY = 0.5
 """Share of the broken places up to which another layout is clearly better."""
+
+_BY_CHANCE = Message(
+    "the images are no more alike where they were put together than anywhere else; take images that overlap more",
+    severity="failure",
+)
 
 _GRID = np.stack(np.meshgrid(*[[0.02, 0.25, 0.5, 0.75, 0.98]] * 2), axis=-1).reshape(-1, 2)
 
@@ -111,7 +117,9 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
     whole = [one for one in tried if one.clipped <= first.clipped]
     best = min(whole, key=lambda one: (one.faults, one.broken))
     if failed is None and best.faults == first.faults and best.broken > _CLEARLY * first.broken:
-        return first
+        best = first
+    if best.layout.seams.by_chance and not options.force:
+        raise RefusedError(best.registration.with_messages([_BY_CHANCE]))
     return best
 
 

@@ -77,10 +77,6 @@ TEXTS = {
         "the images show a repeated pattern; what is unique in them (dirt, a mark, an object) decided where they lie; "
         "look at the seams, that between {first} and {second} first",
     ),
-    "little alike": (
-        "doubtful-seam",
-        "{both}: only {confirming} of {cells} places look alike; look at the seam between them",
-    ),
     "second motion": (
         "rival-motion",
         "{moving} (something that moved, or a second surface?); a mask keeps it out",
