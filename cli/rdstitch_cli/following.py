@@ -62,12 +62,21 @@ def followed(
     check_outputs([*planned, *(beside or NOTHING_BESIDE).files([])], stitch.overwrite, [source])
     before = file_state(preview) if preview else None
     with TemporaryFolder() as folder:
-        arrivals = Arrivals(str(inputs[0]), frames_folder=lambda: folder, names=sys.stdin, every=every or 1, idle=idle)
+        arrivals = Arrivals(
+            str(inputs[0]),
+            frames_folder=lambda: folder,
+            names=sys.stdin,
+            every=every or 1,
+            idle=idle,
+            topic=stitch.topic,
+        )
         try:
             again = arrivals.comes_again
             frames = follow_frames(arrivals, stitch, poses, comes_again=again, preview=preview, refresh=refresh or 0.0)
             for frame in frames:
                 print_line(frame.as_dict())
+                for message in frame.messages:
+                    reporter.warn(str(message))
         except KeyboardInterrupt:
             reporter.note("interrupted: registering what has arrived; interrupt once more to give up")
         yield arrivals.inputs

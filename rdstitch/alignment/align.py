@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import (
+    Fit,
     Problem,
     homography_apart,
     relations_at,
@@ -189,6 +190,7 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
     noise = noise_of_links(problem.observations, problem.homographies, problem.lens)
     problem = replace(problem, overdispersion=max(noise.overdispersion, choice.overdispersion))
     problem, fit = adjust_over_relief(problem, choice)
+    fit = from_another_start(problem, fit)
     if len(options.lenses) > 1:
         problem, fit = with_third_coefficient(problem, fit)
     problem, fit, disagreement = hold_positions(problem, fit)
@@ -203,6 +205,13 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         covariance=covariance,
         lens_covariance=of_lens,
     )
+
+
+def from_another_start(problem: Problem, fit: Fit) -> Fit:
+    """A fit that converged as it is; another one from where the links lead, where that converges or fits better."""
+    if fit.adjusted.converged:
+        return fit
+    return min((fit, problem.fit(fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
 
 
 def _checked_focal(told: AdjustedImages) -> AdjustedImages:

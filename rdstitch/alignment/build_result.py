@@ -21,6 +21,7 @@ from rdstitch.alignment.select import ModelChoice
 from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.alignment.uncertainty import considered_covariance, pose_covariances
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.choices import Purpose
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane
@@ -44,6 +45,15 @@ _WORTH_SAYING = 1.0
 
 _CONFIDENT = 2.0
 """Standard deviations within which the lens is taken to be known: 95 %."""
+
+
+_SEVERITY_OF_NUMBERS: dict[Purpose, Severity] = {
+    "pano": "detail",
+    "mosaic": "detail",
+    "trajectory": "warning",
+    "calibrate": "failure",
+}
+"""Of what makes λ unknown, by what is wanted."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +187,9 @@ def _with_lens(
     )
     if estimated and result.sees_beyond_horizon:
         raise ImpossibleCameraError(f"with λ = {result.distortion:.3g} the corners would see behind the camera")
-    std = _nearest_distortion_std(result, considered) if adjustment.observable else math.inf
+    lens_free = bool(adjustment.problem.free_lens.any())
+    shown = adjustment.observable and (adjustment.choice.fit.adjusted.converged or not lens_free)
+    std = _nearest_distortion_std(result, considered) if shown else math.inf
     return replace(result, distortion_std=std)
 
 
@@ -279,14 +291,14 @@ def _overruled_focal(adjustment: AdjustedImages, camera: Camera) -> str | None:
 def _warnings(adjustment: AdjustedImages, camera: Camera, considered: FloatArray) -> tuple[Message, ...]:
     """What the user should know of the whole, with the covariance (5, 5) of all parameters of a lens."""
     result: list[Message] = []
-    # An image can be right whatever the lens is.
-    image_only = adjustment.options.layout_matters
+    # An image can be right whatever the lens is, and a path by what is known of the lens.
+    image_only, severity = adjustment.options.layout_matters, _SEVERITY_OF_NUMBERS[adjustment.options.purpose]
     if adjustment.depth or not adjustment.observable:
         cause, remedy = "the images hardly move, or only turn about the optical axis", "images that overlap by less"
         if adjustment.depth:
             cause, remedy = "what the images show has depth, which looks like a lens in so few of them", "more images"
         text = f"λ is not observable: {cause}; give λ, a camera file, or {remedy}"
-        severity: Severity = "detail" if image_only else "failure" if adjustment.depth else "warning"
+        severity = "failure" if adjustment.depth and not image_only else severity
         result.append(Message(text, severity=severity, code="lambda-not-observable"))
     elif len(adjustment.images) < ENOUGH_IMAGES and adjustment.problem.free_lens.any():
         every = replace(camera, lens_covariance=tuple(map(tuple, considered.tolist())))
@@ -300,9 +312,9 @@ def _warnings(adjustment: AdjustedImages, camera: Camera, considered: FloatArray
     if (overruled := _overruled_focal(adjustment, camera)) is not None:
         result.append(Message(overruled))
     if not adjustment.choice.fit.adjusted.converged:
-        text = "the adjustment did not converge; judge the result with care"
+        text = "the adjustment did not converge, from another start neither, so that λ is not known; add images"
         # Of seven on adverse sets two results were off (python -m examples.benchmarks.trust --kind adverse).
-        result.append(Message(text, severity="detail", code="not-converged"))
+        result.append(Message(text, severity=severity, code="not-converged"))
     if adjustment.positions_disagree:
         result.append(Message(adjustment.positions_disagree))
     return tuple(result)

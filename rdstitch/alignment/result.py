@@ -1,8 +1,8 @@
 """What the adjustment gives: the cameras and poses of all images over one plane."""
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Self
 
@@ -228,6 +228,33 @@ class Alignment:
     def with_messages(self, messages: Iterable[Message]) -> Self:
         """The same with more to know about it."""
         return replace(self, messages=(*self.messages, *messages))
+
+    def with_copies(self, copies: Mapping[int, int], pairs: Sequence[tuple[int, int]]) -> Self:
+        """The same with copies, by index, where the images lie that they are copies of.
+
+        The links are between the images of these pairs, one of which may be a copy.
+        """
+        placed = {copy: first for copy, first in copies.items() if self.used[first]}
+        origin = np.arange(len(self.used))
+        origin[list(placed)] = list(placed.values())
+        poses = self.poses
+        if poses is not None:
+            given = {field.name: getattr(poses, field.name) for field in fields(poses)}
+            poses = replace(poses, **{name: part[origin] for name, part in given.items() if part is not None})
+        fits = [replace(fit, image1=i, image2=j) for fit, (i, j) in zip(self.links, pairs, strict=True)]
+        groups = (tuple(k for k in group if k not in copies) for group in self.components)
+        return replace(
+            self,
+            homographies=self.homographies[origin],
+            used=self.used[origin],
+            poses=poses,
+            links=tuple(fits),
+            components=tuple(
+                tuple(sorted({*group, *(copy for copy, first in copies.items() if first in group)}))
+                for group in groups
+                if group
+            ),
+        )
 
     def relation(self, image1: int, image2: int) -> FloatArray:
         """Homography (3, 3) from undistorted normalized coordinates of one image to those of another."""

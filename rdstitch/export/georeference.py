@@ -211,6 +211,7 @@ class Located:
     names: Sequence[str]
     nadirs: Sequence[tuple[float, float, float] | None] = ()  # straight down by each camera's attitude, where known
     control: Sequence[Sequence[GroundControl]] = ()
+    relief: float = 0.0  # pixels of the images that neighbours are off together: hills on what is mapped as a plane
 
 
 def georeference(located: Located, epsg: int | None = None, *, force: bool = False) -> tuple[Georeference | None, str]:
@@ -235,7 +236,9 @@ def _by_positions(located: Located, epsg: int | None, force: bool) -> tuple[Geor
     views = views_of(located.cameras, located.to_output, located.nadirs).of(known)
     std = np.array([(np.nan, np.nan) if place.std is None else place.std for place in places])
     names = [name for name, is_known in zip(located.names, known.tolist(), strict=True) if is_known]
-    return _placed(views, [(p.latitude, p.longitude) for p in places], _altitudes(places), std, names, epsg, force, GPS)
+    return _placed(
+        located, views, [(p.latitude, p.longitude) for p in places], _altitudes(places), std, names, epsg, force, GPS
+    )
 
 
 def _altitudes(places: Sequence[GpsPosition]) -> FloatArray:
@@ -256,11 +259,12 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
         return None, f"{len(control)} {CONTROL} are in the images, and {MIN_POSITIONS} are needed"
     if epsg is None and control[0][0].epsg != WGS84:
         epsg = control[0][0].epsg
-    views = Views.of_ground(np.array([pixel for _, pixel in control]))
+    seen = views_of(located.cameras, located.to_output, located.nadirs)
+    views = replace(Views.of_ground(np.array([pixel for _, pixel in control])), pixel=seen.pixel)
     std = np.array([[np.nan if point.std is None else point.std] * 2 for point, _ in control])
     degrees = [(point.place.latitude, point.place.longitude) for point, _ in control]
     names = [point.name for point, _ in control]
-    place, reason = _placed(views, degrees, np.full(len(names), np.nan), std, names, epsg, force, CONTROL)
+    place, reason = _placed(located, views, degrees, np.full(len(names), np.nan), std, names, epsg, force, CONTROL)
     if place is None or not checks:
         return place, reason
     latitude, longitude = np.array([(p.place.latitude, p.place.longitude) for p, _ in checks]).T
@@ -273,10 +277,11 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
 
 
 def _placed(
+    located: Located,
     views: Views,
     degrees: Sequence[tuple[float, float]],
     altitude: FloatArray,
-    std: FloatArray,
+    accuracy: FloatArray,
     names: Sequence[str],
     epsg: int | None,
     force: bool,
@@ -290,7 +295,7 @@ def _placed(
     usable: BoolArray = np.isfinite(places) & views.usable
     if usable.sum() < MIN_POSITIONS:
         return None, f"{crs.name} does not reach the {source}"
-    fit = fit_map(views.of(usable), places[usable], altitude[usable], std[usable], map_scale)
+    fit = fit_map(views.of(usable), places[usable], altitude[usable], accuracy[usable], map_scale)
     used = np.zeros(len(names), dtype=bool)
     used[usable] = fit.used
     off = np.full(len(names), complex(np.inf))
@@ -308,8 +313,9 @@ def _placed(
             return None, f"{reason}; --georeference force places it nevertheless"
     residuals = tuple(Residual(n, e.real, e.imag, u) for n, e, u in zip(names, off, used.tolist(), strict=True))
     assumption = _assumption(views, fit) if source == GPS else ""
+    std = None if fit.std is None else math.hypot(fit.std, located.relief * views.pixel * abs(fit.scale))
     place = Georeference(
-        crs, fit.scale, fit.origin, rms, source, residuals, fit.std, map_scale=map_scale, assumption=assumption
+        crs, fit.scale, fit.origin, rms, source, residuals, std, map_scale=map_scale, assumption=assumption
     )
     return place, reason
 

@@ -3,8 +3,9 @@
 A position is that of a camera's centre of projection. Where the images have poses, the plane is where they put it under
 the cameras; the fit has seven parameters, those of a similarity in space: four on the map, the height, and the slope
 of the ground, which is level unless altitudes show otherwise. Two more are what images leave open of the cameras: the
-focal length, with which heights and tilts grow, and the tilt that all share. With homographies alone, the camera is
-above the point that its attitude says, else above the centre of its image.
+focal length, with which heights and tilts grow, and the tilt that all share, with which the plane under a flight of one
+heading leans. With homographies alone, the camera is above the point that its attitude says, else above the centre of
+its image.
 
 All is linear in small quantities, and solved by weighted least squares with priors; weights vanish for outliers.
 """
@@ -28,7 +29,7 @@ SLOPE_STD = math.radians(1.0)
 _TILT_STD = math.radians(3.0)  # of a camera that is taken to look straight down, and of an attitude
 _METRIC = 1e-4  # by which the axes of a plane seen from above differ, of their length: rounding
 _ROUNDS = 12
-_SMALLEST = 0.1  # pixels of the output: an error that every position has
+_SMALLEST = 0.1  # pixels of the images: an error that every position has
 _SHOWN = 4.0  # standard deviations from which on the ground is not level
 _SLOPE = slice(5, 7)  # among the parameters
 _MEDIANS = 2.0  # of the residuals: standard deviations and more, whatever the share that is wrong
@@ -48,8 +49,9 @@ class Views:
     height: FloatArray  # (N,): of the camera above the plane, pixels of the output; NaN where not known
     right: ComplexArray  # (N,): direction of the image's x axis, of length one
     known: Literal["poses", "attitudes", "centres", "points"]
+    pixel: float = 1.0  # of the images, in the middle, pixels of the output
     focal_std: float = 0.0  # relative, of the focal length
-    tilt_std: float = 0.0  # of the tilt that all images share, radians
+    tilt_std: float = 0.0  # of the tilt that all images share, by their own axes, radians
 
     @classmethod
     def of_ground(cls, points: ComplexArray) -> "Views":
@@ -75,6 +77,7 @@ def views_of(
     middle = np.array([_in_output(c, h, _middle(c)) for c, h in each])
     beside = np.array([_in_output(c, h, _middle(c) + np.array([1.0, 0.0])) for c, h in each])
     right = (beside - middle) / np.abs(beside - middle)
+    pixel = float(np.median(np.abs(beside - middle)))
     focal = np.array([np.nan if c.focal is None else c.focal for c in cameras])
     if np.isfinite(focal).all() and (centres := _centres(cameras, focal, to_output)) is not None:
         known = cameras[0]
@@ -83,14 +86,14 @@ def views_of(
         rest = np.square(tilt_std) - np.square(np.array(tilt) * known.focal_log_std)
         tilt_alone = math.sqrt(max(float(rest.max()), 0.0))
         foot = centres[:, 0] - 1j * centres[:, 1]
-        return Views(middle, foot, centres[:, 2], right, "poses", known.focal_log_std, tilt_alone)
+        return Views(middle, foot, centres[:, 2], right, "poses", pixel, known.focal_log_std, tilt_alone)
     # A guess where nobody knows the focal length.
     height = np.array([c.with_focal().focal or 0.0 for c in cameras]) * np.abs(beside - middle)
     below = [_below(camera, nadir) for camera, nadir in zip(cameras, nadirs, strict=True)]
     if all(pixel is not None for pixel in below):
         foot = np.array([_in_output(*one, pixel) for one, pixel in zip(each, below, strict=True) if pixel is not None])
-        return Views(middle, foot, height, right, "attitudes", 0.0, _TILT_STD)
-    return Views(middle, middle, height, right, "centres", 0.0, _TILT_STD)
+        return Views(middle, foot, height, right, "attitudes", pixel, 0.0, _TILT_STD)
+    return Views(middle, middle, height, right, "centres", pixel, 0.0, _TILT_STD)
 
 
 def _middle(camera: Camera) -> FloatArray:
@@ -191,7 +194,9 @@ def _fitted(
     if not (abs(scale) > 0.0 and math.isfinite(abs(scale))):
         return None
     weights = np.stack([start.weights, start.weights], axis=1)
-    noise = np.full(2, 1.0 if declared else max(float(np.median(start.residuals)), _SMALLEST * abs(scale)))
+    noise = np.full(
+        2, 1.0 if declared else max(float(np.median(start.residuals)), _SMALLEST * views.pixel * abs(scale))
+    )
     for _ in range(_ROUNDS):
         system = _system(views, places - center, altitude, scale, map_scale, slope_std)
         precision = np.repeat(weights / (std * noise) ** 2, (2, 1), axis=1)  # of east, north, altitude (N, 3)
@@ -205,7 +210,7 @@ def _fitted(
         origin = center + complex(solution[2], solution[3])
         away = np.stack([np.hypot(residual[:, 0], residual[:, 1]), np.abs(residual[:, 2])], axis=1) / std
         # No position is off by less than a part of a pixel.
-        least = 1.0 if declared else _SMALLEST * abs(scale)
+        least = 1.0 if declared else _SMALLEST * views.pixel * abs(scale)
         width = OUTLYING * np.maximum(least, _MEDIANS * np.median(away, axis=0))
         weights = 1.0 / (1.0 + (away / width) ** 2) ** 2
         used = away <= width
@@ -263,7 +268,8 @@ def _system(
     rows, right = np.zeros((count, 3, 10)), np.zeros((count, 3))
     height = abs(scale) * np.nan_to_num(views.height)  # on the map
     base, lever = scale * (views.foot - middle), scale * (views.foot - views.ground)
-    tilted = height * views.right * (scale / abs(scale))
+    leaning = views.right * (scale / abs(scale))
+    tilted = height * leaning
     columns = (base, 1j * base, np.ones(count), np.full(count, 1j), np.zeros(count), height, 1j * height)
     for k, column in enumerate((*columns, 2.0 * lever, tilted, 1j * tilted)):
         rows[:, 0, k], rows[:, 1, k] = column.real, column.imag
@@ -272,8 +278,10 @@ def _system(
     known = _has_altitudes(views, altitude)
     away = places / map_scale
     rise = height / map_scale
-    vertical = np.stack([rise, rise * 0, rise * 0, rise * 0, rise * 0 + 1, -away.real, -away.imag, rise], axis=1)
-    rows[known, 2, :8] = vertical[known]
+    slopes = [-(np.conj(axis) * away).real for axis in (1.0, 1j, leaning, 1j * leaning)]
+    none = np.zeros(count)
+    vertical = np.stack([rise, none, none, none, none + 1.0, *slopes[:2], rise, *slopes[2:]], axis=1)
+    rows[known, 2] = vertical[known]
     right[known, 2] = (altitude - rise)[known]
     held = 1e-9  # standard deviation of what is not a parameter here
     stds = np.array([np.inf] * 4 + [np.inf if known.any() else held] + [max(slope_std, held)] * 2)

@@ -1,9 +1,10 @@
 """Trajectories as files: a table, a drawing, and the formats of the TUM and KITTI benchmarks, which ``evo`` reads.
 
-The plane lies at z = 0; at the first frame x, y and yaw are zero. Two frames of reference, both right-handed:
+The plane lies at z = 0; at the first frame x, y and yaw are zero. Three frames of reference, all right-handed:
 
 ========= ============================================================= ==================
 "enu"     x to the right and y to the top of the first image, z up      the camera above 0
+"ros"     x to the top and y to the left of the first image, z up       the camera above 0
 "camera"  x to the right and y to the bottom of the first image, z down the camera below 0
 ========= ============================================================= ==================
 
@@ -23,10 +24,17 @@ import numpy as np
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 
-TrajectoryFrame = Literal["enu", "camera"]
+TrajectoryFrame = Literal["enu", "camera", "ros"]
 
-_SIGNS: dict[TrajectoryFrame, float] = {"enu": -1.0, "camera": 1.0}
-"""Of y, of z and of the turn about z, with respect to the axes of the first image."""
+_AXES: dict[TrajectoryFrame, FloatArray] = {
+    "enu": np.array([[1.0, 0.0], [0.0, -1.0]]),
+    "camera": np.eye(2),
+    "ros": np.array([[0.0, -1.0], [-1.0, 0.0]]),
+}
+"""x and y by those of the first image, to its right and its bottom."""
+
+_NOT_MEASURED = 1e6
+"""Variance that programs of ROS take for "not measured"."""
 
 _SIDE = 800.0  # pixels of the drawing's longer side
 _MARGIN = 60.0  # pixels
@@ -69,12 +77,39 @@ def path_as_svg(path: Trajectory, unit_name: str = "heights") -> str:
 
 def frame_of(layout: str) -> TrajectoryFrame:
     """The frame of reference of a format where none is asked for: KITTI's axes are the camera's."""
-    return "camera" if layout == "kitti" else "enu"
+    axes: dict[str, TrajectoryFrame] = {"kitti": "camera", "bag": "ros"}
+    return axes.get(layout, "enu")
 
 
 def in_frame(x: float, y: float, frame: TrajectoryFrame) -> tuple[float, float]:
     """Coordinates x and y in a frame of reference, given in the axes of the first image."""
-    return x, _SIGNS[frame] * y + 0.0  # no minus zero
+    there = _AXES[frame] @ (x, y) + 0.0  # no minus zero
+    return float(there[0]), float(there[1])
+
+
+def covariance_in_frame(covariance: FloatArray, frame: TrajectoryFrame) -> FloatArray:
+    """Covariances (..., 4, 4) of x, y, height and yaw in a frame of reference, given in the axes of the first image."""
+    change = np.eye(4)
+    change[:2, :2] = _AXES[frame]
+    return np.asarray(change @ covariance @ change.T)
+
+
+def ros_covariance(covariance: FloatArray, frame: TrajectoryFrame) -> FloatArray:
+    """The same (..., 6, 6) of x, y, z and the turns about these axes, radians, as messages of ROS have it.
+
+    The tilt has been taken out of the poses: of the turns about x and y nothing is said.
+    """
+    known, place = covariance_in_frame(covariance, frame), np.array([0, 1, 2, 5])
+    sign = -_turn(frame)
+    whole = np.zeros((*covariance.shape[:-2], 6, 6))
+    whole[..., place[:, None], place] = known * np.outer([1.0, 1.0, sign, sign], [1.0, 1.0, sign, sign])
+    whole[..., 3, 3] = whole[..., 4, 4] = _NOT_MEASURED
+    return whole
+
+
+def _turn(frame: TrajectoryFrame) -> float:
+    """Sign of z down, and so of a turn about z against the yaw, in a frame of reference."""
+    return float(np.linalg.det(_AXES[frame]))
 
 
 def as_csv(path: Trajectory, frame: TrajectoryFrame) -> str:
@@ -87,8 +122,9 @@ def as_csv(path: Trajectory, frame: TrajectoryFrame) -> str:
     table = csv.writer(text, lineterminator="\n")
     covariances = np.zeros((count, 0))
     if path.covariance is not None:
-        units = np.array([1.0, _SIGNS[frame], 1.0, np.degrees(1.0)])
-        covariances = np.stack([(path.covariance * np.outer(units, units))[:, i, j] for i, j in _PAIRS], axis=1)
+        units = np.array([1.0, 1.0, 1.0, np.degrees(1.0)])
+        there = covariance_in_frame(path.covariance, frame) * np.outer(units, units)
+        covariances = np.stack([there[:, i, j] for i, j in _PAIRS], axis=1)
     table.writerow([*_COLUMNS, *(f"cov_{_POSE[i]}_{_POSE[j]}" for i, j in _PAIRS if covariances.size)])
     poses = (path.position, np.degrees(path.yaw), path.height)
     rows = zip(path.frame, names, numbers, times, *poses, covariances + 0.0, strict=True)
@@ -102,8 +138,8 @@ def as_csv(path: Trajectory, frame: TrajectoryFrame) -> str:
 def as_tum(path: Trajectory, frame: TrajectoryFrame) -> str:
     """Lines ``timestamp tx ty tz qx qy qz qw``; where not every frame has a time, numbers of frames stand for them."""
     times = path.timestamp if path.timestamp is not None and has_times(path) else path.frame
-    half = -_SIGNS[frame] * path.yaw / 2
-    rows = zip(times, _positions(path, frame), np.sin(half), np.cos(half), strict=True)
+    half = -_turn(frame) * path.yaw / 2
+    rows = zip(times, positions_in_frame(path, frame), np.sin(half), np.cos(half), strict=True)
     lines = [f"{time:.6f} {x:.9g} {y:.9g} {z:.9g} 0 0 {qz:.9g} {qw:.9g}" for time, (x, y, z), qz, qw in rows]
     return "\n".join(lines) + "\n"
 
@@ -111,17 +147,16 @@ def as_tum(path: Trajectory, frame: TrajectoryFrame) -> str:
 def as_kitti(path: Trajectory, frame: TrajectoryFrame) -> str:
     """Lines of the 12 numbers of ``[R t]``, row by row; frames that were left out have no line."""
     lines = []
-    for (x, y, z), turn in zip(_positions(path, frame), -_SIGNS[frame] * path.yaw, strict=True):
+    for (x, y, z), turn in zip(positions_in_frame(path, frame), -_turn(frame) * path.yaw, strict=True):
         c, s = np.cos(turn), np.sin(turn)
         pose = (c, -s, 0.0, x, s, c, 0.0, y, 0.0, 0.0, 1.0, z)
         lines.append(" ".join(f"{value:.9g}" for value in pose))
     return "\n".join(lines) + "\n"
 
 
-def _positions(path: Trajectory, frame: TrajectoryFrame) -> FloatArray:
+def positions_in_frame(path: Trajectory, frame: TrajectoryFrame) -> FloatArray:
     """x, y and z of the camera, shape (F, 3)."""
-    sign = _SIGNS[frame]
-    return np.column_stack([path.position * (1.0, sign), -sign * path.height]) + 0.0  # no minus zero
+    return np.column_stack([path.position @ _AXES[frame].T, -_turn(frame) * path.height]) + 0.0  # no minus zero
 
 
 def has_times(path: Trajectory) -> bool:

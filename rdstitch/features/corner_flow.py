@@ -7,22 +7,25 @@ SIFT's matches 0.11.
 
 from collections.abc import Callable
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.features.prepared_image import PreparedImage
 
 _CORNERS, _QUALITY, _SPACING = 200, 0.005, 0.02  # the spacing is in sides of the image
+_TILES = 4, 3  # that corners are spread over: a vehicle's body has the strongest, and one place of a floor another
 _WINDOW, _LEVELS = (15, 15), 3
 _MARGIN = 8.0  # pixels, half a window
 _EXPECTED_LEVELS = 1  # where the expected motion has been taken out
 _NODES = 9  # a side, by which an expected motion is interpolated
 _STILL, _MOVED = 0.5, 3.0  # pixels: what stays in the image, such as a robot's body, and what moves with the ground
 _SEEN_TO_MOVE = 15  # corners that move, where those that do not are none of the ground
+_PLACES, _SURE = 32, 3  # a side, that are told apart, and still corners more than moving ones that make one static
 _MIN_SHARE = 0.3  # of the corners, below which they no longer stand for the keyframe
 
 
@@ -32,6 +35,7 @@ class CornerFlow:
     def __init__(self) -> None:
         self._last: PreparedImage | None = None
         self._from = self._at = np.empty((0, 2))
+        self._votes = np.zeros((_PLACES, _PLACES), dtype=np.intp)  # of still corners over moving ones, by their places
         self.count = 0
 
     def begin(self, frame: PreparedImage, keyframe: FloatArray, corners: FloatArray | None = None) -> None:
@@ -52,15 +56,41 @@ class CornerFlow:
         if len(self._at) < _MIN_SHARE * self.count:
             return None
         moved = np.linalg.norm(self._at - self._from, axis=1)
-        ground = moved > (_STILL if (moved > _MOVED).sum() >= _SEEN_TO_MOVE else -1.0)
+        ground = ~self.is_static(self._at)
+        if (moved > _MOVED).sum() >= _SEEN_TO_MOVE:
+            places = self._places(self._at)
+            np.add.at(self._votes, places, np.where(moved <= _STILL, 1, np.where(moved > _MOVED, -1, 0)))
+            self._votes = np.clip(self._votes, -_SURE, _SURE)
+            ground &= moved > _STILL
         return self._from[ground], self._at[ground]
+
+    def is_static(self, points: FloatArray) -> BoolArray:
+        """Which points (N, 2) lie where corners stayed in the image while others moved: a bumper, a mast, dirt."""
+        if self._last is None or not len(points):
+            return np.zeros(len(points), dtype=np.bool_)
+        return np.asarray(self._votes[self._places(points)] >= _SURE)
+
+    def _places(self, points: FloatArray) -> tuple[IntArray, IntArray]:
+        assert self._last is not None
+        x, y = np.clip(points * _PLACES / self._last.grey.shape[::-1], 0, _PLACES - 1).astype(np.intp).T
+        return y, x
 
 
 def corners_of(frame: PreparedImage) -> FloatArray:
-    """Detect corners (N, 2) clear of the mask, pixels of ``grey``."""
-    detected = cv2.goodFeaturesToTrack(frame.grey, _CORNERS, _QUALITY, _SPACING * max(frame.grey.shape))
-    corners = np.empty((0, 2)) if detected is None else detected[:, 0].astype(np.float64)
-    return corners[_usable(frame, corners)]
+    """Detect corners (N, 2) clear of the mask, pixels of ``grey``, as many in each part of the image."""
+    height, width = frame.grey.shape
+    across, down = (
+        np.linspace(0, side, count + 1).astype(int) for side, count in zip((width, height), _TILES, strict=True)
+    )
+    most, spacing = _CORNERS // (_TILES[0] * _TILES[1]), _SPACING * max(frame.grey.shape)
+    found: list[FloatArray] = [np.empty((0, 2))]
+    for top, bottom in pairwise(down.tolist()):
+        for left, right in pairwise(across.tolist()):
+            corners = cv2.goodFeaturesToTrack(frame.grey[top:bottom, left:right], most, _QUALITY, spacing)
+            if corners is not None:
+                found.append(corners[:, 0].astype(np.float64) + np.array([left, top]))
+    spread = np.concatenate(found)
+    return spread[_usable(frame, spread)]
 
 
 def matched_corners(

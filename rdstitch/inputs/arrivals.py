@@ -13,6 +13,7 @@ import cv2
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import images_in, is_rdstitch_output, natural_key
 from rdstitch.inputs.frame import Frame, Named, array_as_image
+from rdstitch.inputs.rosbag import images_in_bag, is_bag
 from rdstitch.io.video import VIDEO_SUFFIXES, opened_capture, write_frame
 from rdstitch.system.file_access import file_state
 
@@ -25,9 +26,10 @@ _MAX_PENDING = 256  # names that are read ahead
 class Arrivals:
     """Iterates over the frames of one source as they arrive.
 
-    The iteration ends with a video, with the end of a list of names, and after ``idle`` seconds without a new frame;
-    that of a folder or camera goes on until it is interrupted otherwise. The source is a folder, a video, the index of
-    a camera, what else OpenCV opens as a stream ("rtsp://…", "/dev/video0"), or "-" for names, one a line.
+    The iteration ends with a video or ROS bag, with the end of a list of names, and after ``idle`` seconds without a
+    new frame; that of a folder or camera goes on until it is interrupted otherwise. The source is a folder, a video, a
+    bag, the index of a camera, what else OpenCV opens as a stream ("rtsp://…", "/dev/video0"), or "-" for names, one a
+    line.
     """
 
     def __init__(
@@ -38,9 +40,10 @@ class Arrivals:
         names: IO[str] | None = None,
         every: int = 1,
         idle: float | None = None,
+        topic: str | None = None,
     ) -> None:
         self._source, self._names, self._every, self._idle = str(source), names, every, idle
-        self._frames_folder = frames_folder
+        self._frames_folder, self._topic = frames_folder, topic
         self._seen: list[Frame] = []
         self._done: set[Path] = set()
         self._not_whole: dict[Path, tuple[int, int]] = {}  # files, and the state that they were read at
@@ -49,6 +52,8 @@ class Arrivals:
             if names is None:
                 raise ArgumentError("there is no list of names to follow")
             self._kind = "names"
+        elif is_bag(path):
+            self._kind = "bag"
         elif path.is_dir():
             self._kind = "folder"
         elif path.suffix.lower() in VIDEO_SUFFIXES and path.exists():
@@ -64,7 +69,7 @@ class Arrivals:
     @property
     def inputs(self) -> list[Named]:
         """What an ordinary run over all that has arrived takes."""
-        if self._kind in ("folder", "video"):
+        if self._kind in ("folder", "video", "bag"):
             return [self._source]
         return list(self._seen)
 
@@ -85,6 +90,8 @@ class Arrivals:
         """Every frame, once it is complete."""
         if self._kind == "folder":
             return self._of_folder(Path(self._source))
+        if self._kind == "bag":
+            return images_in_bag(Path(self._source), self._frames_folder(), self._every, self._topic)
         return self._of_names() if self._kind == "names" else self._of_capture()
 
     def _of_folder(self, folder: Path) -> Iterator[Frame]:

@@ -1,8 +1,8 @@
 """What was measured of each image besides: tilt, place and time, by the image's metadata or a table."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import tilt_from_normal, turned_tilt
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import by_image, csv_rows, image_name
+from rdstitch.inputs.tables import Row, by_image, csv_rows, image_name
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.results.messages import shortened
 from rdstitch.system.file_access import canonical_name, file_state, read_text
@@ -23,10 +23,11 @@ XMP = "xmp"
 """The value of ``attitude`` that stands for the images' own XMP."""
 
 _NAMES = "name filename file image imagename"
-_TILT_COLUMNS = {"name": _NAMES, "psi": "psi", "theta": "theta"}
+_TIME = "timestamp time stamp"
+_TILT_COLUMNS = {"name": _NAMES, "timestamp": _TIME} | {name: name for name in ("psi", "theta", "qx", "qy", "qz", "qw")}
 _MAX_TILT = math.radians(80.0)  # beyond, hardly an image shows ground, and more likely angles mean something else
 _EARTH = 6_371_000.0  # m
-_TIME_COLUMNS = {"name": _NAMES, "timestamp": "timestamp time"}
+_TIME_COLUMNS = {"name": _NAMES, "timestamp": _TIME}
 
 
 def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list[Source]:
@@ -37,7 +38,8 @@ def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list
     wanted : str, path or None
         The text :data:`XMP`: what drones write into images, see :mod:`rdstitch.io.attitude`; the plane is then taken
         to be level. Or a CSV file with a header that names the columns ``name`` (of the image's file), ``psi`` and
-        ``theta``, degrees; others are ignored.
+        ``theta``, degrees; or ``timestamp``, s, instead of the name, between which is interpolated; or the quaternion
+        ``qx``, ``qy``, ``qz``, ``qw`` of a body of ROS instead of the angles.
     """
     if wanted is None:
         return list(sources)
@@ -69,18 +71,72 @@ def _of_images(sources: Sequence[Source]) -> list[tuple[float, float]]:
 
 
 def _of_table(sources: Sequence[Source], file: str | Path) -> list[tuple[float, float]]:
-    """(ψ, θ), radians, of each source by its line."""
-    rows = csv_rows(read_text(file), str(file), _TILT_COLUMNS, ("name,psi,theta",), ("deg", "degrees"))
-    table: dict[str, tuple[float, float]] = {}
-    for name, row in by_image(rows).items():
-        psi, theta = (math.radians(row.needed(column)) for column in ("psi", "theta"))
+    """(ψ, θ), radians, of each source by its line, or by its time."""
+    table = _read_attitudes(file, file_state(file))
+    return [turned_tilt(table.of(source, file), turning_matrix(source.metadata.orientation)) for source in sources]
+
+
+@dataclass(frozen=True)
+class _AttitudeTable:
+    """Attitudes (ψ, θ), radians, by the names of images, or by time as an IMU measures them at its own rate."""
+
+    named: Mapping[str, tuple[float, float]]
+    times: FloatArray  # (M,), s, ascending; empty where they are by name
+    tilts: FloatArray  # (M, 2)
+
+    def of(self, source: Source, file: str | Path) -> tuple[float, float]:
+        """Of one image; between two times interpolated."""
+        if not len(self.times):
+            if source.name not in self.named:
+                raise InputError(f"{file}: has no line for {source.name}; add one with its psi and theta")
+            return self.named[source.name]
+        time = float(timestamps_of([source])[0])
+        first, last = self.times[[0, -1]].tolist()
+        beyond = float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
+        if math.isnan(time):
+            raise InputError(f"{source.path}: has no time, and {file} has attitudes by time; give --timestamps")
+        if not first - beyond <= time <= last + beyond:
+            raise InputError(
+                f"{file}: has attitudes from {first:.3f} to {last:.3f} s, not for {source.name}, {time:.3f} s"
+            )
+        psi, theta = (float(np.interp(time, self.times, values)) for values in self.tilts.T)
+        return psi, theta
+
+
+@lru_cache(maxsize=1)  # frames that are followed ask one after the other
+def _read_attitudes(file: str | Path, state: tuple[int, int] | None) -> _AttitudeTable:
+    """The table of a file in a state."""
+    wanted = ("name,psi,theta", "timestamp,psi,theta", "timestamp,qx,qy,qz,qw")
+    rows = csv_rows(read_text(file), str(file), _TILT_COLUMNS, wanted, ("deg", "degrees", "s"))
+    by_name = any("name" in row.values for row in rows)
+    tilts = []
+    for row in rows:
+        psi, theta = _tilt_of(row)
         if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
             raise InputError(f"{row.where}: psi and theta must lie between -90 and 90 degrees")
-        table[name] = psi, theta
-    for source in sources:
-        if source.name not in table:
-            raise InputError(f"{file}: has no line for {source.name}; add one with its psi and theta")
-    return [turned_tilt(table[source.name], turning_matrix(source.metadata.orientation)) for source in sources]
+        tilts.append((psi, theta))
+    if by_name:
+        named = dict(zip(by_image(rows), tilts, strict=True))
+        return _AttitudeTable(named, np.empty(0), np.empty((0, 2)))
+    times = np.array([row.needed("timestamp") for row in rows])
+    order = np.argsort(times, kind="stable")
+    return _AttitudeTable({}, times[order], np.array(tilts).reshape(-1, 2)[order])
+
+
+def _tilt_of(row: Row) -> tuple[float, float]:
+    """(ψ, θ), radians, as angles in degrees or as the quaternion of a body of ROS (x ahead, y left, z up).
+
+    The lens of that looks down, and the top of the image is ahead.
+    """
+    if "qw" not in row.values:
+        return math.radians(row.needed("psi")), math.radians(row.needed("theta"))
+    x, y, z, w = (row.needed(name) for name in ("qx", "qy", "qz", "qw"))
+    if not 0.99 < math.hypot(x, y, z, w) < 1.01:
+        raise InputError(f"{row.where}: qx, qy, qz, qw are no unit quaternion")
+    # Down in the body's axes, then in the camera's: right, towards the bottom of the image, ahead of the lens.
+    ahead, left, up = -2.0 * (x * z - w * y), -2.0 * (y * z + w * x), -(1.0 - 2.0 * (x * x + y * y))
+    psi, theta = tilt_from_normal((-left, -ahead, -up)).tolist()
+    return psi, theta
 
 
 def positions_of(sources: Sequence[Source]) -> FloatArray:

@@ -68,6 +68,11 @@ def with_masks(sources: Sequence[Source], masks: str | Path | None) -> list[Sour
     return masked
 
 
+def mask_of(source: Source, folder: str | Path) -> Path | None:
+    """The mask of an image in a folder of them."""
+    return _by_stem(Path(folder)).get(canonical_name(source.path.stem))
+
+
 def _by_stem(folder: Path) -> Mapping[str, Path]:
     """The masks in a folder, by their names before the suffix."""
     try:

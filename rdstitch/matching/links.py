@@ -90,4 +90,5 @@ def in_alternate_directions(links: Sequence[Link]) -> list[Link]:
     is transferred. All in one direction, that adds up: strips over slopes went downhill.
     """
     # The parity of the middle alternates along a sequence, whether neighbours are linked or images farther apart.
-    return [link.reversed() if (link.image1 + link.image2) // 2 % 2 else link for link in links]
+    rank = {image: k for k, image in enumerate(sorted({k for link in links for k in (link.image1, link.image2)}))}
+    return [link.reversed() if (rank[link.image1] + rank[link.image2]) // 2 % 2 else link for link in links]

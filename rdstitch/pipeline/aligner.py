@@ -1,6 +1,6 @@
 """Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Self
@@ -19,11 +19,12 @@ from rdstitch.geometry.exif_orientation import quarter_turn
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
+from rdstitch.matching.copies import copies_of, distinct
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline.working_size import at_working_size
-from rdstitch.results.messages import names_of
+from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.cache import Cache
 from rdstitch.system.file_access import canonical_name
@@ -53,6 +54,8 @@ def impossible_estimates_fail() -> Iterator[None]:
     """An estimated camera that cannot be is a failed registration; a block, or a decorator of a stage."""
     try:
         yield
+    except np.linalg.LinAlgError as error:
+        raise RegistrationError(f"no reliable result: the images determine nothing ({error})") from error
     except ImpossibleCameraError as error:
         raise RegistrationError(
             f"no reliable result: the images agree best on a lens that cannot be ({error}); "
@@ -67,7 +70,7 @@ class AlignedPairs:
     pairs: tuple[PairRegistration, ...]  # every pair that was compared, in the order of the images
     alignment: Alignment
     rough: bool = False  # whether the inliers that it was made from are those over rough ground
-    task: AlignmentTask | None = None  # what the alignment is a draft of; None where it is complete
+    completed: Callable[[], Alignment] | None = None  # what the alignment is a draft of; None where it is complete
 
 
 @dataclass(frozen=True)
@@ -97,9 +100,7 @@ class Aligner:
         megapixels = options.features.for_images(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
         orientations = tuple(quarter_turn(source.metadata.orientation) for source in sources)
-        layout_matters = purpose in ("pano", "mosaic")
-        decided = alignment_options(sources, options)
-        decided = replace(decided, prefer_turn=purpose == "pano", layout_matters=layout_matters)
+        decided = replace(alignment_options(sources, options), purpose=purpose)
         return cls(paths, cameras, decided, cache, options.threshold, orientations=orientations)
 
     @property
@@ -131,10 +132,9 @@ class Aligner:
 
     def completed(self, aligned: AlignedPairs) -> AlignedPairs:
         """The images adjusted to all matches, where their alignment is a draft."""
-        if (task := aligned.task) is None:
+        if aligned.completed is None:
             return aligned
-        alignment = self._recalled("alignment", task, lambda: task.result)
-        return replace(aligned, alignment=alignment, task=None)
+        return replace(aligned, alignment=aligned.completed(), completed=None)
 
     def used(self, aligned: AlignedPairs) -> Sequence[PairRegistration]:
         """The pairs with the inliers that the alignment was made from."""
@@ -156,17 +156,36 @@ class Aligner:
         return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
 
     def _drafted(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
-        related = [pair for pair in pairs if pair.relation]
-        if not related:
+        if not any(pair.relation for pair in pairs):
             raise RegistrationError(_no_overlap(self.paths, pairs))
+        copies = copies_of(pairs)
+        related = distinct(pairs, copies) or distinct(pairs, copies := {})
         most, back = most_matches_read(len(related), self.options), stored(self._turns)
         cameras = tuple(camera.turned(turn) for camera, turn in zip(self.cameras, back, strict=True))
-        links = tuple(turned_link(pair.link().thinned(most), self.cameras, back) for pair in related)
+        named = (replace(pair.link().thinned(most), image1=i, image2=j) for (i, j), pair in related.items())
+        links = tuple(turned_link(link, self.cameras, back) for link in named)
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
-        task = AlignmentTask(cameras, links, self.options)
-        return AlignedPairs(tuple(pairs), self._recalled("draft", task, lambda: task.draft), task=task)
+        reference = self.options.reference
+        options = replace(self.options, reference=None if reference is None else copies.get(reference, reference))
+        task = AlignmentTask(cameras, links, options)
+        ends = [pair.images for pair in related.values()]
+
+        def complete(stage: str, compute: Callable[[], Alignment]) -> Alignment:
+            alignment = self._recalled(stage, task, compute)
+            return self._with_copies(alignment, copies, ends) if copies else alignment
+
+        return AlignedPairs(
+            tuple(pairs),
+            complete("draft", lambda: task.draft),
+            completed=lambda: complete("alignment", lambda: task.result),
+        )
+
+    def _with_copies(self, alignment: Alignment, copies: Mapping[int, int], ends: Sequence[Pair]) -> Alignment:
+        names = shortened(names_of(self.paths[k] for k in sorted(copies)))
+        text = f"counted once, because they show the same as other images at the same pixels: {names}"
+        return alignment.with_copies(copies, ends).with_messages([Message(text, severity="detail", code="copies")])
 
     def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Alignment]) -> Alignment:
         """An alignment of the upright images; from an earlier run where the cache has it."""

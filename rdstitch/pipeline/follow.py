@@ -12,19 +12,24 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.executors import ProcessExecutor
-from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
+from rdstitch.export.trajectory_files import TrajectoryFrame, covariance_in_frame, in_frame, ros_covariance
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.inputs.frame import Frame, Image, as_inputs
-from rdstitch.inputs.measurements import time_of, timestamps_of
-from rdstitch.inputs.selection import is_selected, with_masks
+from rdstitch.inputs.measurements import XMP, time_of, timestamps_of, with_attitudes
+from rdstitch.inputs.selection import is_selected, mask_of, with_masks
 from rdstitch.inputs.source import Source
+from rdstitch.io.opening import check_readable
 from rdstitch.io.write import write_image
 from rdstitch.pipeline.aligner import alignment_options
 from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
+from rdstitch.results.messages import Message
 from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.tracking import CameraPose, Preview, Tracked, TrackingOptions
 from rdstitch.tracking import Tracker as FrameTracker
@@ -43,7 +48,7 @@ class FollowedPoses:
     height : float
         Of the first keyframe above the plane, in the unit that positions shall have.
     frame : str
-        "enu" or "camera", see :mod:`rdstitch.export.trajectory_files`.
+        "enu", "ros" or "camera", see :mod:`rdstitch.export.trajectory_files`.
     """
 
     height: float = 1.0
@@ -52,9 +57,19 @@ class FollowedPoses:
     def fields(self, pose: CameraPose | None) -> dict[str, float | None]:
         """x, y, yaw and height."""
         if pose is None:
-            return dict.fromkeys(("x", "y", "yaw_deg", "height"))
+            return dict.fromkeys(("x", "y", "yaw_deg", "yaw", "height"))
         x, y = in_frame(pose.x * self.height, pose.y * self.height, self.frame)
-        return {"x": x, "y": y, "yaw_deg": math.degrees(pose.yaw), "height": pose.height * self.height}
+        yaw = {"yaw_deg": math.degrees(pose.yaw), "yaw": pose.yaw}
+        return {"x": x, "y": y, **yaw, "height": pose.height * self.height}
+
+    def covariance(self, tracked: Tracked) -> FloatArray | None:
+        """Of x, y, height and yaw (4, 4), in the axes of the first image; with what all lengths share."""
+        if (pose := tracked.pose) is None or tracked.covariance is None:
+            return None
+        place = np.array([pose.x, pose.y, 0.0, 0.0])
+        shared = 0.0 if math.isnan(tracked.length_std) else tracked.length_std
+        unit = np.array([self.height, self.height, self.height, 1.0])
+        return np.asarray((tracked.covariance + shared**2 * np.outer(place, place)) * np.outer(unit, unit))
 
 
 @dataclass(frozen=True)
@@ -74,6 +89,8 @@ class Pose:
         Why there is no place; empty where there is one.
     poses : FollowedPoses
         How the pose is printed.
+    messages : tuple of Message
+        What the user should know, and what this frame has shown.
     """
 
     name: str
@@ -82,6 +99,7 @@ class Pose:
     tracked: Tracked | None
     reason: str = ""
     poses: FollowedPoses = FollowedPoses()
+    messages: tuple[Message, ...] = ()
 
     def __bool__(self) -> bool:
         return self.tracked is not None and self.tracked.pose is not None
@@ -98,15 +116,50 @@ class Pose:
         """Heading, radians, counterclockwise as seen from above; None where there is no place."""
         return None if self.tracked is None or self.tracked.pose is None else self.tracked.pose.yaw
 
+    @property
+    def covariance(self) -> FloatArray | None:
+        """Of x, y, height and yaw, (4, 4), in the frame and unit of the tracker and radians; None where not known.
+
+        Relative to the first keyframe, with the growth of the errors from keyframe to keyframe and the scale that all
+        share.
+        """
+        known = None if self.tracked is None else self.poses.covariance(self.tracked)
+        return None if known is None else covariance_in_frame(known, self.poses.frame)
+
+    @property
+    def ros_covariance(self) -> FloatArray | None:
+        """The same as messages of ROS have it, (6, 6); see :func:`rdstitch.export.trajectory_files.ros_covariance`."""
+        known = None if self.tracked is None else self.poses.covariance(self.tracked)
+        return None if known is None else ros_covariance(known, self.poses.frame)
+
+    @property
+    def map(self) -> int | None:
+        """Number of the map that the pose belongs to: those of different maps have nothing in common."""
+        return None if self.tracked is None else self.tracked.map_number
+
+    @property
+    def quality(self) -> float:
+        """Share of the matches that agree, 0 to 1."""
+        return self.tracked.quality if self.tracked is not None and self else 0.0
+
+    @property
+    def length_std(self) -> float:
+        """Relative standard deviation that all lengths share, by the focal length; NaN where it is not known."""
+        return math.nan if self.tracked is None else self.tracked.length_std
+
     def as_dict(self) -> dict[str, Any]:
         """As a line of JSON takes it; null for what is not known."""
         tracked = self.tracked
         placement = None if tracked is None else tracked.placement
+        covariance = self.ros_covariance
         return {
             "name": self.name,
             "frame": self.number,
             "timestamp": _known(self.timestamp),
             **self.poses.fields(None if tracked is None else tracked.pose),
+            "covariance": None if covariance is None else covariance.ravel().tolist(),
+            "length_std": _known(self.length_std),
+            "quality": self.quality,
             "homography": None if placement is None else placement.homography.tolist(),
             "lambda": None if tracked is None else _known(tracked.distortion),
             "lambda_std": None if tracked is None else _known(tracked.distortion_std),
@@ -116,6 +169,7 @@ class Pose:
             "inliers": 0 if tracked is None else tracked.inliers,
             "revised": tracked is not None and tracked.revised,
             "reason": self.reason,
+            "messages": [str(message) for message in self.messages],
         }
 
 
@@ -152,7 +206,7 @@ def follow(
     Pose
         One a frame; and one more for keyframes that find their place only later.
     """
-    tracker = Tracker(options, poses)
+    tracker = Tracker(options, poses, patient=True)
     sketch = None if preview is None else _Sketch(preview, refresh)
     numbers = count()
     unread: dict[Path, int] = {}  # numbers of frames that come again
@@ -197,16 +251,21 @@ class Tracker:
     >>> tracker = rdstitch.Tracker()
     >>> pose = tracker.add(cv2.imread("left.png"), 0.0)
     >>> bool(pose), pose.position, pose.reason
-    (False, None, 'the first frames wait for others')
+    (False, None, 'first frame')
     """
 
-    def __init__(self, options: StitchOptions | None = None, poses: FollowedPoses | None = None) -> None:
+    def __init__(
+        self, options: StitchOptions | None = None, poses: FollowedPoses | None = None, *, patient: bool = False
+    ) -> None:
         self._options, self._poses = options or StitchOptions(), poses or FollowedPoses()
         self._detection = _live_features(self._options.features)
-        how = TrackingOptions(self._options.estimation, alignment_options([], self._options))
+        for file in (self._options.attitude, self._options.mask):  # before the first frame, not at each
+            if file is not None and file != XMP and not Path(file).is_dir():
+                check_readable(Path(file))
+        how = TrackingOptions(self._options.estimation, alignment_options([], self._options), patient)
         # Of frames that have been made ready.
         features = replace(self._detection, work_megapixels=None, stretch=None, equalize=False)
-        apart = self._options.threads > 1 and bool(sys.executable)
+        apart = (self._options.threads > 1 or not patient) and bool(sys.executable)
         executor = ProcessExecutor(1) if apart else ThreadPoolExecutor(1)
         weakref.finalize(self, executor.shutdown, wait=False, cancel_futures=True)
         matcher = partial(match, ratio=self._options.ratio)
@@ -214,8 +273,14 @@ class Tracker:
         self._labels: dict[int, Pose] = {}  # of the frames that may still find their place
         self._numbers = count()
         self.revised: tuple[Pose, ...] = ()
+        self._told = 0  # messages that poses had
 
-    def add(self, image: Image, timestamp: float | None = None) -> Pose:
+    @property
+    def messages(self) -> tuple[Message, ...]:
+        """What the user should know of all that has come so far."""
+        return tuple(self._frames.messages)
+
+    def add(self, image: Image, timestamp: float | None = None, attitude: tuple[float, float] | None = None) -> Pose:
         """Register the next frame.
 
         Parameters
@@ -224,6 +289,9 @@ class Tracker:
             Arrays are as :func:`rdstitch.mosaic` takes them.
         timestamp : float, optional
             s.
+        attitude : (float, float), optional
+            Tilt (ψ, θ) of this frame, radians, as an IMU has measured it, with ``attitude_std`` of the options; instead
+            of a table of them.
 
         Returns
         -------
@@ -235,11 +303,13 @@ class Tracker:
         (named,) = as_inputs(image, self._options.channel_order)
         frame = replace(named, path=Path(f"image_{number:04d}")) if isinstance(named, Frame) else Frame(Path(named))
         frame = replace(frame, number=number, timestamp=timestamp)
-        *revised, pose = self.register(frame, *self.read(frame))
+        *revised, pose = self.register(frame, *self.read(frame, attitude))
         self.revised = tuple(revised)
         return pose
 
-    def read(self, frame: Frame) -> tuple[Source | None, PreparedImage | None, str]:
+    def read(
+        self, frame: Frame, attitude: tuple[float, float] | None = None
+    ) -> tuple[Source | None, PreparedImage | None, str]:
         """The frame as a source, and as it is tracked; or why it is not."""
         options, features = self._options, self._detection
         if options.timestamps is not None and (time := time_of(frame, options.timestamps)) is not None:
@@ -247,14 +317,20 @@ class Tracker:
         sources, unread = read_frames([frame], options, skip_bad=True)
         if not sources:
             return None, None, unread[0].text
-        common = options.mask is not None and not Path(options.mask).is_dir()
-        source = with_masks(sources, options.mask if common else None)[0]
-        megapixels = features.limits[1]
+        source, megapixels = replace(sources[0], attitude=attitude), features.limits[1]
         try:
+            (source,) = self._measured(source)
             view = source.view(megapixels)
             return source, prepare(view, megapixels, stretch=features.stretch, equalize=bool(features.equalize)), ""
         except InputError as error:
             return source, None, str(error)
+
+    def _measured(self, source: Source) -> list[Source]:
+        """The frame with its mask and attitude; of a folder of masks not every frame needs one."""
+        options = self._options
+        if options.mask is None or not Path(options.mask).is_dir() or mask_of(source, options.mask) is not None:
+            source = with_masks([source], options.mask)[0]
+        return [source] if source.attitude is not None else with_attitudes([source], options.attitude)
 
     def register(self, frame: Frame, source: Source | None, image: PreparedImage | None, reason: str) -> list[Pose]:
         """Register a frame that was read; it comes last, after those before it that only now have found their place."""
@@ -263,16 +339,18 @@ class Tracker:
             return [label]
         label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))
         camera = at_working_size(source.camera, self._detection.limits[1])
-        results = self._frames.add(image, camera)
+        results = self._frames.add(image, camera, source.attitude)
         self._labels[results[-1].number] = label
         poses = [
             replace(
                 self._labels[result.number],
                 tracked=result,
-                reason="" if result.placement is not None else _why(self._frames, result),
+                reason=result.reason,
             )
             for result in results
         ]
+        told, self._told = self._frames.messages[self._told :], len(self._frames.messages)
+        poses[-1] = replace(poses[-1], messages=tuple(told))
         waiting = self._frames.numbers_without_place
         self._labels = {number: known for number, known in self._labels.items() if number in waiting}
         return poses
@@ -315,13 +393,6 @@ def _features(options: FeatureOptions, image: PreparedImage) -> Features:
     """Of a frame, in its pixels."""
     mask = None if image.clearance is None else image.clearance > 0.0
     return detect_view(lambda _: View(image.grey, mask), options)
-
-
-def _why(tracker: FrameTracker, result: Tracked) -> str:
-    """Why a frame has no place."""
-    if result.inliers or not result.number:
-        return "the first frames wait for others" if tracker.waits else "its motion fits no plane yet"
-    return "it begins a new map" if result.keyframe else "no keyframe shows what it shows"
 
 
 def _known(value: float) -> float | None:

@@ -84,6 +84,7 @@ class PlacedImages:
     whole: bool = False  # whether nothing of them can be static: tiles on a stage, whose ground may be black
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
+    relief: float = 0.0  # pixels that neighbours are off together, where the ground is no plane
     # pixels that the output is made on, as of an earlier run: from the plane (3, 3), their size, and their place
     grid: tuple[FloatArray, tuple[int, int], Georeference | None] | None = None
 
@@ -100,6 +101,7 @@ class PlacedImages:
             displacements,
             alignment.on_sphere,
             whole=registration.tiles is not None,
+            relief=alignment.relief.size if alignment.relief.found else 0.0,
         )
 
     @cached_property
@@ -135,6 +137,7 @@ class PlacedImages:
             [source.name for source in self.sources],
             [source.metadata.nadir for source in self.sources],
             [source.control for source in self.sources],
+            self.relief,
         )
 
     def images(self, near: Sequence[NearPart | None]) -> list[PlacedImage]:

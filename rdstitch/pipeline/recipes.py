@@ -355,8 +355,8 @@ def trajectory(
     height : float
         Height of the first frame above the plane, metres; positions are in metres then, and in heights with 1.
     frame : str, optional
-        "enu" or "camera": the axes of the file, see :mod:`rdstitch.export.trajectory_files`. "enu" if not given, but
-        for "kitti", whose axes are the camera's.
+        "enu", "ros" or "camera": the axes of the file, see :mod:`rdstitch.export.trajectory_files`. "enu" if not given,
+        but for "kitti", whose axes are the camera's, and for "bag", whose axes are those of ROS.
 
     Returns
     -------

@@ -14,12 +14,14 @@ from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import CONTRADICTS, Alignment, PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.alignment.unaligned import explain_unaligned
+from rdstitch.choices import Purpose
 from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import RadialHomography, transfer
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import SpanningTree, spanning_tree
+from rdstitch.results.messages import Severity
 from tests.alignment_scenes import Scene, grid, jittered, robot_path, scene
 from tests.sampled import sampled
 
@@ -177,9 +179,13 @@ def test_turning_on_the_spot_says_nothing_of_the_lens() -> None:
     rng = np.random.default_rng(9)
     poses = np.zeros((5, 6))
     poses[:, YAW] = np.linspace(0, 1.5, 5)
-    found = _run(scene(poses, distortion=-0.2, rng=rng))
-    assert math.isinf(found.distortion_std)
-    assert any("not observable" in message.text for message in found.messages)
+    given = scene(poses, distortion=-0.2, rng=rng)
+    # A picture needs no lens, and a path only what is known of it.
+    wanted: dict[Purpose, Severity] = {"mosaic": "detail", "trajectory": "warning", "calibrate": "failure"}
+    for purpose, severity in wanted.items():
+        found = align(given.cameras, given.links, AlignmentOptions(purpose=purpose))
+        assert math.isinf(found.distortion_std)
+        assert {m.severity for m in found.messages if m.code == "lambda-not-observable"} == {severity}
 
 
 def test_hills_are_noticed() -> None:

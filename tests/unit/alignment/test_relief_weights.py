@@ -7,6 +7,7 @@ import pytest
 
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.align import from_another_start
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
@@ -114,3 +115,13 @@ def test_the_error_of_the_reason_is_that_of_the_fit() -> None:
     choice = ModelChoice(fit, "; as requested", 1.0)
     later = replace(choice, fit=replace(fit, adjusted=replace(fit.adjusted, sigma=7.25)))
     assert "7.25 pixels; as requested" in later.reason
+
+
+def test_what_did_not_converge_is_tried_from_another_start() -> None:
+    problem, fit = _fitted(_scene(0.0))
+    astray = replace(fit.adjusted.parameters, shared=SIMILARITY.shared_from_physical(np.array([-1.4, 0.5, 3.0])))
+    lost = replace(fit, adjusted=replace(fit.adjusted, parameters=astray, sigma=25.0, converged=False))
+    found = from_another_start(problem, lost)
+    assert found.adjusted.converged
+    assert found.adjusted.sigma == pytest.approx(fit.adjusted.sigma, rel=0.01)
+    assert from_another_start(problem, fit) is fit

@@ -120,7 +120,7 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
     found = align(*given)
     assert found.distortion == 0.0
     assert [message.severity for message in found.messages if "depth" in message.text] == ["detail"]
-    lens = align(*given, AlignmentOptions(layout_matters=False))
+    lens = align(*given, AlignmentOptions(purpose="calibrate"))
     assert [message.severity for message in lens.messages if "depth" in message.text] == ["failure"]
 
 

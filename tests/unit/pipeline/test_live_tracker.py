@@ -2,14 +2,29 @@
 
 import json
 import math
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import rdstitch
 from examples.odometry import main
-from rdstitch.synthetic import Sequence
+from rdstitch.alignment import AlignmentOptions
+from rdstitch.arrays import FloatArray
+from rdstitch.errors import ImpossibleCameraError, InputError
+from rdstitch.features import detect, match
+from rdstitch.features.prepared_image import View, prepare
+from rdstitch.geometry.camera import Camera
+from rdstitch.robust import EstimationOptions
+from rdstitch.synthetic import Sequence, drive_poses, ground, sequence_over
+from rdstitch.tracking import Tracker as FrameTracker
+from rdstitch.tracking import TrackingOptions
+from rdstitch.tracking import tracker as tracker_module
 from tests.floor_drives import DISTORTION, floor_drive, true_path
 
 HEIGHT = 0.8
@@ -71,3 +86,98 @@ def test_the_example_prints_odometry(drive: Sequence, tmp_path: Path, capsys: py
     assert lines[-1]["pose"]["pose"]["position"]["z"] == pytest.approx(0.8, rel=0.1)
     assert len(lines[-1]["pose"]["covariance"]) == 36
     assert lines[-1]["header"]["frame_id"] == "odom_0"
+
+
+CAMERA = Camera((320, 240), DISTORTION, focal=256.0, focal_source="option")
+TILT = (math.radians(3.0), math.radians(-2.0))
+
+
+def _all_poses(tracker: rdstitch.Tracker, images: Iterable[NDArray[np.uint8]]) -> dict[int, rdstitch.Pose]:
+    """The last pose of each frame."""
+    poses: dict[int, rdstitch.Pose] = {}
+    for image in images:
+        pose = tracker.add(image)
+        poses |= {known.number: known for known in (*tracker.revised, pose)}
+    return poses
+
+
+def _errors(poses: dict[int, rdstitch.Pose], drive: Sequence) -> FloatArray:
+    """How far (N, 2) positions are from the truth, metres, in the axes of the first image."""
+    truth = true_path(drive)
+    turn = np.exp(1j * truth.yaw[0])
+    places = turn * ((truth.position - truth.position[0]) @ [1.0, 1.0j]) * HEIGHT
+    errors = np.array([complex(pose.position[0], -pose.position[1]) - places[k] for k, pose in poses.items() if pose])
+    return np.stack([errors.real, errors.imag], axis=1)
+
+
+def test_with_lens_and_tilt_the_second_frame_has_a_pose_and_errors_are_as_large_as_they_say(drive: Sequence) -> None:
+    tracker = rdstitch.Tracker(rdstitch.StitchOptions(camera=CAMERA, tilt=TILT), rdstitch.FollowedPoses(HEIGHT))
+    first = tracker.add(drive.frame(0))
+    assert (bool(first), first.reason) == (False, "first frame")
+    second = tracker.add(drive.frame(1))
+    assert second
+    assert [pose.number for pose in tracker.revised] == [0]
+    poses = _all_poses(tracker, drive.frames()[2:])
+    assert all(poses.values())
+    assert np.abs(_errors(poses, drive)).max() < 0.01 * HEIGHT
+    for pose in poses.values():
+        assert pose.length_std == pytest.approx(0.01)
+        assert pose.covariance.shape == (4, 4)
+        assert (np.linalg.eigvalsh(pose.covariance)[1:] > 0.0).all()
+        assert pose.ros_covariance[5, 5] == pytest.approx(pose.covariance[3, 3])
+        assert 0.5 < pose.quality <= 1.0
+        assert pose.map == 0
+    spread = [float(np.trace(pose.covariance[:2, :2])) for pose in poses.values()]
+    assert spread[-1] > 2.0 * spread[0]
+
+
+def test_what_stays_in_the_image_is_no_floor(drive: Sequence) -> None:
+    part = np.kron(np.random.default_rng(1).integers(0, 255, (6, 32, 3)), np.ones((10, 10, 1))).astype(np.uint8)
+    tracker = rdstitch.Tracker(rdstitch.StitchOptions(camera=CAMERA), rdstitch.FollowedPoses(HEIGHT))
+    poses = _all_poses(tracker, (np.concatenate([image[:180], part]) for image in drive.frames()))
+    assert all(poses.values())
+    assert np.abs(_errors(poses, drive)).max() < 0.03 * HEIGHT
+
+
+def test_measured_attitudes_are_used(tmp_path: Path) -> None:
+    lens = CAMERA
+    tilts = [(0.06 * math.sin(k), 0.05 * math.cos(2.0 * k)) for k in range(8)]
+    swaying = replace(drive_poses(lens, "line", 8, overlap=0.6), tilt=np.array(tilts))
+    images = sequence_over(partial(ground, seed=1), lens, swaying).frames()
+    options = rdstitch.StitchOptions(camera=CAMERA, tilt=(0.0, 0.0), attitude_std=0.0)
+    tracker = rdstitch.Tracker(options, rdstitch.FollowedPoses(HEIGHT))
+    found = [tracker.add(image, 0.1 * k, attitude=tilts[k]) for k, image in enumerate(images)]
+    times = "".join(f"{0.05 * k},0,0\n" for k in range(3))
+    assert all(found[1:])
+    steps = np.diff([(0.0, 0.0), *(pose.position[:2] for pose in found[1:])], axis=0)
+    assert np.abs(steps - steps.mean(axis=0)).max() < 0.01 * HEIGHT
+    table = tmp_path / "attitude.csv"
+    table.write_text("timestamp,psi,theta\n" + times, encoding="utf-8")
+    late = rdstitch.Tracker(rdstitch.StitchOptions(camera=CAMERA, attitude=table))
+    assert "attitude.csv" in late.add(images[0], 5.0).reason
+    with pytest.raises(InputError, match="no such file"):
+        rdstitch.Tracker(rdstitch.StitchOptions(attitude=tmp_path / "missing.csv"))
+
+
+def test_after_a_jump_it_finds_its_place_in_the_map(drive: Sequence) -> None:
+    tracker = rdstitch.Tracker(rdstitch.StitchOptions(camera=CAMERA, tilt=TILT), rdstitch.FollowedPoses(HEIGHT))
+    images = drive.frames()
+    poses = _all_poses(tracker, [*images, np.full_like(images[0], 120), images[1], images[2]])
+    assert (bool(poses[12]), poses[12].reason) == (False, "no floor texture")
+    for number, shown in ((13, 1), (14, 2)):
+        assert poses[number].map == 0
+        assert np.linalg.norm(np.subtract(poses[number].position, poses[shown].position)) < 0.005 * HEIGHT
+
+
+def test_an_alignment_that_fails_is_survived(drive: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise ImpossibleCameraError("a lens that cannot be")
+
+    monkeypatch.setattr(tracker_module, "align", fails)
+    monkeypatch.setattr(tracker_module, "_ALIGNMENT_DELAY", 1)
+    options = TrackingOptions(EstimationOptions(distortion=DISTORTION), AlignmentOptions(tilt=TILT, lens_known=True))
+    tracker = FrameTracker(options, lambda image: detect(image.grey), match, ThreadPoolExecutor(1))
+    for image in drive.frames():
+        *_, last = tracker.add(prepare(View(image), None), CAMERA)
+    assert last.pose is not None
+    assert "a lens that cannot be" in tracker.messages[0].text
