@@ -111,11 +111,6 @@ def prepare_composite(
     """Everything that is needed to compute the output; see :func:`compose`.
 
     Images are read ahead as long as it lasts, if they are needed here.
-
-    Parameters
-    ----------
-    decisions : Decisions, optional
-        Of the same images, canvas and options; made here if not given.
     """
     task = _Task.of(images, canvas, options)
     decided = decisions or _decided(task, _part_of(progress, 0.0, _PREPARATION))
