@@ -120,7 +120,7 @@ def _message(finding: Finding, paths: Sequence[str]) -> Message:
     images, values = tuple(paths[k] for k in finding.images), dict[str, Any](finding.values)
     names = names_of(images)
     if "pairs" in values:
-        return Message(_outvoted(finding.kind, values["pairs"], paths), images, finding.severity, "doubtful-seam")
+        return Message(_outvoted(finding.kind, values["pairs"], paths), images, finding.severity, code="doubtful-seam")
     if len(names) == 2:
         values |= {"first": names[0], "second": names[1], "both": " and ".join(names)}
     for key in ("images1", "images2", "without"):
