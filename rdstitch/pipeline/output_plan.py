@@ -11,7 +11,7 @@ from rdstitch.pipeline.result_files import (
     PosesFrame,
     layer_files,
     make_folder,
-    poses_table,
+    poses_file,
     project_of_hugin,
     write_layers,
 )
@@ -85,8 +85,8 @@ class FilesBeside:
         if isinstance(result, StitchResult) and result.plan is None:
             how = {"whole": self.whole_layers, "overwrite": result.options.overwrite}
             attempt(self.hugin_project, lambda file: outputs.write(file, text_bytes(project_of_hugin(result))))
-            table = partial(poses_table, result, self.frame, self.height)
-            attempt(self.poses, lambda file: outputs.write(file, text_bytes(table())))
+            table = partial(poses_file, result, frame=self.frame, height=self.height)
+            attempt(self.poses, lambda file: outputs.write(file, text_bytes(table(file))))
             attempt(self.layers, lambda folder: write_layers(result, folder, **how, outputs=outputs))
         return failed
 
