@@ -106,7 +106,9 @@ def test_with_lens_and_tilt_the_second_frame_has_a_pose_and_errors_are_as_large_
     assert [pose.number for pose in tracker.revised] == [0]
     poses = _all_poses(tracker, drive.frames()[2:])
     assert all(poses.values())
-    assert np.abs(_errors(poses, drive)).max() < 0.01 * HEIGHT
+    # Lengths are as good as the focal length, whose standard deviation is 1 %.
+    far = max(float(np.hypot(*pose.position[:2])) for pose in poses.values())
+    assert np.abs(_errors(poses, drive)).max() < 0.005 * HEIGHT + 0.01 * far
     for pose in poses.values():
         assert pose.length_std == pytest.approx(0.01)
         assert pose.covariance.shape == (4, 4)
