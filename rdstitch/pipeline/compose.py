@@ -195,12 +195,14 @@ def _cut_away(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -
 
 def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
     """Where seams are broken, a warning where a person sees it, else a detail; and whether overlaps are unlike."""
-    if seams.contradicted:
+    if seams.contradicted and seams.least_alike is not None:
+        images = tuple(paths[k] for k in seams.least_alike)
         text = (
-            f"only {seams.alike:.0%} of what the images share looks alike: something that fills a part of them (a "
-            "vehicle, the camera's own mount) may be what was put together; a mask keeps it out"
+            f"only {seams.alike:.0%} of what the images share looks alike, the least between "
+            f"{' and '.join(names_of(images))}: something that fills a part of them (a vehicle, a mount) may be what "
+            "was put together; a mask keeps it out"
         )
-        return [Message(text, code="rival-motion")]
+        return [Message(text, images, code="rival-motion")]
     if not seams.breaks:
         return []
     worst = list({one.images: one for one in reversed(seams.breaks)}.values())[::-1][:MAX_NAMED]
