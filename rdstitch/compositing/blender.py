@@ -45,20 +45,12 @@ def rounded(values: Float32Array, constant: np.float32) -> Float32Array:
 
 @dataclass
 class MultibandBlender:
-    """Sums of weighted Laplacian bands on one box.
+    """Sums of weighted Laplacian bands on one box."""
 
-    Parameters
-    ----------
-    box : (int, int, int, int)
-        On the canvas, aligned to the coarsest band.
-    constant : float32
-        From :func:`rounding_constant`.
-    """
-
-    box: Box
+    box: Box  # on the canvas, aligned to the coarsest band
     bands: int
     channels: int
-    constant: np.float32
+    constant: np.float32  # of :func:`rounding_constant`
     _sums: list[Float32Array] = field(default_factory=list)
     _weights: list[Float32Array] = field(default_factory=list)
 

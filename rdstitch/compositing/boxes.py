@@ -67,18 +67,8 @@ def cut(values: NDArray[Any], box: Box, part: Box) -> NDArray[Any]:
 def overlapping_pairs(boxes: Sequence[Box | None], most: int = _MAX_NEIGHBOURS) -> NDArray[np.intp]:
     """Pairs of boxes that have pixels in common, found without looking at every pair.
 
-    Parameters
-    ----------
-    boxes : sequence of Box or None
-        None for an image that is nowhere.
-    most : int
-        Where a box overlaps more others, so many of them: those with which it shares most, and what it takes for all
-        that is connected to stay so (a spanning tree of the largest overlaps).
-
-    Returns
-    -------
-    ndarray of shape (P, 2), int
-        The larger index first, in ascending order.
+    Shape (P, 2), ascending, the larger index first; None is an image that is nowhere. Where a box overlaps more than
+    ``most`` others, those with which it shares most, and a spanning tree of the largest overlaps.
     """
     present = np.array([k for k, box in enumerate(boxes) if box is not None], dtype=np.intp)
     edges = np.array([box for box in boxes if box is not None], dtype=np.intp).reshape(-1, 4)

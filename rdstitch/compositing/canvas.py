@@ -100,15 +100,8 @@ def near_parts(
 ) -> list[NearPart | None]:
     """What of each image is drawn; None for all of it.
 
-    Parameters
-    ----------
-    homographies : sequence of ndarray of shape (3, 3)
-        Normalized undistorted coordinates to the plane, with positive third coordinates in front of the camera.
-    resolution : float
-        Canvas pixels per unit of the plane at which the reference image keeps its size.
-    max_stretch : float
-        How many times coarser than the reference image, or than its own finest part where that is coarser, an image
-        may be.
+    ``homographies`` lead to the plane, with positive third coordinates in front of the camera; at ``resolution`` canvas
+    pixels per unit of it the reference image keeps its size.
     """
     parts: list[NearPart | None] = []
     if max_stretch == np.inf:
@@ -262,21 +255,8 @@ def plan_canvas(
 ) -> Canvas:
     """Plan the smallest upright canvas that holds every image.
 
-    Parameters
-    ----------
-    homographies : array_like of shape (N, 3, 3)
-        ``G`` of each image: normalized undistorted to plane coordinates.
-    scale : float
-        1 keeps, at its centre, the resolution of the reference image, or of the median image without one.
-    rotate : float
-        Degrees that the plane is turned clockwise in the output.
-    reference : int, optional
-        Image whose resolution counts.
-    names : sequence of str, optional
-        What to call the images in messages.
-    max_stretch : float
-        What an image shows so many times coarser than the reference image has no place on the canvas; see
-        :mod:`rdstitch.compositing.canvas`. Without a limit, an image that shows the horizon is refused.
+    At ``scale`` 1 it keeps the resolution that the reference image, or the median one, has at its centre. Without
+    ``max_stretch`` (see :mod:`rdstitch.compositing.canvas`), an image that shows the horizon is refused.
     """
     matrices = np.asarray(homographies, dtype=np.float64)
     called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)

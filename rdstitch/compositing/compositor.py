@@ -62,16 +62,8 @@ def compose(
 ) -> Composite:
     """Put images together on a canvas, in memory.
 
-    Parameters
-    ----------
-    canvas : Canvas
-        From :func:`rdstitch.compositing.plan_canvas` with the same cameras and homographies.
-    progress : callable, optional
-        Called with the share of the work done, 0 to 1.
-    elsewhere : callable, optional
-        Computes the pixels, in blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
-    decisions : Decisions, optional
-        From :func:`rdstitch.compositing.decide` with the same arguments; made here if not given.
+    The canvas is planned, and the ``decisions`` are made, with the same images. ``elsewhere`` computes the pixels in
+    blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
     """
     with prepare_composite(images, canvas, options, progress, elsewhere, decisions) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
@@ -101,19 +93,8 @@ def compose_to_file(
 ) -> FileComposite:
     """Put images together straight into a file, whatever its size: memory is that of a strip of tiles.
 
-    Parameters
-    ----------
-    path : path
-        ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
-        (held in memory whole).
-    images, canvas, options, progress, elsewhere, decisions
-        As for :func:`compose`.
-    metadata : Metadata, optional
-        Colour profile, EXIF and resolution to keep.
-    extra_tags : callable
-        Gives further tags of a TIFF file for the canvas after cropping.
-    outputs : Outputs, optional
-        Where the file is staged, to be published with what belongs to it; without, it replaces what is there.
+    As :func:`compose`. ``extra_tags`` gives further tags of a TIFF file for the canvas after cropping; without
+    ``outputs`` the file replaces what is there.
     """
     with prepare_composite(images, canvas, options, progress, elsewhere, decisions) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size

@@ -199,20 +199,8 @@ _Prior = tuple["sparse.csr_array", FloatArray, int]
 def estimate_exposure(survey: Survey, images: Sequence[PlacedImage], method: ExposureMethod = "balanced") -> Exposure:
     """Estimate what makes images agree where they overlap, with the median brightness of the set kept.
 
-    Parameters
-    ----------
-    images : sequence of PlacedImage
-        The distortion centre is the centre of the vignetting, and the exposure that the camera wrote down is a weak
-        prior of the gain.
-    method : str
-        "gain": one factor per image and channel, and one vignetting for all. "blocks": also a smooth field per
-        image, where one is asked for. "balanced": the same, following the images' own brightness as far as it takes to
-        burn out nothing.
-
-    Returns
-    -------
-    Exposure
-        Without any correction where none makes images agree better.
+    The distortion centre is the centre of the vignetting, and the exposure that the camera wrote down is a weak prior
+    of the gain. Nothing is corrected where that makes images agree no better.
     """
     present, cells = [tile for tile in survey.tiles if tile is not None], compare_overlaps(survey)
     integer = any(tile.pixels.dtype.kind == "u" for tile in present)

@@ -13,14 +13,8 @@ from rdstitch.system.outputs import TemporaryFolder
 class ImageCache:
     """Images, prepared for resampling, in at most ``limit`` bytes (though always one in memory).
 
-    Parameters
-    ----------
-    shrinks : sequence of float
-        Image pixels per output pixel.
-    limit : int
-        Bytes of memory; those used longest ago go to a temporary file when there are more, where one can be written.
-    ahead : bool
-        Read images ahead of their use, in a thread of its own.
+    ``shrinks`` are image pixels per output pixel. Images used longest ago go to a temporary file when there are more,
+    where one can be written. ``ahead``: a thread of its own reads them before they are used.
     """
 
     def __init__(self, reader: ImageReader, shrinks: Sequence[float], limit: int, *, ahead: bool = False) -> None:

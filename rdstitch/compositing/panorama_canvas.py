@@ -50,13 +50,7 @@ class SeenDirections:
 
 
 def seen_directions(cameras: Sequence[Camera], directions: FloatArray) -> SeenDirections:
-    """What images show.
-
-    Parameters
-    ----------
-    directions : ndarray of shape (N, 3, 3)
-        From undistorted normalized coordinates of each image to directions.
-    """
+    """What images show, by what takes their undistorted normalized coordinates to directions, (N, 3, 3)."""
     outlines = [_outline(camera, matrix) for camera, matrix in zip(cameras, directions, strict=True)]
     low = np.array([outline[:, 0].min() for outline in outlines])
     high = np.array([outline[:, 0].max() for outline in outlines])
@@ -98,17 +92,8 @@ def plan_panorama(
 ) -> Canvas:
     """Plan the canvas that holds every image of a panorama.
 
-    Parameters
-    ----------
-    directions : ndarray of shape (N, 3, 3)
-        From undistorted normalized coordinates of each image to directions.
-    projection : str
-        One of :data:`rdstitch.compositing.projection.PROJECTIONS`, or "auto": what suits the field of view.
-    scale, rotate, reference, names
-        As for :func:`rdstitch.compositing.plan_canvas`.
-    max_stretch : float
-        What the projection would stretch more than so many times has no place on the canvas: the ends of a plane, the
-        top and the bottom of a cylinder.
+    As :func:`rdstitch.compositing.plan_canvas`. What the projection would stretch more than ``max_stretch`` times has
+    no place on it: the ends of a plane, the top and the bottom of a cylinder.
     """
     seen = seen_directions(cameras, directions)
     chosen = choose_projection(seen) if projection == "auto" else PROJECTIONS[projection]
@@ -139,14 +124,7 @@ def plan_panorama(
 def _lay_out(outlines: Sequence[FloatArray], start: float | None, resolution: float, rotate: float) -> Canvas:
     """The canvas that holds the places (K, 2) of images.
 
-    Parameters
-    ----------
-    start : float or None
-        Longitude at the left border of a full turn; None where there is none.
-    resolution : float
-        pixels per radian straight ahead.
-    rotate : float
-        Degrees that the output is turned clockwise.
+    ``start`` is the longitude at the left border of a full turn, or None; ``resolution`` in pixels per radian ahead.
     """
     if start is not None and rotate:
         raise ArgumentError("a panorama that goes all the way round cannot be turned; leave out --rotate")

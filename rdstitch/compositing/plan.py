@@ -50,12 +50,7 @@ def plan_composite(
 ) -> CompositePlan:
     """Tile size and cache that keep within the memory limit, with estimates for a dry run.
 
-    Parameters
-    ----------
-    channels, itemsize : int
-        Channels and bytes per sample of the images.
-    masked : bool
-        Whether some have transparent parts, or else only those of which the canvas has the near part.
+    ``masked``: some images have transparent parts.
     """
     bands = options.bands or usual_bands(cameras)
     limit = options.max_memory or default_memory()

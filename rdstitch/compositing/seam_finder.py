@@ -101,14 +101,7 @@ class SeamMap:
 def find_seams(survey: Survey, exposure: Exposure, graphcut: bool, progress: ShareProgress = unheard) -> SeamMap:
     """Owner of every pixel.
 
-    Parameters
-    ----------
-    exposure : Exposure
-        Differences in brightness must not steer the seams.
-    graphcut : bool
-        Whether seams avoid what differs; otherwise they run where borders are equally far.
-    progress : callable, optional
-        Called with the share of the work done.
+    Seams avoid what differs but for exposure, or, without ``graphcut``, run where borders are equally far.
     """
     width, height = survey.canvas.size
     labels = np.full((height, width), NO_OWNER, dtype=np.int32)

@@ -185,12 +185,8 @@ class ImageOnDisk:
 def prepare_image(image: DecodedImage, shrink: float, reduction: int = 1) -> LoadedImage:
     """Fill what is transparent, and smooth the image to what an output that shrinks it can show.
 
-    Parameters
-    ----------
-    shrink : float
-        Original pixels per output pixel. From 4 on, whole blocks are averaged first; a Gaussian does the rest.
-    reduction : int
-        What the image was read smaller by.
+    It was read smaller by ``reduction``. Where the output shrinks it 4 times or more, whole blocks are averaged first;
+    a Gaussian does the rest.
     """
     pixels, opaque = image.pixels, None
     if image.alpha is not None:
@@ -221,13 +217,7 @@ def smoothed(pixels: NDArray[Any], shrink: float, reduction: int = 1) -> tuple[N
 
 
 class ImageReader:
-    """Reads images, and sees to it that they are what was registered.
-
-    Parameters
-    ----------
-    images : sequence of PlacedImage
-        Each must have the size that its camera has.
-    """
+    """Reads images, and sees to it that they are what was registered."""
 
     def __init__(self, images: Sequence[PlacedImage]) -> None:
         self._images = images

@@ -31,15 +31,8 @@ _WINDOW = 0.05  # of the longer side, over which corners are compared
 def static_pixels(images: Sequence[NDArray[np.generic]]) -> BoolArray | None:
     """Which pixels show what stays at its place in all images.
 
-    Parameters
-    ----------
-    images : sequence of ndarray of shape (h, w) or (h, w, C)
-        At least :data:`MIN_IMAGES` of one camera that moved between them, some hundred pixels wide.
-
-    Returns
-    -------
-    ndarray of shape (h, w), bool, or None
-        None where nothing stays, or so much that the camera hardly moved.
+    The images, at least :data:`MIN_IMAGES` of one camera that moved between them, are some hundred pixels wide. None
+    where nothing stays, or so much that the camera hardly moved.
     """
     grey = np.stack([mean_of_channels(image.astype(np.float32)) for image in images])
     window = max(3, round(_WINDOW * max(grey.shape[1:])))

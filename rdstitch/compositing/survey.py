@@ -67,7 +67,8 @@ class Survey:
             full = max(float(high - low), 1e-12)
         seen = [None if tile is None else tile.seen for tile in self.tiles]
         quality = measure_seams(seen, labels, self.enlarged, self.factor / self.enlarged, full)
-        return replace(quality, alike=share_alike(seen, self.pairs(), full))
+        alike, worst = share_alike(seen, self.pairs(), full)
+        return replace(quality, alike=alike, least_alike=worst)
 
 
 def survey_factor(canvas: Canvas) -> int:
@@ -155,14 +156,7 @@ def covered_pixels(survey: Survey) -> NDArray[np.bool_]:
 def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> tuple[Box | None, str]:
     """Largest rectangle without holes, on the canvas, and, when there is none worth having, why.
 
-    Parameters
-    ----------
-    covered : ndarray of shape (h, w), bool
-        From :func:`covered_pixels`.
-    factor : int
-        Canvas pixels per pixel of ``covered``.
-    size : (int, int)
-        Width and height of the canvas.
+    ``covered`` as of :func:`covered_pixels`, of which each takes ``factor`` pixels a side of a canvas of this size.
     """
     # A reduced pixel stands for those around its centre: one more on each side makes sure of all of them.
     whole = cv2.erode(
@@ -182,12 +176,7 @@ def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> 
 def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], whole: Box) -> tuple[Box | None, str]:
     """As :func:`crop_box`, for a canvas that goes all the way round: rows without holes, at their full width.
 
-    Parameters
-    ----------
-    covered, factor, size
-        As for :func:`crop_box`.
-    whole : (int, int, int, int)
-        One full turn of the canvas.
+    ``whole`` is one full turn of it.
     """
     columns = slice(-(-whole[0] // factor), whole[2] // factor)
     full = np.concatenate([[False], covered[:, columns].all(axis=1), [False]])

@@ -75,11 +75,8 @@ class CompositeTables:
     def compose(self, images: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Put a set of images together.
 
-        Parameters
-        ----------
-        images : sequence of ndarray of shape (H, W) or (H, W, C)
-            In the order of those that the tables were made for, each of the size of its camera; uint8, uint16 or
-            floating point. Of other bands than these, exposure is left as it is.
+        In the order of those that the tables were made for, (H, W) or (H, W, C), each of the size of its camera. Of
+        other bands than these, exposure is left as it is.
         """
         self._check(images)
         first = images[0]

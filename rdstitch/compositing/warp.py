@@ -298,19 +298,7 @@ def border_weight(geometry: Geometry) -> Float32Array:
 def sample(image: LoadedImage, geometry: Geometry, interpolation: str = "cubic") -> NDArray[Any]:
     """Resample an image; content is mirrored outside of it, so that filters find no edge there.
 
-    Parameters
-    ----------
-    image : LoadedImage
-        Prepared for ``geometry.warp.shrink``.
-    geometry : Geometry
-        From :func:`locate`.
-    interpolation : str
-        "linear", "cubic" or "lanczos".
-
-    Returns
-    -------
-    ndarray of shape (h, w) or (h, w, C)
-        In the image's sample type.
+    The image is prepared for ``geometry.warp.shrink``; the result is (h, w) or (h, w, C), in its sample type.
     """
     map_x, map_y = _mirrored(image, geometry)
     return _remap_whole(image.pixels, map_x, map_y, INTERPOLATION[interpolation])
