@@ -136,7 +136,8 @@ tiles --lambda L|auto: Known λ (half-diagonal frame), or auto: estimate it; oth
 --whole-layers: With --layers: on the whole canvas instead of cropped.
 --all-blocks: Stitch every block of overlapping images: the largest becomes OUTPUT, the others OUTPUT with -2, -3, …
     before its suffix.
---poses FILE: Write the pose of the camera for each image, with covariances: CSV, as 'rdstitch trajectory' does.
+--poses FILE: Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does;
+    images.txt: COLMAP's; geo.txt: OpenDroneMap's.
 --hugin-project FILE: Write a project for Hugin (.pto): all images with lens and pose, and control points.
 --plot FILE: Draw the path to FILE (SVG).
 --json: Print {} as JSON.
