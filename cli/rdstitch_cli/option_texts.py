@@ -123,8 +123,9 @@ tiles --lambda L|auto: Known λ (half-diagonal frame), or auto: estimate it; oth
 * --max-size N: Longest side of the output, pixels; --scale is reduced to fit.
 --local-alignment auto|off|N: Smooth displacement of each image where the scene has depth. auto: if held-out
     matches come nearer; N: always, with N cells along an image's longer side.
-* --exposure: Brightness: gain makes the whole comparable (one factor per image, one vignetting); blocks adds a smooth
-    field per image where needed; balanced also keeps what is bright near its own images' brightness.
+* --exposure: Brightness: exif normalises by time, ISO and aperture, for measurements; gain makes the whole comparable
+    (one factor per image, one vignetting); blocks adds a smooth field per image where needed; balanced also keeps what
+    is bright near its own images' brightness; auto: exif for one band of 16 bits, else balanced.
 --seam: Seam finder: around differences, midway, or none.
 --blend: Blender; none: hard edges, for measurements.
 --interpolation: Interpolation kernel.

@@ -153,7 +153,7 @@ output_form = together(
     option("--dry-run", bool),
 )
 compositing = together(
-    option("--exposure", ("none", "gain", "blocks", "balanced"), "balanced"),
+    option("--exposure", ("auto", "none", "exif", "gain", "blocks", "balanced"), "auto"),
     option("--seam", ("none", "voronoi", "graphcut"), "graphcut"),
     blend,
     crop,

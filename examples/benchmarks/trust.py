@@ -23,6 +23,7 @@ _TRUE_OF = {
     "relief": ("cylinder",),
     "repeated-pattern": ("dirt", "repeated"),
     "rival-motion": ("vehicle", "body"),
+    "seam-break": ("vehicle", "body", "bit rot", "spoiled"),
     "shape": ("off centre", "crops", "rolling shutter", "cylinder", "odd lens"),
     "static-background": ("body", "banner", "round border", "curved border"),
 }

@@ -8,7 +8,7 @@ from rdstitch.choices import ProjectionName
 from rdstitch.compositing.upright_options import UprightOptions
 from rdstitch.errors import ArgumentError
 
-ExposureMethod = Literal["none", "gain", "blocks", "balanced"]
+ExposureMethod = Literal["auto", "none", "exif", "gain", "blocks", "balanced"]
 Seam = Literal["none", "voronoi", "graphcut"]
 Blend = Literal["none", "feather", "multiband"]
 Crop = Literal["none", "auto"]
@@ -22,6 +22,8 @@ class CompositeOptions(UprightOptions):
     Attributes
     ----------
     exposure : str
+        "auto": "exif" for one band of 16 bits, which multispectral cameras write, else "balanced". "exif" makes samples
+        those of one exposure by what the camera wrote down, and looks at no overlap.
         Gain compensation. "gain" makes the whole comparable, with one factor per image and channel and one vignetting
         for all; "blocks" adds a smooth field per image where one is asked for; "balanced" does the same, but keeps
         regions near the brightness of their own images where they would be burnt out; "none" is for people who measure.
@@ -84,7 +86,7 @@ class CompositeOptions(UprightOptions):
         When a value is not one of those listed.
     """
 
-    exposure: ExposureMethod = "balanced"
+    exposure: ExposureMethod = "auto"
     seam: Seam = "graphcut"
     blend: Blend = "multiband"
     crop: Crop = "none"

@@ -14,6 +14,7 @@ from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.photometric import Exposure, no_exposure
 from rdstitch.compositing.plan import CompositePlan, plan_composite
+from rdstitch.compositing.radiometry import are_measurements, exposure_by_metadata
 from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import SeamMap, find_seams
 from rdstitch.compositing.seam_quality import SeamQuality
@@ -132,13 +133,20 @@ def _decided(task: _Task, progress: ShareProgress) -> Decisions:
     """Everything that small images say."""
     images, canvas, options, plan = task.images, task.canvas, task.options, task.plan
     exposure, seams, quality = no_exposure(len(images), task.reader.samples[0]), None, SeamQuality()
+    messages: list[Message] = []
+    method = options.exposure
+    if method == "auto":
+        method = "exif" if are_measurements(*task.reader.samples) else "balanced"
     joined = len(images) > 1 and (options.exposure != "none" or options.seam != "none")
     whole = task.turn or (0, 0, *canvas.size)
     if not joined and options.crop != "auto":
         return Decisions(exposure, None, whole)
     survey = survey_images(task.reader, images, canvas, min(plan.workers, _READERS), _part_of(progress, 0.0, 0.7))
-    if joined and options.exposure != "none":
-        exposure = estimate_exposure(survey, images, options.exposure)
+    if joined and method == "exif":
+        exposure, said = exposure_by_metadata(images, task.reader.samples[0])
+        messages.append(said)
+    elif joined and method != "none":
+        exposure = estimate_exposure(survey, images, method)
     if joined and options.seam != "none":
         seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
         quality = survey.seam_quality(seams.labels)
@@ -153,7 +161,7 @@ def _decided(task: _Task, progress: ShareProgress) -> Decisions:
         find = crop_box if task.turn is None else partial(crop_rows, whole=task.turn)
         cropped_box, note = find(covered_pixels(survey), survey.factor, canvas.size)
         box = cropped_box or box
-    return Decisions(exposure, seams, box, (Message(note),) if note else (), quality.cropped(box))
+    return Decisions(exposure, seams, box, (*messages, *([Message(note)] if note else [])), quality.cropped(box))
 
 
 def _wrap_margin(canvas: Canvas, bands: int) -> int:

@@ -28,7 +28,9 @@ _CONTRAST = 6.0 / 255.0
 _ALIKE, _GAIN, _MOVED = 0.75, 0.2, 3.0  # correlation of a moved window, its lead, and by how much it is moved
 _UNLIKE = 0.4  # correlation below which edges on both sides are not the same
 _COARSER, _CELL, _MIN_CELLS = 3, 13, 8  # overlaps are compared so many times smaller, in cells; fewer say nothing
-_MIN_ALIKE = 0.5  # share of the overlaps that what fills less than half of the images cannot reach
+# Share of the overlaps that images of a scene reach where they do not belong, in nine of ten cases (0.1 in the median);
+# and share that what fills less than half of the images cannot reach.
+_CHANCE, _MIN_ALIKE = 0.2, 0.5
 # Coherence of edges (0: all directions, 1: one) from which on a person sees them end: leaves and gravel hide a seam.
 _DIRECTED = 0.4
 _MAX_SHARE, _MIN_BROKEN = 0.05, 3  # of the places that may be broken before a person sees it
@@ -65,11 +67,17 @@ class SeamQuality:
     breaks: tuple[SeamBreak, ...] = ()  # the longest first
     spacing: float = math.inf  # of the places, pixels of the output
     alike: float = math.nan  # share of the overlaps that looks alike, [0, 1]; NaN where there is nothing to compare
+    least_alike: tuple[int, int] | None = None  # the images whose overlap does so the least
 
     @property
     def contradicted(self) -> bool:
         """Whether most of what the images share does not look alike: it may be something else that holds them."""
         return self.alike < _MIN_ALIKE
+
+    @property
+    def by_chance(self) -> bool:
+        """Whether the images are no more alike where they overlap than anywhere else."""
+        return self.alike < _CHANCE
 
     @property
     def share(self) -> float:
@@ -139,27 +147,38 @@ def measure_seams(
     return SeamQuality((places + 0.5) * unit - 0.5, broken, breaks, _STEP * unit)
 
 
-def share_alike(tiles: Sequence[SeamTile | None], pairs: IntArray, full: float = 255.0) -> float:
-    """Share of the overlaps of pairs (P, 2) that looks alike in place, a few pixels more or less; NaN without any."""
+def share_alike(
+    tiles: Sequence[SeamTile | None], pairs: IntArray, full: float = 255.0
+) -> tuple[float, tuple[int, int] | None]:
+    """Share of the overlaps of pairs (P, 2) that looks alike in place, a few pixels more or less, and the worst pair.
+
+    NaN and None where there is nothing to compare.
+    """
     small = [None if tile is None else _smaller(tile) for tile in tiles]
-    cells = alike = 0
+    found: dict[tuple[int, int], tuple[int, int]] = {}
     for i, j in pairs.tolist():
         first, second = small[i], small[j]
         if first is None or second is None or (box := intersection(first.box, second.box)) is None:
             continue
-        parts = [(cut(tile.grey, tile.box, box), cut(tile.inside, tile.box, box)) for tile in (first, second)]
-        rows, columns = (n // _CELL for n in parts[0][0].shape)
-
-        def in_cells(values: NDArray[Any], rows: int = rows, columns: int = columns) -> NDArray[Any]:
-            whole = values[: rows * _CELL, : columns * _CELL].reshape(rows, _CELL, columns, _CELL)
-            return whole.swapaxes(1, 2).reshape(-1, _CELL, _CELL)
-
-        (grey1, inside1), (grey2, inside2) = ([in_cells(values) for values in part] for part in parts)
+        (grey1, inside1), (grey2, inside2) = (
+            [_in_cells(cut(values, tile.box, box)) for values in (tile.grey, tile.inside)] for tile in (first, second)
+        )
         known = (inside1 & inside2).all(axis=(1, 2))
         known &= np.minimum(grey1.std(axis=(1, 2)), grey2.std(axis=(1, 2))) > _CONTRAST * full
-        cells += int(known.sum())
-        alike += int((_correlation(grey1[known], grey2[known]) > _UNLIKE).sum())
-    return alike / cells if cells >= _MIN_CELLS else math.nan
+        alike = _correlation(grey1[known], grey2[known]) > _UNLIKE
+        found[min(i, j), max(i, j)] = len(alike), int(alike.sum())
+    cells = sum(count for count, _ in found.values())
+    shares = {pair: alike / count for pair, (count, alike) in found.items() if count >= _MIN_CELLS}
+    if not shares:
+        return math.nan, None
+    return sum(alike for _, alike in found.values()) / cells, min(shares, key=lambda pair: shares[pair])
+
+
+def _in_cells(values: NDArray[Any]) -> NDArray[Any]:
+    """Values (h, w) by cells (N, side, side)."""
+    rows, columns = (n // _CELL for n in values.shape)
+    whole = values[: rows * _CELL, : columns * _CELL].reshape(rows, _CELL, columns, _CELL)
+    return whole.swapaxes(1, 2).reshape(-1, _CELL, _CELL)
 
 
 def _smaller(tile: SeamTile) -> SeamTile:

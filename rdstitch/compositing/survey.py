@@ -67,7 +67,8 @@ class Survey:
             full = max(float(high - low), 1e-12)
         seen = [None if tile is None else tile.seen for tile in self.tiles]
         quality = measure_seams(seen, labels, self.enlarged, self.factor / self.enlarged, full)
-        return replace(quality, alike=share_alike(seen, self.pairs(), full))
+        alike, worst = share_alike(seen, self.pairs(), full)
+        return replace(quality, alike=alike, least_alike=worst)
 
 
 def survey_factor(canvas: Canvas) -> int:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import IMAGE_SUFFIXES
@@ -56,7 +56,9 @@ def with_masks(sources: Sequence[Source], masks: str | Path | None) -> list[Sour
     )
     masked = []
     for source in sources:
-        mask, frame = by_stem.get(canonical_name(source.path.stem)), None
+        stem = canonical_name(source.path.stem)
+        # Of images of one name in several folders, each may have its own in a folder of that name.
+        mask, frame = by_stem.get(str(PurePosixPath(source.name).with_suffix("")), by_stem.get(stem)), None
         if mask is not None:
             if mask.resolve() == source.path.resolve():
                 raise InputError(f"{mask}: is the image itself, not its mask; masks lie in another folder")
@@ -76,12 +78,12 @@ def mask_of(source: Source, folder: str | Path) -> Path | None:
 def _by_stem(folder: Path) -> Mapping[str, Path]:
     """The masks in a folder, by their names before the suffix."""
     try:
-        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+        files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
     masks: dict[str, Path] = {}
     for path in files:
-        other = masks.setdefault(canonical_name(path.stem), path)
+        other = masks.setdefault(canonical_name(path.relative_to(folder).with_suffix("").as_posix()), path)
         if other != path:
             raise InputError(f"{path}: {other.name} is a mask for the same image; remove one of them")
     return masks

@@ -16,7 +16,7 @@ from rdstitch.geometry.exif_orientation import turned
 from rdstitch.io.colour import without_inks
 from rdstitch.io.metadata import Metadata, is_grey_palette, metadata_of, read_metadata, read_ome
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image, read_raw
-from rdstitch.io.read_tiff import read_page
+from rdstitch.io.read_tiff import as_opacity, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.system.file_access import open_regular, read_beginning
 from rdstitch.system.late_imports import imagecodecs, tifffile
@@ -207,7 +207,9 @@ def as_image(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metada
     """An image from samples as stored: upright, in one of the three sample types, contiguous, and without NaN."""
     if samples.size == 0:
         raise InputError(f"{file}: has no pixels")
-    opaque = None if alpha is None else _as_uint8(alpha)
+    opaque = None
+    if alpha is not None:
+        opaque = as_opacity(alpha, np.iinfo(alpha.dtype).max if alpha.dtype.kind in "ui" else 1.0)
     if samples.dtype not in (np.uint8, np.uint16):
         samples = samples.astype(np.float32)
         finite = np.isfinite(samples)
@@ -221,12 +223,3 @@ def as_image(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metada
     if opaque is not None:
         opaque = np.ascontiguousarray(turned(opaque, metadata.orientation))
     return DecodedImage(np.ascontiguousarray(turned(samples, metadata.orientation)), opaque, metadata)
-
-
-def _as_uint8(alpha: Pixels) -> NDArray[np.uint8]:
-    """Alpha of any sample type as 0..255."""
-    if alpha.dtype == np.uint8:
-        return np.asarray(alpha, dtype=np.uint8)
-    full = np.iinfo(alpha.dtype).max if np.issubdtype(alpha.dtype, np.integer) else 1.0
-    share = np.clip(np.nan_to_num(alpha.astype(np.float32) / full), 0.0, 1.0)
-    return np.asarray(np.rint(share * _OPAQUE), dtype=np.uint8)

@@ -56,16 +56,16 @@ def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[Pix
         raise ValueError(f"has {stored.shape[2]} of {count} bands")
     full = 2**bits - 1 if stored.dtype.kind in "bu" else np.iinfo(stored.dtype).max if stored.dtype.kind == "i" else 1.0
     masks = [_mask(tiff, page)]
-    if (empty := _lacks_data(page, stored)) is not None:
-        stored[empty] = 0
-        masks.append(np.where(empty, np.uint8(0), np.uint8(_OPAQUE)))
     colours, data = stored[..., :count], stored[..., count:]
     alphas = [n for n, meaning in enumerate(page.extrasamples) if meaning in (_ASSOCIATED, _UNASSOCIATED)]
     if alphas:
         alpha, data = data[..., alphas[0]], np.delete(data, alphas[0], axis=2)
         if page.extrasamples[alphas[0]] == _ASSOCIATED:
             colours = _straight(colours, alpha, full)
-        masks.append(_as_uint8(alpha, full))
+        masks.append(as_opacity(alpha, full))
+    if (empty := _lacks_data(page, colours, data)) is not None:
+        colours[empty] = data[empty] = 0
+        masks.append(np.where(empty, np.uint8(0), np.uint8(_OPAQUE)))
     samples = _grey_or_rgb(page, kind, colours, full)
     if kind not in _INDIRECT:
         if data.shape[2]:
@@ -124,24 +124,24 @@ def _mask(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> NDArray[np.ui
         same = (other.imagelength, other.imagewidth) == (page.imagelength, page.imagewidth)
         if other.subfiletype == _MASK and same and other.samplesperpixel == 1:
             stored = other.asarray()
-            return _as_uint8(stored, 2**other.bitspersample - 1)
+            return as_opacity(stored, 2**other.bitspersample - 1)
     return None
 
 
-def _lacks_data(page: "tifffile.TiffPage", stored: Pixels) -> NDArray[np.bool_] | None:
+def _lacks_data(page: "tifffile.TiffPage", *bands: Pixels) -> NDArray[np.bool_] | None:
     """Where a page has GDAL's NODATA; of counts, where all bands have it, since in one it may be part of a colour."""
-    tag = page.tags.get(_NODATA)
+    tag, kind = page.tags.get(_NODATA), bands[0].dtype.kind
     try:
         number = float(str(tag.value).strip("\0 ")) if tag is not None else np.nan
-        nodata = stored.dtype.type(int(number) if stored.dtype.kind in "bui" else number)
+        nodata = bands[0].dtype.type(int(number) if kind in "bui" else number)
     except (ValueError, OverflowError):  # no number, or none that the samples can have
         return None
-    equal = stored == nodata
-    return np.asarray(equal.all(axis=2) if stored.dtype.kind in "bu" else equal.any(axis=2))
+    equal = np.concatenate([part == nodata for part in bands], axis=2)
+    return np.asarray(equal.all(axis=2) if kind in "bu" else equal.any(axis=2))
 
 
-def _as_uint8(alpha: Pixels, full: float) -> NDArray[np.uint8]:
-    """Alpha of any sample type as 0..255."""
+def as_opacity(alpha: Pixels, full: float) -> NDArray[np.uint8]:
+    """Alpha of any sample type, which is ``full`` where the image is opaque, as 0..255."""
     if alpha.dtype == np.uint8 and full == _OPAQUE:
         return np.asarray(alpha, dtype=np.uint8)
     share = np.clip(np.nan_to_num(alpha.astype(np.float32) / full), 0.0, 1.0)

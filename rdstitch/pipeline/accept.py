@@ -87,9 +87,15 @@ def aligner_of(registration: Registration, options: StitchOptions, purpose: Purp
     return replace(aligner, needs_poses=purpose == "trajectory")
 
 
-def realigned(registration: Registration, aligner: Aligner) -> Registration:
-    """The pairs of a registration aligned by another aligner."""
-    return _aligned_anew(registration, aligner.align(registration.pairs), aligner.paths, {})
+def realigned(registration: Registration, aligner: Aligner) -> Registration | None:
+    """The pairs of a registration aligned by another aligner; None where a draft shows that they do not fit."""
+    try:
+        draft = aligner.draft(registration.pairs)
+        if draft.alignment.rms > limit("error of rough ground") * aligner.threshold:
+            return None
+        return _aligned_anew(registration, aligner.completed(draft), aligner.paths, {})
+    except RegistrationError:
+        return None
 
 
 def _without_damage(registration: Registration, aligner: Aligner) -> Registration | None:

@@ -14,7 +14,7 @@ import numpy as np
 from rdstitch.alignment.result import Alignment
 from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.projection import PLANE
-from rdstitch.errors import ArgumentError, LimitError, RdstitchError, RegistrationError
+from rdstitch.errors import ArgumentError, LimitError, RdstitchError
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.pipeline.accept import plane_of_most, realigned
 from rdstitch.pipeline.aligner import Aligner
@@ -27,6 +27,7 @@ from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.verification.verdict import RefusedError
 
 _MODELS = ("rotation", "pose", "homography")
 """What a camera can have done: turned, moved over a plane, or anything that joins images of a plane."""
@@ -36,6 +37,11 @@ _MAX_MAGNIFICATION, _MAX_ASPECT = 4.0, 2.0
 
 _CLEARLY = 0.5
 """Share of the broken places up to which another layout is clearly better."""
+
+_BY_CHANCE = Message(
+    "the images are no more alike where they were put together than anywhere else; take images that overlap more",
+    severity="failure",
+)
 
 _GRID = np.stack(np.meshgrid(*[[0.02, 0.25, 0.5, 0.75, 0.98]] * 2), axis=-1).reshape(-1, 2)
 
@@ -102,7 +108,7 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         return _first(tried, failed)
     if tried and tried[0].local.fields and options.local_alignment == "auto":
         tried.append(laid(registration, no_local_alignment("seams hold better without it")))
-    for other in _others(registration, options, aligner):
+    for other in _others(registration, options, aligner, tried[0] if tried else None):
         try:
             tried.append(laid(other))
         except (LimitError, ArgumentError):
@@ -111,7 +117,9 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
     whole = [one for one in tried if one.clipped <= first.clipped]
     best = min(whole, key=lambda one: (one.faults, one.broken))
     if failed is None and best.faults == first.faults and best.broken > _CLEARLY * first.broken:
-        return first
+        best = first
+    if best.layout.seams.by_chance and not options.force:
+        raise RefusedError(best.registration.with_messages([_BY_CHANCE]))
     return best
 
 
@@ -122,23 +130,24 @@ def _first(tried: list[LaidOut], failed: RdstitchError | None) -> LaidOut:
     raise failed
 
 
-def _others(registration: Registration, options: StitchOptions, aligner: Aligner) -> Iterator[Registration]:
+def _others(
+    registration: Registration, options: StitchOptions, aligner: Aligner, first: LaidOut | None
+) -> Iterator[Registration]:
     """Other registrations that use every image that this one does."""
     alignment = registration.alignment
-    if options.model == "auto":
-        for name in _MODELS:
-            if name == alignment.model:
-                continue
-            decided = replace(aligner.options, model=name)
-            try:
-                other = realigned(registration, replace(aligner, options=decided))
-            except RegistrationError:
-                continue
-            if _joins(other.alignment, alignment):
-                yield other
-    plane = plane_of_most(registration, options, aligner)
-    if plane is not None and _joins(plane.alignment, alignment):
-        yield plane
+    names = [name for name in _MODELS if name != alignment.model] if options.model == "auto" else []
+    if first is not None and first.layout.placed.has_place:  # a map needs a plane with a metric
+        names = [name for name in names if name == "pose"]
+    for name in names:
+        other = realigned(registration, replace(aligner, options=replace(aligner.options, model=name)))
+        if other is not None and _joins(other.alignment, alignment):
+            reason = f"{other.alignment.model_reason.removesuffix('; as requested')}; seams break less than with a "
+            reason += f"{alignment.model} model"
+            yield replace(other, alignment=replace(other.alignment, model_reason=reason))
+    if first is None or first.layout.seams.contradicted:
+        plane = plane_of_most(registration, options, aligner)
+        if plane is not None and _joins(plane.alignment, alignment):
+            yield plane
 
 
 def _joins(other: Alignment, alignment: Alignment) -> bool:

@@ -99,21 +99,10 @@ def compose_images(
     elsewhere: BlockRunner | None = None,
     dry_run: bool = False,
 ) -> Composed:
-    """Plan the canvas, see whether a file can hold it, and put the images on it.
+    """Plan the canvas, see whether a file can hold it, and put the images on it; of a dry run the plan alone.
 
-    Parameters
-    ----------
-    placed : PlacedImages or Layout
-        A layout where the canvas is planned already.
-    output : path or None
-        File that the image is written to, a strip at a time, with colour profile and EXIF of the first image, and
-        with its place on the Earth where three images have a GPS position; without it the image is made in memory.
-    outputs : Outputs
-        Where the files are staged.
-    elsewhere : callable, optional
-        See :func:`rdstitch.compositing.compose`.
-    dry_run : bool
-        Only plan.
+    Without ``output`` the image is made in memory; a file has colour profile and EXIF of the first image, and its place
+    on the Earth. ``elsewhere``: see :func:`rdstitch.compositing.compose`.
     """
     return_freed_memory()
     layout = placed if isinstance(placed, Layout) else Layout.of(placed, options)
@@ -206,12 +195,14 @@ def _cut_away(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -
 
 def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
     """Where seams are broken, a warning where a person sees it, else a detail; and whether overlaps are unlike."""
-    if seams.contradicted:
+    if seams.contradicted and seams.least_alike is not None:
+        images = tuple(paths[k] for k in seams.least_alike)
         text = (
-            f"only {seams.alike:.0%} of what the images share looks alike: something that fills a part of them (a "
-            "vehicle, the camera's own mount) may be what was put together; a mask keeps it out"
+            f"only {seams.alike:.0%} of what the images share looks alike, the least between "
+            f"{' and '.join(names_of(images))}: something that fills a part of them (a vehicle, a mount) may be what "
+            "was put together; a mask keeps it out"
         )
-        return [Message(text, code="rival-motion")]
+        return [Message(text, images, code="rival-motion")]
     if not seams.breaks:
         return []
     worst = list({one.images: one for one in reversed(seams.breaks)}.values())[::-1][:MAX_NAMED]
@@ -297,12 +288,7 @@ def _profiles_differ(sources: Sequence[Source]) -> list[Message]:
 def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None) -> BlockRunner | None:
     """What computes blocks of an output on the workers of an executor; None for threads, which need no blocks.
 
-    Parameters
-    ----------
-    sources : sequence of Source
-        The images of the composite.
-    folder : Path or None
-        What all machines see by the same name, for the strips; None where there is one machine.
+    ``folder`` is what all machines see by the same name, for the strips; None where there is one machine.
     """
     if isinstance(executor, ThreadPoolExecutor):
         return None

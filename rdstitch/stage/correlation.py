@@ -239,6 +239,7 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
         noise.append(noise_variance(tile) * float((weights**2).sum()))
     spectra = fft.rfft2(frames)
     product = spectra[0] * np.conj(spectra[1])
+    plain = fft.irfft2(product, s=shape)
     product /= np.abs(product) + np.float32(_NOISE_SHARE * math.sqrt(noise[0] * noise[1])) + np.float32(1e-12)
     surface = fft.irfft2(product, s=shape)
     y, x = (
@@ -251,11 +252,14 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
     broad = (common[0][:, None] > 0.5 * height) | (common[1] > 0.5 * width)
     possible = aside & broad & (common[0][:, None] > least[0]) & (common[1] > least[1])
     deviation = float(np.median(np.abs(surface[possible]))) / 0.6745 + 1e-12
-    surface = np.where(possible, surface / deviation, 0.0).astype(np.float32)
-    rows, columns = np.nonzero((surface == cv2.dilate(surface, np.ones((3, 3), np.uint8))) & (surface > 2.0))
-    height, at = surface[rows, columns], np.stack([x[columns], y[rows]], axis=1).astype(np.float64)
-    order = np.argsort(-height, kind="stable")
-    places = at[order[height[order] > peak_threshold(1.0, surface.size)][:_WIDE_PEAKS]]
+    found: dict[tuple[int, int], None] = {}
+    # A pattern that repeats itself is as high in many places of the plain correlation, and in chance ones of the other.
+    for values, threshold in ((surface, peak_threshold(deviation, surface.size)), (plain, 0.0)):
+        shown = np.where(possible, values, 0.0).astype(np.float32)
+        rows, columns = np.nonzero((shown == cv2.dilate(shown, np.ones((3, 3), np.uint8))) & (shown > threshold))
+        order = np.argsort(-shown[rows, columns], kind="stable")[:_WIDE_PEAKS]
+        found |= dict.fromkeys(zip(x[columns[order]].tolist(), y[rows[order]].tolist(), strict=True))
+    places = np.array(list(found), dtype=np.float64).reshape(-1, 2)
     boxes = [Overlap.expected(0, 1, place, sizes[:, ::-1], 1) for place in places]
     return places, np.array([log_evidence(tiles, box, at) for at, box in zip(places, boxes, strict=True)])
 

@@ -45,7 +45,7 @@ _POOR = 6.0  # nats below which a pair is looked for elsewhere: a correlation of
 _RIVAL = 4.6  # nats from which on a place is possible that the whitened correlation does not show: a hundred to one
 _SHOWS = 0.5  # share of the variance of a tile that must be content to look for it elsewhere
 _SURE = 0.99  # probability that one place of a pair must have among all that are possible
-_ASTRAY = 1e-4  # probability that a tile is anywhere but where its stage was sent, within its errors
+_ASTRAY = 1e-3  # probability that a tile is anywhere but where its stage was sent, within its errors
 _LARGEST_STD = 1.0  # coarse pixels
 _ROUNDS = 4  # by which what is certain of the stage decides about what was not
 # λ is taken where pairs along rows and pairs along columns show it by so many standard deviations each
@@ -325,30 +325,30 @@ def _moved_tiles(
     for tile, numbers in of_tile.items():
         if any(number in chosen or number in found for number in numbers):
             continue
-        moves, nats, owner, index = [], [], [], []
+        moves, nats = list[FloatArray](), list[FloatArray]()
+        owner, index = list[int](), list[int]()
         for number in numbers:
             expected, _ = fitted.between(pairs[number])
             sign = 1.0 if pairs[number][1] == tile else -1.0
-            for k, value in enumerate(candidates[number].nats.tolist()):
-                moves.append(sign * (candidates[number].offsets[k] - expected))
-                nats.append(value)
-                owner.append(number)
-                index.append(k)
-        if len(set(owner)) < 2:
+            moves.append(sign * (candidates[number].offsets - expected))
+            nats.append(candidates[number].nats)
+            owner += [number] * len(candidates[number].nats)
+            index += range(len(candidates[number].nats))
+        move, value, pair = np.concatenate(moves), np.concatenate(nats), np.array(owner, dtype=np.intp)
+        near = np.abs(move[:, None] - move).max(axis=2) <= search
+        together = [sum(value[row & (pair == n)].max(initial=0.0) for n in set(owner)) for row in near]
+        best = int(np.argmax(together)) if together else -1
+        if best < 0 or np.abs(move[best]).max() <= search:
             continue
-        near = np.abs(np.array(moves)[:, None] - np.array(moves)).max(axis=2) <= search
-        strongest = [
-            {
-                n: max((nats[k], k) for k in np.flatnonzero(row) if owner[k] == n)
-                for n in {owner[k] for k in np.flatnonzero(row)}
-            }
-            for row in near
-        ]
-        sums = np.array([sum(value for value, _ in of_pair.values()) for of_pair in strongest])
-        best = int(sums.argmax())
-        rival = sums[~near[best]].max(initial=0.0)
-        if len(strongest[best]) > 1 and sums[best] - rival > math.log(_SURE / (1.0 - _SURE) / _ASTRAY):
-            found.update({n: candidates[n].offsets[index[k]] for n, (_, k) in strongest[best].items()})
+        margins: dict[int, tuple[float, int]] = {}
+        for number in {owner[k] for k in np.flatnonzero(near[best])}:
+            own = candidates[number]
+            k = index[max(np.flatnonzero(near[best] & (pair == number)), key=value.__getitem__)]
+            apart = np.abs(own.offsets - own.offsets[k]).max(axis=1) > own.grain
+            margins[number] = own.nats[k] - own.nats[apart].max(initial=0.0), k
+        shown = {number: k for number, (margin, k) in margins.items() if margin > 0.0}
+        if len(shown) > 1 and sum(margins[n][0] for n in shown) > math.log(_SURE / (1.0 - _SURE) / _ASTRAY):
+            found |= {number: candidates[number].offsets[k] for number, k in shown.items()}
     return found
 
 

@@ -77,10 +77,6 @@ TEXTS = {
         "the images show a repeated pattern; what is unique in them (dirt, a mark, an object) decided where they lie; "
         "look at the seams, that between {first} and {second} first",
     ),
-    "little alike": (
-        "doubtful-seam",
-        "{both}: only {confirming} of {cells} places look alike; look at the seam between them",
-    ),
     "second motion": (
         "rival-motion",
         "{moving} (something that moved, or a second surface?); a mask keeps it out",
@@ -124,7 +120,7 @@ def _message(finding: Finding, paths: Sequence[str]) -> Message:
     images, values = tuple(paths[k] for k in finding.images), dict[str, Any](finding.values)
     names = names_of(images)
     if "pairs" in values:
-        return Message(_outvoted(finding.kind, values["pairs"], paths), images, finding.severity, "doubtful-seam")
+        return Message(_outvoted(finding.kind, values["pairs"], paths), images, finding.severity, code="doubtful-seam")
     if len(names) == 2:
         values |= {"first": names[0], "second": names[1], "both": " and ".join(names)}
     for key in ("images1", "images2", "without"):

@@ -28,7 +28,6 @@ LIMITS = {
     "offset": Limit(2.5, "pixels of the compared images", "chosen"),
     "cells": Limit(8, "cells of an overlap", "of fewer the pixels say nothing"),
     "unlike": Limit(0.10, "share of the cells of an overlap", "chance reaches 0.07; low sun, parallax, blur 0.20"),
-    "little alike": Limit(0.15, "share of the cells of an overlap", "between the two"),
     "alike": Limit(0.25, "share of the overlaps", "0.26 to 1 in 22 sets that a person would keep: benchmarks.world"),
     "clearly alike": Limit(0.5, "share of the overlaps", "python -m examples.benchmarks.relief"),
     # Repeated patterns.

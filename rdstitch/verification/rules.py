@@ -12,7 +12,6 @@ from typing import NamedTuple
 from rdstitch.alignment.result import LinkFit
 from rdstitch.alignment.unaligned import few_features
 from rdstitch.inputs.source import Source
-from rdstitch.results.messages import Severity
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
 from rdstitch.verification.limits import limit
@@ -71,7 +70,7 @@ def _mixed_lenses(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _errors(evidence: Evidence) -> Iterator[Finding]:
-    """Errors of all pairs together; those of a picture count only where its overlaps are no more alike than chance."""
+    """Errors of all pairs together; of a picture its seams say whether they are seen."""
     alignment, threshold = evidence.alignment, evidence.threshold
     rms, relief = alignment.rms, alignment.relief
     if rms <= limit("error") * threshold:
@@ -84,7 +83,7 @@ def _errors(evidence: Evidence) -> Iterator[Finding]:
         relief.found and explained and evidence.alike >= limit("clearly alike")
     )
     values = {"rms": rms, "threshold": threshold}
-    if rough or (evidence.picture and evidence.alike >= limit("little alike")):
+    if rough or evidence.picture:
         yield Finding("rough", (), "warning", values)
     else:
         yield Finding("errors", values=values)
@@ -125,20 +124,10 @@ def _size_of_shape(evidence: Evidence) -> float:
 
 def _unlike(evidence: Evidence) -> Iterator[Finding]:
     """Images that were put together and are no more alike there than by chance."""
-    return _less_alike(evidence, limit("unlike"), "unlike", "failure")
-
-
-def _little_alike(evidence: Evidence) -> Iterator[Finding]:
-    """Images that look less alike than most where they are put together."""
-    return _less_alike(evidence, limit("little alike"), "little alike", "warning")
-
-
-def _less_alike(evidence: Evidence, least: float, kind: str, severity: Severity) -> Iterator[Finding]:
-    """Pairs of whose cells fewer than a share agree."""
     for link in evidence.checked:
-        if link.agreement.cells >= limit("cells") and link.agreement.share < least:
+        if link.agreement.cells >= limit("cells") and link.agreement.share < limit("unlike"):
             values = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
-            yield Finding(kind, link.pair, severity, values)
+            yield Finding("unlike", link.pair, "failure", values)
 
 
 def _ambiguous(evidence: Evidence) -> Iterator[Finding]:
@@ -217,17 +206,17 @@ OF_MATCHES: tuple[Find, ...] = (_mixed_lenses, _matches_disagree, _misfitting_im
 OF_PAIRS: tuple[Find, ...] = (disagreeing_pairs, _unlike, _ambiguous)
 """Suspicions of pairs, the last of each counts: a failure where images hang on it alone."""
 
-OF_THE_WHOLE: tuple[Find, ...] = (_errors, _depth, _shape, _pattern, _second_motion, _little_alike, _two_left, _inputs)
+OF_THE_WHOLE: tuple[Find, ...] = (_errors, _depth, _shape, _pattern, _second_motion, _two_left, _inputs)
 """Everything else."""
 
 OF_PLACES = {
-    "shape unknown", "shape bent", "shape free", "pattern", "settled pattern", "little alike", "ambiguous", "outvoted"
+    "shape unknown", "shape bent", "shape free", "pattern", "settled pattern", "ambiguous", "outvoted"
 }  # fmt: skip
 """Kinds that make the places of images doubtful and leave the lens as it is: a board shifted by a square is as straight
 as before."""
 
 
-SEEN_AT_SEAMS = {"rough", "relief", "depth of a turn", "little alike"}
+SEEN_AT_SEAMS = {"rough", "relief", "depth of a turn"}
 """Kinds that the seams of a picture show, or do not."""
 
 
@@ -252,6 +241,5 @@ ALOUD = {
     **dict.fromkeys(("rough", "relief"), Aloud("flatness", lambda evidence: evidence.flat or _seen(evidence))),
     **dict.fromkeys(("parallax", "depth of a turn"), Aloud("flatness", _seen)),
     "second motion": Aloud("second motion"),
-    "little alike": Aloud("little alike", _seen),
 }
 """The gravest first; other kinds are always said, and before these."""

@@ -59,7 +59,6 @@ def judge(evidence: Evidence) -> tuple[Finding, ...]:
     suspicions = {(finding.images[0], finding.images[1]): finding for finding in found}
     hanging = [] if lens_only or evidence.static else decisive_pairs(suspicions, evidence.used, count)
     whole = [finding for find in rules.OF_THE_WHOLE for finding in find(evidence)]
-    whole = [f for f in whole if not (f.kind == "little alike" and f.images in suspicions)]
     every = [*(suspicions[pair] for pair in hanging), *whole]
     every += _outvoted([f for pair, f in suspicions.items() if pair not in hanging])
     return _aloud([f for f in every if not (lens_only and f.kind in rules.OF_PLACES)], evidence)

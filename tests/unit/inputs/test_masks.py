@@ -15,6 +15,7 @@ from examples.judging import registration_error
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import SIDEWAYS, turned, turned_size
+from rdstitch.inputs.find import find_images
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import DecodedImage, read_image
@@ -114,6 +115,15 @@ def test_masks_are_found_by_the_names_of_images(tmp_path: Path) -> None:
     assert [found.mask for found in with_masks(sources, tmp_path / "masks")] == [of_a, None, of_c]
     assert [found.mask for found in with_masks(sources, of_a)] == [of_a] * 3
     assert with_masks(sources, None) == sources
+
+
+def test_masks_of_images_of_one_name_are_in_folders_of_their_names(tmp_path: Path) -> None:
+    for name in ("left/a.png", "right/a.png", "masks/left/a.png", "masks/a.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        save(tmp_path / name, np.full((30, 40), 255, np.uint8))
+    frames = find_images([tmp_path / "left", tmp_path / "right"]).frames
+    masked = with_masks(read_sources(frames, skip_bad=False)[0], tmp_path / "masks")
+    assert [source.mask for source in masked] == [tmp_path / "masks" / "left" / "a.png", tmp_path / "masks" / "a.png"]
 
 
 def test_masks_that_cannot_be_meant_are_refused(tmp_path: Path) -> None:

@@ -136,6 +136,15 @@ def test_nodata_is_empty(tmp_path: Path, kind: Any, bands: int, nodata: str, val
     assert (alpha is None) if not counts else ((alpha == 0) == wanted).all()
 
 
+def test_nodata_is_looked_for_in_what_is_no_alpha(tmp_path: Path) -> None:
+    samples = np.full((H, W, 4), 200, np.uint8)
+    samples[:5, :, :3] = 0
+    options: dict[str, Any] = {"extratags": [(42113, 2, 0, "0", True)], "extrasamples": [ALPHA], "metadata": None}
+    tifffile.imwrite(tmp_path / "a.tif", samples, photometric="rgb", **options)
+    alpha = read_image(tmp_path / "a.tif").alpha
+    np.testing.assert_array_equal(alpha, np.where(np.arange(H) < 5, 0, 200)[:, None].repeat(W, axis=1))
+
+
 def test_few_bits_fill_the_range_and_palettes_are_colours(tmp_path: Path) -> None:
     levels = np.arange(16, dtype=np.uint8).reshape(4, 4)
     table = np.stack([np.arange(256) * 256, np.full(256, 65535), np.zeros(256)]).astype(np.uint16)

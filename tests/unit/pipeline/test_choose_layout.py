@@ -62,7 +62,7 @@ def test_a_plane_seen_from_the_side_is_stretched(tilt: float, stretched: bool) -
 
 
 def _quality(*breaks: SeamBreak, alike: float = 0.9) -> SeamQuality:
-    return SeamQuality(np.zeros((100, 2)), np.arange(100) < len(breaks), breaks, 8.0, alike)
+    return SeamQuality(np.zeros((100, 2)), np.arange(100) < len(breaks), breaks, 8.0, alike, (0, 2))
 
 
 def _break(pair: tuple[int, int], length: float) -> SeamBreak:
@@ -81,3 +81,4 @@ def test_a_break_that_a_person_sees_is_one_warning_and_others_a_detail() -> None
     assert "and 1 more" in warning.text
     (unlike,) = seam_messages(_quality(alike=0.49), paths)
     assert (unlike.severity, unlike.code) == ("warning", "rival-motion")
+    assert "only 49% of what the images share looks alike, the least between a.jpg and c.jpg" in unlike.text
