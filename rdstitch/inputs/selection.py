@@ -41,11 +41,8 @@ def _fits(frame: Frame, pattern: str) -> bool:
 def with_masks(sources: Sequence[Source], masks: str | Path | None) -> list[Source]:
     """The sources, each with its mask, if it has one.
 
-    Parameters
-    ----------
-    masks : path or None
-        An image: the mask of all images, such as of a camera that sees its own vehicle. Or a folder with a mask for
-        each image, or for some, of the image's name; the suffix may differ.
+    ``masks`` is an image: the mask of all images, such as of a camera that sees its own vehicle. Or a folder with a
+    mask for each image, or for some, of the image's name; the suffix may differ.
     """
     if masks is None:
         return list(sources)

@@ -100,19 +100,10 @@ def by_image(rows: Iterable[Row]) -> dict[str, Row]:
 def csv_rows(
     text: str, file: str, columns: Mapping[str, str], wanted: Sequence[str], units: Sequence[str] = ()
 ) -> list[Row]:
-    """The rows of a CSV file with a heading.
+    """The rows of a CSV file with a heading; ``wanted`` are the columns that there must be, and alternatives to them.
 
-    Parameters
-    ----------
-    text, file
-        The content, and the name for messages.
-    columns
-        What the caller knows: of each column all headings that mean it, between blanks. Others are ignored; of several
-        with one meaning the last counts that is not empty.
-    wanted
-        The columns that there must be, such as ``"name,x,y"``, and alternatives to them.
-    units
-        What may stand in brackets behind a heading and changes nothing.
+    Of each column ``columns`` has all headings that mean it, between blanks. Others are ignored; of several with one
+    meaning the last counts that is not empty. ``file`` is what messages call it.
     """
     if "\0" in text:
         raise InputError(f"{file}: is no UTF-8 text; save it as CSV in UTF-8")

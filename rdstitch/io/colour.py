@@ -28,11 +28,7 @@ _EDGE = 6.0 / 29.0  # where the cube root of CIE 1976 becomes a line
 def srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> NDArray[Any]:
     """Samples of CIELAB (h, w, 3), 8 or 16 bits as TIFF stores them, as sRGB of the same type.
 
-    Parameters
-    ----------
-    signed : bool
-        Whether a* and b* are numbers with a sign, as TIFF's own CIELAB has them; else they are offset by half of their
-        range, as profiles have them.
+    In TIFF's own CIELAB a* and b* are signed; else they are offset by half of their range, as profiles have them.
     """
     rgb = np.empty_like(lab)
     for top in range(0, len(lab), _ROWS_AT_A_TIME):

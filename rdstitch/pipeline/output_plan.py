@@ -11,7 +11,7 @@ from rdstitch.pipeline.result_files import (
     PosesFrame,
     layer_files,
     make_folder,
-    poses_table,
+    poses_file,
     project_of_hugin,
     write_layers,
 )
@@ -86,7 +86,7 @@ class FilesBeside:
         if isinstance(result, StitchResult) and result.plan is None:
             how = {"whole": self.whole_layers, "overwrite": result.options.overwrite}
             attempt(self.hugin_project, lambda file: outputs.write(file, text_bytes(project_of_hugin(result))))
-            attempt(self.poses, lambda file: outputs.write(file, text_bytes(poses_table(result, self.frame))))
+            attempt(self.poses, lambda file: outputs.write(file, text_bytes(poses_file(result, file, self.frame))))
             attempt(self.layers, lambda folder: write_layers(result, folder, **how, outputs=outputs))
         return failed
 

@@ -9,13 +9,14 @@ from typing import Literal
 import numpy as np
 
 from rdstitch.alignment.frames import stored, turned_alignment, turns
-from rdstitch.alignment.result import Alignment
+from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import intersection
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.errors import ArgumentError, OutputError
+from rdstitch.export.poses_files import geo_of_opendronemap, images_of_colmap
 from rdstitch.export.trajectory_files import as_csv
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import quarter_turn, turning_matrix
@@ -128,17 +129,45 @@ def poses_table(result: StitchResult, frame: PosesFrame = "enu") -> str:
     registration = result.registration
     path = Trajectory.from_alignment(registration.alignment)
     if frame == "map":
-        place, poses = result.georeference, registration.alignment.poses
-        if place is None or poses is None:
-            raise ArgumentError(f"there is no map for the poses: {result.not_georeferenced}; leave out --frame map")
-        turned = np.eye(3) if result.canvas.orientation is None else result.canvas.orientation
-        if np.abs(turned[2, :2]).max() > _LEVEL * abs(turned[2, 2]):
-            raise ArgumentError("poses have no map where the plane was tilted to be upright; leave out --frame map")
-        path = Trajectory.on_map(poses, place.pixel_to_map @ result.canvas.matrix @ (turned / turned[2, 2]))
+        path = Trajectory.on_map(*_poses_and_map(result))
     sources = registration.sources
     numbers = [source.number(k) for k, source in enumerate(sources)]
     path = path.labelled([source.name for source in sources], numbers, timestamps_of(sources))
     return as_csv(path, "enu" if frame == "map" else frame)
+
+
+def _poses_and_map(result: StitchResult) -> tuple[PlanarPoses, FloatArray]:
+    """The poses, and what leads (2, 3) from their plane to the map."""
+    place, poses = result.georeference, result.registration.alignment.poses
+    if place is None or poses is None:
+        raise ArgumentError(f"there is no map for the poses: {result.not_georeferenced}; leave out --frame map")
+    turned = np.eye(3) if result.canvas.orientation is None else result.canvas.orientation
+    if np.abs(turned[2, :2]).max() > _LEVEL * abs(turned[2, 2]):
+        raise ArgumentError("poses have no map where the plane was tilted to be upright; leave out --frame map")
+    return poses, place.pixel_to_map @ result.canvas.matrix @ (turned / turned[2, 2])
+
+
+def poses_file(result: StitchResult, file: str | Path, frame: PosesFrame = "enu") -> str:
+    """What a file of poses holds, by its name: ``images.txt`` is COLMAP's, ``geo.txt`` OpenDroneMap's, else CSV."""
+    name = Path(file).name.lower()
+    if name not in ("images.txt", "geo.txt"):
+        return poses_table(result, frame)
+    sources, poses = result.registration.sources, result.registration.alignment.poses
+    names = [source.name for source in sources]
+    if any(source.metadata.orientation != 1 for source in sources):
+        raise ArgumentError(f"{file}: images that EXIF turns have other axes there; turn the files first")
+    if name == "geo.txt":
+        place = result.georeference
+        poses, to_map = _poses_and_map(result)
+        assert place is not None
+        unit = math.hypot(to_map[0, 0], to_map[1, 0])
+        altitudes = [math.nan if s.metadata.gps is None else s.metadata.gps.altitude or math.nan for s in sources]
+        above = np.array(altitudes) - unit * poses.height
+        ground = float(np.median(above[np.isfinite(above)])) if np.isfinite(above).any() else 0.0
+        return geo_of_opendronemap(names, poses, to_map, place.crs.epsg, ground)
+    if poses is None:
+        raise ArgumentError(f"{file}: one homography per image has no poses; --model pose gives some")
+    return images_of_colmap(names, poses, None if result.georeference is None else _poses_and_map(result)[1])
 
 
 _CONTROL_POINTS = 20  # of a pair; Hugin's own finder takes about as many

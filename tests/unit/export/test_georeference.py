@@ -12,6 +12,7 @@ import rasterio.warp
 from PIL import ExifTags, Image
 
 from rdstitch.arrays import FloatArray
+from rdstitch.camera_files import camera_file_text
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.georeference import Georeference, Located, georeference
@@ -22,9 +23,10 @@ from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.pipeline.result_files import poses_table
+from rdstitch.pipeline.result_files import poses_file, poses_table
 from rdstitch.report import report_page
 from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.results.stitch_result import StitchResult
 from rdstitch.synthetic.poses import Poses
 from tests.cli.running import flight, transfers
 
@@ -428,6 +430,7 @@ def test_positions_and_control_points_from_files(
         replace(result, canvas=replace(result.canvas, orientation=by, matrix=result.canvas.matrix @ np.linalg.inv(by)))
         for by in upright
     )
+    _check_colmap(result, plain, truth, tmp_path)
     again = np.genfromtxt(poses_table(turned, "map").splitlines(), delimiter=",", names=True)
     assert again["x"] == pytest.approx(table["x"], abs=1e-3)
     assert again["yaw_deg"] == pytest.approx(table["yaw_deg"], abs=1e-5)
@@ -456,3 +459,26 @@ def test_gdal_sees_what_was_meant(tmp_path: Path) -> None:
             np.testing.assert_allclose(opened.xy(y, x), place.to_map([(x, y)])[0], atol=1e-6)
         assert opened.overviews(1) == [2, 4]
         np.testing.assert_array_equal(opened.dataset_mask(), alpha)
+
+
+def _check_colmap(result: StitchResult, paths: list[Path], middles: FloatArray, folder: Path) -> None:
+    """COLMAP projects places of the ground to where the images show them, and OpenDroneMap's list has the cameras."""
+    pycolmap = pytest.importorskip("pycolmap")
+    (folder / "model").mkdir()
+    camera = result.registration.camera
+    (folder / "model/cameras.txt").write_text(camera_file_text(camera, "cameras.txt"), encoding="utf-8")
+    (folder / "model/images.txt").write_text(poses_file(result, "images.txt"), encoding="utf-8")
+    (folder / "model/points3D.txt").write_text("", encoding="utf-8")
+    model = pycolmap.Reconstruction(folder / "model")
+    first = poses_file(result, "images.txt").splitlines()[0]
+    origin = np.array([float(value) for value in first.rpartition(": ")[2].split()])
+    images = {image.name: image for image in model.images.values()}
+    for path, middle in zip(paths, middles, strict=True):
+        seen = images[path.name].project_point(np.array([*middle, 0.0]) - origin)
+        # COLMAP counts from the corner of the first pixel.
+        assert np.abs(seen - (200.0, 150.0)).max() < 3.0
+    rows = poses_file(result, "geo.txt").splitlines()
+    assert rows[0] == "EPSG:32734"
+    listed = np.array([[float(value) for value in row.split()[1:4]] for row in rows[1:]])
+    centres = np.array([images[path.name].projection_center() for path in paths]) + origin
+    np.testing.assert_allclose(listed, centres, atol=1e-3)
