@@ -135,6 +135,8 @@ tiles --lambda L|auto: Known λ (half-diagonal frame), or auto: estimate it; oth
 --layers DIR: Write each image, warped, with alpha, and its mask into DIR: TIFF, cropped, with the offsets that enblend
     reads.
 --whole-layers: With --layers: on the whole canvas instead of cropped.
+--bands: Images of several bands by their names: the first one is registered, and the lenses of the others to it; each
+    becomes a file, OUTPUT with - and the band's name before its suffix, all on the same pixels.
 --all-blocks: Stitch every block of overlapping images: the largest becomes OUTPUT, the others OUTPUT with -2, -3, …
     before its suffix.
 --poses FILE: Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does;

@@ -159,11 +159,21 @@ def _lens(text: str) -> float | str:
     return value
 
 
-ANGLES, ANGLE, BYTES, EPSG, EXTENT, CORNERS, LINES, LENS = (
+def _bands(text: str) -> dict[str, str]:
+    """Patterns of images by the names of bands."""
+    pairs = [part.partition("=") for part in text.split(",")]
+    bands = {name.strip(): pattern.strip() for name, _, pattern in pairs}
+    if len(bands) < max(2, len(pairs)) or not all(bands) or not all(bands.values()) or set("/\\") & set("".join(bands)):
+        raise ValueError("is not a list like NIR=*_NIR.TIF,RED=*_RED.TIF")
+    return bands
+
+
+ANGLES, ANGLE, BANDS, BYTES, EPSG, EXTENT, CORNERS, LINES, LENS = (
     Parsed(name, parse)
     for name, parse in (
         ("PSI,THETA", _angles),
         ("DEG", _angle),
+        ("NAME=PATTERN,…", _bands),
         ("SIZE", _bytes),
         ("EPSG:N", _epsg),
         ("W,S,E,N", partial(_pixels, count=4)),

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rdstitch.choices import SolverName
     from rdstitch.compositing import CompositePlan
     from rdstitch.geometry.camera import Camera
+    from rdstitch.pipeline.apply_sidecar import Recomposition
     from rdstitch.pipeline.output_plan import FilesBeside
     from rdstitch.results.registration import Registration
     from rdstitch.results.stitch_options import StitchOptions
@@ -140,6 +141,21 @@ def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = Fal
         reporter.log(f"broken over {one.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}")
     if result.plan is not None and not as_json:
         show_plan(result.plan)
+
+
+def report_applied(result: "Recomposition", reporter: Reporter) -> None:
+    """What the user must know of images that were applied, and what was made of them, or would be."""
+    from rdstitch.results.messages import told_once
+
+    reporter.finish()
+    for missing in told_once(result.left_out.values()):
+        reporter.warn(str(missing))
+    for message in result.messages:
+        reporter.tell(message)
+    if result.plan is not None:
+        show_plan(result.plan)
+    else:
+        reporter.made(result.summary)
 
 
 def show_plan(plan: "CompositePlan") -> None:

@@ -189,7 +189,7 @@ def log_evidence(
     first, second = (tile.content for tile in tiles)
     noise = np.array([tile.noise for tile in tiles])
     shifts = np.zeros((len(overlap.blocks), 2)) if shifts is None else shifts
-    products, pixels, features = np.zeros(3), 0, np.zeros((2, 2))
+    products, pixels, features = np.zeros(3), 0, np.zeros(2)
     for block, moved in zip(overlap.blocks, place + shifts, strict=True):
         low = np.maximum(np.maximum(block[:2], np.ceil(moved).astype(np.intp)), 0)
         high = np.minimum(
@@ -203,7 +203,7 @@ def log_evidence(
         middle = x + (width - 1) / 2.0, y + (height - 1) / 2.0
         b = np.asarray(cv2.getRectSubPix(second, (width, height), middle), dtype=np.float32)
         products += [float(np.vdot(a, a)), float(np.vdot(b, b)), float(np.vdot(a, b))]
-        features += [_energies(a), _energies(b)]
+        features += _energies(a)
         pixels += width * height
     if pixels < _CORRELATED or not min(products[:2]) > 0.0:
         return 0.0
@@ -211,8 +211,7 @@ def log_evidence(
     correlation = min(1.0, max(0.0, products[2]) / math.sqrt(float(content.prod())))
     chance = math.sqrt(_CORRELATED / pixels * float((products[:2] / content).prod()))
     # As many pixels as the energy is spread over, and as are independent: a single bright spot is like any other.
-    independent = products[:2] * features[:, 1] / (2.0 * math.pi * np.maximum(features[:, 0], 1e-30))
-    count = min(_INDEPENDENT, float(independent.min()))
+    count = min(_INDEPENDENT, float(products[0] * features[1] / (2.0 * math.pi * max(features[0], 1e-30))))
     unlike = _UNLIKE + 2.0 * chance
     return -0.5 * count * math.log((1.0 - correlation**2 + unlike) / (1.0 + unlike))
 
@@ -220,7 +219,7 @@ def log_evidence(
 def _energies(image: Image) -> tuple[float, float]:
     """Sums of the fourth powers of samples, and of the squares of their differences from neighbours."""
     squares = image * image
-    slopes = np.diff(image, axis=0), np.diff(image, axis=1)
+    slopes = cv2.subtract(image[1:], image[:-1]), cv2.subtract(image[:, 1:], image[:, :-1])
     return float(np.vdot(squares, squares)), sum(float(np.vdot(slope, slope)) for slope in slopes)
 
 

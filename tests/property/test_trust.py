@@ -36,11 +36,11 @@ def test_one_wrong_match_is_no_depth(tmp_path: Path) -> None:
     ("kind", "seed", "said"),
     [
         ("body", 1, "stays where it is"),
-        ("vehicle", 1, "moves differently"),
+        ("vehicle", 1, ""),
         ("cylinder", 2, "errors of neighbours agree"),
         ("round border", 0, ""),
         pytest.param("banner", 2, "stays where it is", marks=pytest.mark.slow),
-        pytest.param("vehicle", 6, "moves differently", marks=pytest.mark.slow),
+        pytest.param("vehicle", 6, "", marks=pytest.mark.slow),
         pytest.param("curved border", 0, "", marks=pytest.mark.slow),
     ],
 )
@@ -59,8 +59,7 @@ def test_a_vehicle_with_more_matches_than_the_plane_is_not_taken_for_it(seed: in
     judged = judge_set(trust_set(seed, "vehicle"), tmp_path)
     assert judged.status == 0, judged.text
     assert judged.right, judged
-    assert judged.warned
-    assert "moves differently" in judged.text
+    assert judged.complete, judged  # the seams go around it, and nothing need be said
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import click
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
 from rdstitch_cli.option_texts import option
-from rdstitch_cli.stitching import composite_fields, show_plan
+from rdstitch_cli.stitching import composite_fields, report_applied
 from rdstitch_cli.terminal import Reporter
 
 
@@ -49,7 +49,6 @@ def apply(
     shape. Compositing options that are not given are those of the sidecar.
     """
     from rdstitch.pipeline.apply_sidecar import apply as recipe
-    from rdstitch.results.messages import told_once
     from rdstitch.sidecar.read import read_sidecar
 
     chosen = {name: value for name, value in composite_fields(given).items() if options.is_given(name)}
@@ -60,12 +59,4 @@ def apply(
         chosen = {"rectangle": None, "straighten": "off", "level": False, **chosen}
     composite = replace(read_sidecar(sidecar).composite, **chosen)
     result = recipe(sidecar, options.resolve(images), output, composite, match=match, progress=reporter, **given)
-    reporter.finish()
-    for missing in told_once(result.left_out.values()):
-        reporter.warn(str(missing))
-    for message in result.messages:
-        reporter.tell(message)
-    if result.plan is not None:
-        show_plan(result.plan)
-    else:
-        reporter.made(result.summary)
+    report_applied(result, reporter)

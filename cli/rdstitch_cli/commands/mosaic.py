@@ -12,8 +12,8 @@ from rdstitch_cli import following as live
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import command
 from rdstitch_cli.option_texts import option
-from rdstitch_cli.parameter_types import RealNumber
-from rdstitch_cli.stitching import files_beside, stitch_options, summarize
+from rdstitch_cli.parameter_types import BANDS, RealNumber
+from rdstitch_cli.stitching import files_beside, report_applied, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 @options.stitching
 @options.every
 @options.topic
+@option("--bands", BANDS)
 @option("--all-blocks", bool)
 @option("--poses", options.IMAGE)
 @option("--frame", ("enu", "ros", "camera", "map"), "enu", of="mosaic")
@@ -45,6 +46,7 @@ def mosaic(
     inputs: tuple[Path, ...],
     output: Path,
     every: int | None,
+    bands: dict[str, str] | None,
     all_blocks: bool,
     following: bool,
     idle: float | None,
@@ -60,11 +62,14 @@ def mosaic(
     list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
+    from rdstitch.pipeline.bands import mosaic_bands
     from rdstitch.pipeline.recipes import mosaic as recipe
     from rdstitch.pipeline.recipes import mosaic_blocks
 
     if all_blocks and (following or given["strict"]):
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
+    if bands and (all_blocks or following or given["dry_run"]):
+        raise click.UsageError("--bands goes neither with --all-blocks, --follow nor --dry-run")
     with ExitStack() as stack:
         named = list(inputs) if following else options.resolve(inputs)
         with_poses = given["poses"] is not None
@@ -75,6 +80,13 @@ def mosaic(
             watched: dict[str, Any] = {"output": output, "every": every, "idle": idle, "refresh": refresh}
             paths = stack.enter_context(live.followed(inputs, stitch, reporter, **watched, beside=beside))
         how: dict[str, Any] = {"every": every, "progress": beside.timer, "beside": beside}
+        if bands:
+            first, others = mosaic_bands(paths, output, bands, stitch, **how)
+            summarize(first, reporter, as_json=as_json)
+            reporter.made(first.summary)
+            for other in others:
+                report_applied(other, reporter)
+            return
         results = mosaic_blocks(paths, output, stitch, **how) if all_blocks else [recipe(paths, output, stitch, **how)]
         for result in results:
             if following and not as_json:

@@ -13,6 +13,7 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
 from rdstitch.pipeline.apply_sidecar import apply
+from rdstitch.pipeline.bands import mosaic_bands
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.results.stitch_options import StitchOptions
 from tests.cli.running import flight
@@ -69,6 +70,17 @@ def test_a_band_by_another_lens_is_registered(rig: Path, tmp_path: Path) -> None
     again = apply(tmp_path / "nir.tif.json", [rig / "nir"], tmp_path / "again.tif", workers=1)
     assert not [message for message in again.messages if message.code == "band-lens"]
     assert _shift_between(rig / "red.tif", tmp_path / "again.tif") < 0.3
+
+
+def test_all_bands_of_a_rig_at_once(rig: Path, tmp_path: Path) -> None:
+    options = StitchOptions(workers=1, positions=rig / "p.csv")
+    bands = {"RED": "*_red.png", "NIR": "*_NIR.png"}
+    first, others = mosaic_bands([rig / "red", rig / "nir"], tmp_path / "f.tif", bands, options)
+    assert first.output == tmp_path / "f-RED.tif"
+    assert [other.output for other in others] == [tmp_path / "f-NIR.tif"]
+    assert _shift_between(tmp_path / "f-RED.tif", tmp_path / "f-NIR.tif") < 0.3
+    with pytest.raises(ArgumentError, match="no image has a name like"):
+        mosaic_bands([rig / "red"], tmp_path / "g.tif", bands, options)
 
 
 def test_a_lost_image_and_one_from_elsewhere_move_no_other(rig: Path, tmp_path: Path) -> None:
