@@ -22,7 +22,7 @@ from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, text_bytes
 from rdstitch.system.progress import StageTimer
 
-REPORT_SUFFIXES = (".html", ".htm")
+_REPORT_SUFFIXES = (".html", ".htm")
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,14 @@ class FilesBeside:
     timer: StageTimer = field(default_factory=StageTimer)
 
     def __post_init__(self) -> None:
+        for name in ("report", "layers", "hugin_project", "poses"):
+            # Text is as good as a path.
+            if (given := getattr(self, name)) is not None:
+                object.__setattr__(self, name, Path(given))
         if self.whole_layers and self.layers is None:
             raise ArgumentError("whole layers need a folder of layers: --whole-layers goes with --layers DIR")
         if self.report is not None:
-            check_suffix(self.report, REPORT_SUFFIXES)
+            check_suffix(self.report, _REPORT_SUFFIXES)
 
     def files(self, names: Iterable[str]) -> list[Path]:
         """All of them, of images of these names; makes the folder of the layers."""
