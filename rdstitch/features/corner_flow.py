@@ -137,7 +137,10 @@ def _moved(
     """Track corners (N, 2) of one frame into another; where they are, and which were found there (N,)."""
     start = corners[:, None].astype(np.float32)
     # The method takes brightness for constant; exposure and lamps do not.
-    (mean, spread), (mean_after, spread_after) = (np.ravel(cv2.meanStdDev(grey)) for grey in (before, after.grey))
+    shown = (before > 0).astype(np.uint8)  # not what was warped from beyond the image
+    (mean, spread), (mean_after, spread_after) = (
+        np.ravel(cv2.meanStdDev(grey, mask=shown)) for grey in (before, after.grey)
+    )
     gain = spread_after / max(spread, 1e-6)
     if abs(math.log(max(gain, 1e-6))) > _SAME_LIGHT or abs(mean_after - mean) > _SAME_LIGHT * mean:
         same = np.rint(before * np.float32(gain) + np.float32(mean_after - gain * mean))
