@@ -28,12 +28,13 @@ _TABLE = """
 * --scale: Scale of the output; 1 keeps the resolution of the reference image, one of the largest.
 * --report FILE: Write a report to FILE (.html): graph, votes on λ, matches, residuals.
 trajectory --format: csv: a table with names, time stamps, x, y, yaw_deg, height and their covariances. tum: time,
-    position and quaternion. kitti: matrices.
+    position and quaternion. kitti: matrices. bag: nav_msgs/Odometry on /odom, ROS 1 (.bag) or ROS 2 (a folder).
 undistort --format: Format of the files written; otherwise that of each image, or png where it cannot be written.
-mosaic --frame: Axes of --poses. enu, camera: of the first image, in heights of it, as for 'rdstitch trajectory'. map:
-    easting, northing and height in metres, where the output is georeferenced.
-trajectory --frame: Axes of positions. enu: x to the right and y to the top of the first image, z up; default but for
-    kitti. camera: x to the right, y to the bottom, z down. yaw_deg is counterclockwise as seen from above in both.
+mosaic --frame: Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. map: easting,
+    northing and height in metres, where the output is georeferenced.
+trajectory --frame: Axes of positions. enu: x to the right and y to the top of the first image, z up; default of csv and
+    tum. ros: x to the top, y to the left, z up; default of bag. camera: x to the right, y to the bottom, z down;
+    default of kitti. yaw_deg is counterclockwise as seen from above in all.
 --height H: Height of the first frame above the plane; positions have its unit.
 --view: Field of view: size and scale of the image, everything it shows, or without empty borders.
 * -q --quiet: Print errors only.
@@ -141,6 +142,8 @@ tiles --lambda L|auto: Known λ (half-diagonal frame), or auto: estimate it; oth
 --poses FILE: Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does;
     images.txt: COLMAP's; geo.txt: OpenDroneMap's.
 --hugin-project FILE: Write a project for Hugin (.pto): all images with lens and pose, and control points.
+--map-server DIR: Write map.yaml and map.png, which nav2_map_server loads, into DIR; in metres by --height, with the
+    first image at the origin and its top along x.
 --plot FILE: Draw the path to FILE (SVG).
 --json: Print {} as JSON.
 # Control

@@ -45,6 +45,10 @@ def covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray]:
     every = np.arange(named + len(problem.free_lens))
     estimated = every[np.concatenate([np.ones(named, dtype=np.bool_), problem.free_lens])]
     of_estimated, considered = sandwich_covariances(free_every.adjuster_of(fit), fit.adjusted, (estimated, every))
+    if problem.free_lens.any():  # what is left open of the lens moves tilt and focal length, too
+        ratio = np.diag(considered)[:named] / np.maximum(np.diag(of_estimated)[:named], 1e-300)
+        grown = np.append(np.sqrt(np.maximum(ratio, 1.0)), np.ones(len(of_estimated) - named))
+        of_estimated = grown[:, None] * of_estimated * grown
     return of_estimated, considered[named:, named:]
 
 
@@ -215,6 +219,8 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
 
     (N, 4, 4) of each image, zero for the reference; and the same of each image (rows) with the first one (columns).
     """
+    if problem.free_lens.any():  # what is left open of the lens moves them, too
+        problem = replace(problem, free_lens=np.ones_like(problem.free_lens))
     adjuster, model, parameters = problem.adjuster_of(fit), fit.model, fit.adjusted.parameters
     assert isinstance(model, PlanarModel)
     normal, free = adjuster.normal_equations(fit.adjusted), adjuster.free.poses

@@ -111,8 +111,8 @@ def compare_overlaps(survey: Survey) -> Cells | None:
 def _evidence(moments: FloatArray, clipped: BoolArray) -> FloatArray:
     """How surely both images show the same in cells (M,), from the means of p, q, pp, qq and pq, shape (5, M).
 
-    By the squared correlation of their patterns; where both are plain, they are taken to be alike, but count for less
-    than any pattern, and where a sample is ``clipped`` for less still.
+    By the squared correlation of their patterns; where both are plain, or a sample is ``clipped``, they are taken to be
+    alike, but count for less than any pattern.
     """
     p, q, pp, qq, pq = moments
     plain = (_PLAIN * float(np.median(moments[:2]))) ** 2
@@ -120,7 +120,7 @@ def _evidence(moments: FloatArray, clipped: BoolArray) -> FloatArray:
     alike = ((pq - p * q + plain) / np.sqrt((first + plain) * (second + plain))).clip(0.0, 1.0) ** 2
     weaker = np.minimum(first, second)
     patterned = np.where(clipped, 0.0, weaker / (weaker + plain))
-    return np.asarray(alike * (patterned + (1.0 - patterned) * _PLAIN_COUNTS ** (1.0 + clipped)))
+    return np.asarray(alike * (patterned + (1.0 - patterned) * _PLAIN_COUNTS))
 
 
 def _grey(pixels: NDArray[Any]) -> Float32Array:

@@ -26,7 +26,7 @@ from rdstitch.arrays import FloatArray
 
 TrajectoryFrame = Literal["enu", "camera", "ros"]
 
-_AXES: dict[TrajectoryFrame, FloatArray] = {
+AXES: dict[TrajectoryFrame, FloatArray] = {
     "enu": np.array([[1.0, 0.0], [0.0, -1.0]]),
     "camera": np.eye(2),
     "ros": np.array([[0.0, -1.0], [-1.0, 0.0]]),
@@ -83,14 +83,14 @@ def frame_of(layout: str) -> TrajectoryFrame:
 
 def in_frame(x: float, y: float, frame: TrajectoryFrame) -> tuple[float, float]:
     """Coordinates x and y in a frame of reference, given in the axes of the first image."""
-    there = _AXES[frame] @ (x, y) + 0.0  # no minus zero
+    there = AXES[frame] @ (x, y) + 0.0  # no minus zero
     return float(there[0]), float(there[1])
 
 
 def covariance_in_frame(covariance: FloatArray, frame: TrajectoryFrame) -> FloatArray:
     """Covariances (..., 4, 4) of x, y, height and yaw in a frame of reference, given in the axes of the first image."""
     change = np.eye(4)
-    change[:2, :2] = _AXES[frame]
+    change[:2, :2] = AXES[frame]
     return np.asarray(change @ covariance @ change.T)
 
 
@@ -109,7 +109,7 @@ def ros_covariance(covariance: FloatArray, frame: TrajectoryFrame) -> FloatArray
 
 def _turn(frame: TrajectoryFrame) -> float:
     """Sign of z down, and so of a turn about z against the yaw, in a frame of reference."""
-    return float(np.linalg.det(_AXES[frame]))
+    return float(np.linalg.det(AXES[frame]))
 
 
 def as_csv(path: Trajectory, frame: TrajectoryFrame) -> str:
@@ -138,7 +138,7 @@ def as_csv(path: Trajectory, frame: TrajectoryFrame) -> str:
 def as_tum(path: Trajectory, frame: TrajectoryFrame) -> str:
     """Lines ``timestamp tx ty tz qx qy qz qw``; where not every frame has a time, numbers of frames stand for them."""
     times = path.timestamp if path.timestamp is not None and has_times(path) else path.frame
-    half = -_turn(frame) * path.yaw / 2
+    half = heading(path, frame) / 2
     rows = zip(times, positions_in_frame(path, frame), np.sin(half), np.cos(half), strict=True)
     lines = [f"{time:.6f} {x:.9g} {y:.9g} {z:.9g} 0 0 {qz:.9g} {qw:.9g}" for time, (x, y, z), qz, qw in rows]
     return "\n".join(lines) + "\n"
@@ -147,16 +147,21 @@ def as_tum(path: Trajectory, frame: TrajectoryFrame) -> str:
 def as_kitti(path: Trajectory, frame: TrajectoryFrame) -> str:
     """Lines of the 12 numbers of ``[R t]``, row by row; frames that were left out have no line."""
     lines = []
-    for (x, y, z), turn in zip(positions_in_frame(path, frame), -_turn(frame) * path.yaw, strict=True):
+    for (x, y, z), turn in zip(positions_in_frame(path, frame), heading(path, frame), strict=True):
         c, s = np.cos(turn), np.sin(turn)
         pose = (c, -s, 0.0, x, s, c, 0.0, y, 0.0, 0.0, 1.0, z)
         lines.append(" ".join(f"{value:.9g}" for value in pose))
     return "\n".join(lines) + "\n"
 
 
+def heading(path: Trajectory, frame: TrajectoryFrame) -> FloatArray:
+    """Turn of the camera about z (F,), radians."""
+    return np.asarray(-_turn(frame) * path.yaw)
+
+
 def positions_in_frame(path: Trajectory, frame: TrajectoryFrame) -> FloatArray:
     """x, y and z of the camera, shape (F, 3)."""
-    return np.column_stack([path.position @ _AXES[frame].T, -_turn(frame) * path.height]) + 0.0  # no minus zero
+    return np.column_stack([path.position @ AXES[frame].T, -_turn(frame) * path.height]) + 0.0  # no minus zero
 
 
 def has_times(path: Trajectory) -> bool:

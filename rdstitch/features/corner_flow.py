@@ -5,6 +5,7 @@ first: of rendered frames that share 80 %, half of the corners are less than 0.0
 SIFT's matches 0.11.
 """
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import pairwise
@@ -23,6 +24,7 @@ _WINDOW, _LEVELS = (15, 15), 3
 _MARGIN = 8.0  # pixels, half a window
 _EXPECTED_LEVELS = 1  # where the expected motion has been taken out
 _NODES = 9  # a side, by which an expected motion is interpolated
+_SAME_LIGHT = 0.05  # change of brightness and contrast up to which they count as constant
 _STILL, _MOVED = 0.5, 3.0  # pixels: what stays in the image, such as a robot's body, and what moves with the ground
 _SEEN_TO_MOVE = 15  # corners that move, where those that do not are none of the ground
 _PLACES, _SURE = 32, 3  # a side, that are told apart, and still corners more than moving ones that make one static
@@ -134,6 +136,12 @@ def _moved(
 ) -> tuple[FloatArray, BoolArray]:
     """Track corners (N, 2) of one frame into another; where they are, and which were found there (N,)."""
     start = corners[:, None].astype(np.float32)
+    # The method takes brightness for constant; exposure and lamps do not.
+    (mean, spread), (mean_after, spread_after) = (np.ravel(cv2.meanStdDev(grey)) for grey in (before, after.grey))
+    gain = spread_after / max(spread, 1e-6)
+    if abs(math.log(max(gain, 1e-6))) > _SAME_LIGHT or abs(mean_after - mean) > _SAME_LIGHT * mean:
+        same = np.rint(before * np.float32(gain) + np.float32(mean_after - gain * mean))
+        before = np.clip(same, 0, 255).astype(np.uint8)
     at, status, _ = cv2.calcOpticalFlowPyrLK(
         before, after.grey, start, np.empty_like(start), winSize=_WINDOW, maxLevel=levels
     )

@@ -156,7 +156,7 @@ def _joins(other: Alignment, alignment: Alignment) -> bool:
 
 
 def _is_stretched(layout: Layout) -> bool:
-    """Whether a plane shows some places much larger than most, or much longer than wide."""
+    """Whether a plane shows some places much larger than most, or much longer than wide, lens apart."""
     canvas = layout.canvas
     if canvas.projection != PLANE:
         return False
@@ -164,9 +164,9 @@ def _is_stretched(layout: Layout) -> bool:
     for image in layout.images:
         size = np.array(image.camera.image_size)
         at, step = _GRID * size, 1e-3 * size[1]
-        middle, right, down = (
-            canvas.place(image.camera, image.homography, at + d) for d in ((0, 0), (step, 0), (0, step))
-        )
+        # A fisheye's border is stretched on any plane.
+        flat = replace(image.camera, distortion=0.0, distortion2=0.0, distortion3=0.0, image_circle=None)
+        middle, right, down = (canvas.place(flat, image.homography, at + d) for d in ((0, 0), (step, 0), (0, step)))
         shown = np.isfinite(middle + right + down).all(axis=1)
         jacobian = np.stack([right - middle, down - middle], axis=-1)[shown] / step
         magnification.append(np.linalg.svd(jacobian, compute_uv=False))

@@ -22,7 +22,7 @@ from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, text_bytes
 from rdstitch.system.progress import StageTimer
 
-REPORT_SUFFIXES = (".html", ".htm")
+_REPORT_SUFFIXES = (".html", ".htm")
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,9 @@ class FilesBeside:
     hugin_project, poses : path, optional
         Project of Hugin (.pto), and table of poses as :func:`rdstitch.trajectory` writes it.
     frame : str
-        Axes of the poses: "enu", "camera" or "map".
+        Axes of the poses: "enu", "ros", "camera" or "map".
+    height : float
+        Of the first image above the plane, metres; positions are in metres then, and in heights with 1.
     command : str
         The command line, for the report.
     timer : StageTimer
@@ -53,14 +55,19 @@ class FilesBeside:
     hugin_project: Path | None = None
     poses: Path | None = None
     frame: PosesFrame = "enu"
+    height: float = 1.0
     command: str = ""
     timer: StageTimer = field(default_factory=StageTimer)
 
     def __post_init__(self) -> None:
+        for name in ("report", "layers", "hugin_project", "poses"):
+            # Text is as good as a path.
+            if (given := getattr(self, name)) is not None:
+                object.__setattr__(self, name, Path(given))
         if self.whole_layers and self.layers is None:
             raise ArgumentError("whole layers need a folder of layers: --whole-layers goes with --layers DIR")
         if self.report is not None:
-            check_suffix(self.report, REPORT_SUFFIXES)
+            check_suffix(self.report, _REPORT_SUFFIXES)
 
     def files(self, names: Iterable[str]) -> list[Path]:
         """All of them, of images of these names; makes the folder of the layers."""
@@ -82,7 +89,8 @@ class FilesBeside:
         if isinstance(result, StitchResult) and result.plan is None:
             how = {"whole": self.whole_layers, "overwrite": result.options.overwrite}
             attempt(self.hugin_project, lambda file: outputs.write(file, text_bytes(project_of_hugin(result))))
-            attempt(self.poses, lambda file: outputs.write(file, text_bytes(poses_file(result, file, self.frame))))
+            table = partial(poses_file, result, frame=self.frame, height=self.height)
+            attempt(self.poses, lambda file: outputs.write(file, text_bytes(table(file))))
             attempt(self.layers, lambda folder: write_layers(result, folder, **how, outputs=outputs))
         return failed
 

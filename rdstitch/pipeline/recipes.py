@@ -37,7 +37,7 @@ from rdstitch.system.outputs import Outputs, TemporaryFolder, check_outputs, jso
 from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.verdict import RefusedError
 
-TrajectoryFormat = Literal["csv", "tum", "kitti"]
+TrajectoryFormat = Literal["csv", "tum", "kitti", "bag"]
 
 _NO_TIMES = Message(
     "not every image has a time stamp: numbers of frames stand for them; give --timestamps", code="no-time-stamps"
@@ -347,7 +347,8 @@ def trajectory(
     output : path, optional
         File to write.
     layout : str
-        "csv", "tum" or "kitti"; see :mod:`rdstitch.export.trajectory_files`.
+        "csv", "tum" or "kitti", see :mod:`rdstitch.export.trajectory_files`; "bag": ``nav_msgs/Odometry``, see
+        :mod:`rdstitch.export.odometry_bag`.
     timestamps : path, optional
         As in ``options``.
     plot : path, optional
@@ -383,11 +384,16 @@ def trajectory(
     path = path.labelled(
         [s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], timestamps_of(sources)
     )
-    if layout == "tum" and not has_times(path):
+    if layout in ("tum", "bag") and not has_times(path):
         registration = registration.with_messages([_NO_TIMES])
     with Outputs(options.overwrite) as outputs:
         if output is not None:
-            outputs.write(output, text_bytes(WRITERS[layout](path, frame or frame_of(layout))))
+            if layout == "bag":
+                from rdstitch.export.odometry_bag import write_bag
+
+                write_bag(path, Path(output), frame or frame_of(layout), overwrite=options.overwrite)
+            else:
+                outputs.write(output, text_bytes(WRITERS[layout](path, frame or frame_of(layout))))
         if plot is not None:
             file, drawn = plot, path_as_svg(path, "heights" if height == 1.0 else "m")
             failed = outputs.attempt(file, lambda: outputs.write(file, text_bytes(drawn)))

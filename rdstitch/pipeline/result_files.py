@@ -113,21 +113,23 @@ def write_layers(
 
 _LEVEL = 1e-9  # rounding of what a turn within the plane leaves as it is
 
-PosesFrame = Literal["enu", "camera", "map"]
+PosesFrame = Literal["enu", "ros", "camera", "map"]
 
 
-def poses_table(result: StitchResult, frame: PosesFrame = "enu") -> str:
+def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float = 1.0) -> str:
     """The table that ``rdstitch trajectory`` writes, of a mosaic; with covariances where ``options`` asked for them.
 
     Parameters
     ----------
     frame : str
-        "enu" or "camera", see :mod:`rdstitch.export.trajectory_files`, in heights of the first image; "map": easting,
-        northing and the height above the ground in metres, with yaw zero where the top of an image is north. The
+        "enu", "ros" or "camera", see :mod:`rdstitch.export.trajectory_files`; "map": easting, northing and the height
+        above the ground in metres, with yaw zero where the top of an image is north. The
         covariances are then relative to the reference image; how well that is placed, the georeference says.
+    height : float
+        Of the first image, in the unit that positions shall have; not for "map".
     """
     registration = result.registration
-    path = Trajectory.from_alignment(registration.alignment)
+    path = Trajectory.from_alignment(registration.alignment, height)
     if frame == "map":
         path = Trajectory.on_map(*_poses_and_map(result))
     sources = registration.sources
@@ -147,11 +149,11 @@ def _poses_and_map(result: StitchResult) -> tuple[PlanarPoses, FloatArray]:
     return poses, place.pixel_to_map @ result.canvas.matrix @ (turned / turned[2, 2])
 
 
-def poses_file(result: StitchResult, file: str | Path, frame: PosesFrame = "enu") -> str:
+def poses_file(result: StitchResult, file: str | Path, frame: PosesFrame = "enu", height: float = 1.0) -> str:
     """What a file of poses holds, by its name: ``images.txt`` is COLMAP's, ``geo.txt`` OpenDroneMap's, else CSV."""
     name = Path(file).name.lower()
     if name not in ("images.txt", "geo.txt"):
-        return poses_table(result, frame)
+        return poses_table(result, frame, height)
     sources, poses = result.registration.sources, result.registration.alignment.poses
     names = [source.name for source in sources]
     if any(source.metadata.orientation != 1 for source in sources):

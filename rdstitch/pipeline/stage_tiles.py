@@ -146,10 +146,22 @@ def place_tiles(
 def _as_tiles(inputs: Any) -> list[Named]:
     """What the user gave as a list of files and images."""
     if not isinstance(inputs, str | os.PathLike | PIL.Image.Image) and getattr(inputs, "ndim", 0) in (3, 4):
-        inputs = [inputs[k] for k in range(len(inputs))]
+        inputs = [inputs[k] if isinstance(inputs, np.ndarray) else _Part(inputs, k) for k in range(inputs.shape[0])]
     if isinstance(inputs, str | os.PathLike | PIL.Image.Image):
         return with_position_folders(as_inputs(inputs))
     return with_position_folders(as_inputs([_as_tile(item, index) for index, item in enumerate(inputs)]))
+
+
+class _Part:
+    """One tile of an array of all, which is read when it is needed."""
+
+    def __init__(self, whole: Any, index: int) -> None:
+        self._whole, self._index = whole, index
+        self.shape, self.dtype = tuple(whole.shape[1:]), whole.dtype
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> NDArray[Any]:
+        """The tile in memory."""
+        return np.asarray(self._whole[self._index])
 
 
 def _as_tile(item: Any, index: int) -> Any:

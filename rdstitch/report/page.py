@@ -37,8 +37,6 @@ from rdstitch.stage.register_tiles import TileRegistration
 from rdstitch.system.outputs import Outputs
 from rdstitch.viewer import viewer_path
 
-REPORT_SUFFIXES = (".html", ".htm")
-
 _THUMBNAIL, _MOSAIC_SIDE = 200, 1200  # pixels of the longer side
 _MAX_NAMES, _MAX_ROWS = 12, 20
 _OUTLINED = {"stroke_width": 3.0, "paint_order": "stroke"}

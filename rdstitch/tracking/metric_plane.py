@@ -19,6 +19,7 @@ so that they count as one."""
 
 _TILT_STARTS = (0.0, 0.0), (0.35, 0.0), (-0.35, 0.0), (0.0, 0.35), (0.0, -0.35)
 _STEPS, _DIFFERENCE, _SETTLED = 15, 1e-5, 1e-6  # radians
+_MAX_CONDITION, _HALVINGS = 1e6, 6
 _HORIZON = 0.05  # of a ray of unit depth: what is nearer to the horizon has no place
 
 
@@ -79,52 +80,78 @@ class SeenPair:
     attitude1: FloatArray  # attitude1, attitude2: (2,): as measured, radians; zeros where nothing was
     attitude2: FloatArray
 
-    def errors(self, tilt: FloatArray) -> FloatArray:
-        """How far (2 N,) their points on the plane are from a rigid motion, in heights; inf beyond the horizon."""
+    def errors(self, camera: FloatArray) -> FloatArray:
+        """How far (2 N,) their points on the plane are from a rigid motion, focal lengths; inf beyond the horizon.
+
+        ``camera``: the tilt, and log of how much longer the focal length is.
+        """
         one, two = (
-            _on_plane(rays, tilt + attitude)
+            _on_plane(rays / np.exp(camera[2]), camera[:2] + attitude)
             for rays, attitude in ((self.rays1, self.attitude1), (self.rays2, self.attitude2))
         )
         one, two = one - one.mean(), two - two.mean()
         turn = complex(np.vdot(two, one))
-        errors = one - turn / max(abs(turn), 1e-300) * two
+        # In given focal lengths, as the points were measured: a longer one makes no errors smaller.
+        errors = (one - turn / max(abs(turn), 1e-300) * two) * np.exp(camera[2])
         return np.concatenate([errors.real, errors.imag])
 
 
-def tilt_of(pairs: Sequence[SeenPair]) -> tuple[tuple[float, float], float, float]:
-    """The tilt (ψ, θ) by which the motions between frames are rigid, radians, its standard deviation, and their rms.
+@dataclass(frozen=True)
+class ShownCamera:
+    """What motions show of a camera."""
 
-    Rigid motions are taken out, so that two parameters are left. The rms is in heights.
-    """
+    tilt: tuple[float, float]  # (ψ, θ), radians, with the focal length that is given
+    tilt_std: float  # of its less certain direction
+    rms: float  # of the points on the plane, heights
+    log_focal: float  # log of how much longer the focal length is than the given one, by the motions alone
+    log_focal_std: float
 
-    def errors(tilt: FloatArray) -> FloatArray:
-        return np.concatenate([pair.errors(tilt) for pair in pairs])
 
-    best, jacobian = (np.zeros(2), errors(np.zeros(2))), np.zeros((0, 2))
-    for start in _TILT_STARTS:
-        tilt = np.array(start)
-        value = errors(tilt)
+def shown_camera(pairs: Sequence[SeenPair]) -> ShownCamera:
+    """The tilt, and the focal length, by which the motions between frames are rigid."""
+
+    def errors(camera: FloatArray) -> FloatArray:
+        with np.errstate(all="ignore"):  # beyond the horizon
+            return np.concatenate([pair.errors(camera) for pair in pairs])
+
+    def fitted(start: FloatArray, free: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The camera, its errors and their derivatives (2 N, free) after Gauss and Newton's steps."""
+        camera, value, change = start, errors(start), np.zeros((0, free))
         for _ in range(_STEPS):
-            change = np.stack([errors(tilt + step) - value for step in _DIFFERENCE * np.eye(2)], axis=1) / _DIFFERENCE
+            steps = _DIFFERENCE * np.eye(3)[:free]
+            change = np.stack([errors(camera + step) - value for step in steps], axis=1) / _DIFFERENCE
             if not np.isfinite(change).all():
                 break
-            step = np.linalg.lstsq(change, value, rcond=None)[0]
-            after = errors(tilt - step)
-            if not after @ after < value @ value:
+            step = np.zeros(3)
+            step[:free] = np.linalg.lstsq(change, value, rcond=None)[0]
+            shorter = ((step / 2**k, errors(camera - step / 2**k)) for k in range(_HALVINGS))
+            step, after = next((one for one in shorter if one[1] @ one[1] < value @ value), (step, None))
+            if after is None:
                 break
-            tilt, value, settled = tilt - step, after, float(abs(step).max()) < _SETTLED
-            if settled:
+            camera, value = camera - step, after
+            if abs(step).max() < _SETTLED:
                 break
-        if value @ value <= best[1] @ best[1] and np.isfinite(change).all():
-            best, jacobian = (tilt, value), change
-    tilt, value = best
+        return camera, value, change
+
+    fits = [fitted(np.append(start, 0.0), 2) for start in _TILT_STARTS]
+    fits = [fit for fit in fits if np.isfinite(fit[2]).all()]
+    if not fits:
+        return ShownCamera((0.0, 0.0), math.inf, math.inf, 0.0, math.inf)
+    camera, value, change = min(fits, key=lambda fit: float(fit[1] @ fit[1]))
     count = len(value) // 2
-    variance = value @ value / max(2 * count - 2 - 3 * len(pairs), 1)
+    freedom = max(2 * count - 3 - 3 * len(pairs), 1)
     together = max(count / (len(pairs) * _CELLS**2 / 2), 1.0)
-    information = jacobian.T @ jacobian if len(jacobian) else np.zeros((2, 2))
-    least = max(float(np.linalg.eigvalsh(information)[0]), 1e-300)
-    std = math.sqrt(together * variance / least)
-    return (float(tilt[0]), float(tilt[1])), std, math.sqrt(value @ value / max(count, 1))
+    least = max(float(np.linalg.eigvalsh(change.T @ change)[0]), 1e-300)
+    longer, better, slope = fitted(camera, 3)
+    known = np.isfinite(slope).all() and np.linalg.cond(slope) < _MAX_CONDITION
+    inverse = np.linalg.inv(slope.T @ slope) if known else np.full((3, 3), math.inf)
+    return ShownCamera(
+        (float(camera[0]), float(camera[1])),
+        math.sqrt(together * float(value @ value) / freedom / least),
+        math.sqrt(float(value @ value) / max(count, 1)),
+        float(longer[2]),
+        math.sqrt(together * float(better @ better) / freedom * float(inverse[2, 2])),
+    )
 
 
 def _on_plane(rays: FloatArray, tilt: FloatArray) -> NDArray[np.complex128]:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Features, Matcher
 from rdstitch.features.corner_flow import CornerFlow, corners_of, matched_corners
@@ -23,7 +24,7 @@ from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
-from rdstitch.tracking.metric_plane import MetricPlane, SeenPair, chained, tilt_of
+from rdstitch.tracking.metric_plane import MetricPlane, SeenPair, ShownCamera, chained, shown_camera
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 
 _ALIGNMENT_IMPORTS = "scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial"
@@ -40,6 +41,7 @@ _KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of an image of 640
 _MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
 _GRID = 8  # points a side by which that is measured
+_CONTRADICTED = 3.7  # standard deviations: odds of a thousand to one
 _TILT_STD, _RIGID = 0.004, 1.0  # radians and pixels, up to which a tilt found by few keyframes makes metric poses
 _MAX_LOST_FRAMES = 10  # frames in a row without a place, after which a new map begins, if all keyframes were searched
 _MAX_WAITING = 500  # frames between the first keyframes that are placed with them
@@ -173,8 +175,12 @@ class Tracker:
         self._distortion = options.pair.distortion
         self._std = 0.0 if self.distortion_known else math.inf
         self._length_std = math.nan
+        # Of positions, relative to their distance from the first, and of yaw, by a lens that is still estimated.
+        self._shape_std = (0.0, 0.0)
         self._focal: float | None = None  # half diagonals, once one was found with a lens that is kept
         self._plane: MetricPlane | None = None
+        self._doubt = 0.0  # of the logarithm of the focal length, where the images contradict it
+        self._settled = False  # whether an alignment has weighed what is given
         self.messages: list[Message] = []
         self._start_map()
 
@@ -442,7 +448,7 @@ class Tracker:
         self._window_links = [link for link in links if link.image1 in kept and link.image2 in kept]
         if not self.distortion_known:
             self._vote()
-        revised = [] if self._mapped or self._plane is not None else self._find_plane(frame)
+        revised = self._find_plane(frame)
         if self._options.patient and self._keyframes_seen >= self._taken_over_at:
             revised += self._take_over(None)
         if self._keyframes_seen + 1 >= self._next_alignment and self._alignment is None:
@@ -455,10 +461,8 @@ class Tracker:
             self._align_window()
         return revised
 
-    def _find_plane(self, frame: _Frame) -> list[Tracked]:
-        """The map by the tilt that a few keyframes show, where lens and focal length are given."""
-        if not self._metric_camera(frame.camera) or self._model not in ("auto", "rigid"):
-            return []
+    def _shown_camera(self, frame: _Frame) -> ShownCamera:
+        """What the links of the keyframes show of a camera whose lens and focal length are given."""
         focal, by_number = frame.camera.focal, {keyframe.number: keyframe for keyframe in self._keyframes}
         assert focal is not None
 
@@ -468,16 +472,33 @@ class Tracker:
 
         pairs = []
         for link in self._window_links:
-            (rays1, one), (rays2, two) = (
-                seen(by_number[link.image1], link.points1),
-                seen(by_number[link.image2], link.points2),
-            )
+            rays1, one = seen(by_number[link.image1], link.points1)
+            rays2, two = seen(by_number[link.image2], link.points2)
             pairs.append(SeenPair(rays1, rays2, one, two))
-        tilt, std, rms = tilt_of(pairs)
-        if not (std < _TILT_STD and rms * focal < _RIGID):
+        shown = shown_camera(pairs)
+        uncertain = math.hypot(shown.log_focal_std, frame.camera.focal_log_std)
+        if abs(shown.log_focal) > _CONTRADICTED * uncertain:
+            self._doubt = math.hypot(shown.log_focal, shown.log_focal_std)
+            self._length_std = max(self._length_std, self._doubt)
+            self._tell(
+                f"the images contradict the given focal length of {focal:.1f} pixels: they show about "
+                f"{focal * math.exp(shown.log_focal):.1f}; lengths are as uncertain until that is settled",
+                "focal-contradicted",
+            )
+        return shown
+
+    def _find_plane(self, frame: _Frame) -> list[Tracked]:
+        """The map by the tilt that a few keyframes show, where lens and focal length are given."""
+        if not self._metric_camera(frame.camera) or self._settled or self._model not in ("auto", "rigid"):
             return []
-        self._plane = MetricPlane(focal / frame.camera.scale, tilt, rigid=True)
-        self._length_std, waiting = frame.camera.focal_log_std, self.numbers_without_place
+        shown, focal = self._shown_camera(frame), frame.camera.focal
+        if self._plane is not None or self._mapped:
+            return []
+        assert focal is not None
+        if not (shown.tilt_std < _TILT_STD and shown.rms * focal < _RIGID):
+            return []
+        self._plane = MetricPlane(focal / frame.camera.scale, shown.tilt, rigid=True)
+        self._length_std, waiting = max(self._doubt, frame.camera.focal_log_std), self.numbers_without_place
         first, *others = self._keyframes
         first.place, first.covariance = self._plane.below(first.camera, first.attitude), np.zeros((4, 4))
         first.aligned = self._mapped = True
@@ -527,7 +548,7 @@ class Tracker:
             most=_MATCHES,
             attitudes=np.array(attitudes) if len(attitudes) == len(cameras) else None,
             reference=None,
-            pose_covariance=False,
+            pose_covariance=known is None,
         )
         executor = self._executor if self._mapped else self._first_executor
         self._alignment = list(self._keyframes), executor.submit(align, cameras, links, options)
@@ -563,9 +584,14 @@ class Tracker:
             )
             if used
         ]
-        self._mapped = True
+        self._mapped = self._settled = True
         if self._focal is None:
             self._length_std = alignment.length_std
+        if any(message.code == "focal-contradicted" for message in alignment.messages):
+            # The unit of the map was another one: all keyframes are placed anew.
+            self._focal, self._length_std = alignment.focal, alignment.length_std
+            for keyframe in (*self._older, *self._keyframes):
+                keyframe.aligned = False
         waiting, move = self.numbers_without_place, _to_map(placed)
         for keyframe, placement in placed:
             keyframe.place, keyframe.aligned = move.applied(placement), True
@@ -580,6 +606,15 @@ class Tracker:
     def _learn(self, alignment: Alignment, keyframes: Sequence[_Frame]) -> None:
         """Keep what an alignment shows of the camera, for the frames to come."""
         poses, tilt = alignment.poses, alignment.tilt
+        self._shape_std = (0.0, 0.0)
+        if poses is not None and poses.covariance is not None:
+            path = Trajectory.from_poses(poses)
+            far = np.linalg.norm(path.position, axis=1)
+            last = int(np.argmax(far))
+            if path.covariance is not None and far[last] > 0.0:
+                # Across: along it is what all lengths share.
+                variance = float(np.linalg.eigvalsh(path.covariance[last, :2, :2])[0]) / far[last] ** 2
+                self._shape_std = math.sqrt(max(variance, 0.0)), math.sqrt(float(path.covariance[:, 3, 3].max()))
         measured = [keyframe.attitude for keyframe in keyframes]
         known = ("rigid", "similarity", *(("tilting",) if None not in measured else ()))
         if alignment.model in known and poses is not None and tilt and alignment.focal:
@@ -601,6 +636,19 @@ class Tracker:
             pair = replace(self._options.pair, distortion=self._distortion, solver="auto")
             self._options = replace(self._options, pair=pair)
             self._model, self._focal = alignment.model, alignment.focal
+
+    def _covariance(self, frame: _Frame, pose: CameraPose) -> FloatArray | None:
+        """Of a frame's pose, with what all frames have in common but for the unit of lengths."""
+        known, (relative, yaw_std) = frame.covariance, self._shape_std
+        if known is None:
+            if not relative:
+                return None
+            known = np.zeros((4, 4))
+        place = (relative * math.hypot(pose.x, pose.y)) ** 2
+        if frame.attitude is not None:
+            # The foot of the camera is off by the error of its tilt, and so is that of the first frame.
+            place += 2.0 * (pose.height * self._options.alignment.attitudes_std) ** 2
+        return np.asarray(known + np.diag([place, place, 0.0, yaw_std**2]))
 
     def _tell(self, text: str, code: str = "") -> None:
         """Keep a message, if it is new."""
@@ -625,7 +673,7 @@ class Tracker:
             keyframe=keyframe,
             inliers=inliers,
             quality=frame.quality,
-            covariance=frame.covariance if placement is not None else None,
+            covariance=None if placement is None or placement.pose is None else self._covariance(frame, placement.pose),
             length_std=self._length_std,
             reason=reason,
         )

@@ -69,7 +69,7 @@ def test_defaults_are_the_librarys(name: str) -> None:
     context = cli.commands[name].make_context(name, ["a.png", "b.png", "-o", "out.png"])
     of_command = {"inputs", "output", "every", "preview", "report", "as_json", "quiet", "verbose"}
     of_command |= {"layout", "frame", "plot", "height", "following", "idle", "refresh"}
-    of_command |= {"all_blocks", "layers", "whole_layers", "poses", "hugin_project"}
+    of_command |= {"all_blocks", "layers", "whole_layers", "poses", "hugin_project", "map_server"}
     given = {key: value for key, value in context.params.items() if key not in of_command}
     with context.scope(cleanup=False), Reporter(-1) as reporter:
         assert stitch_options(reporter, **given) == StitchOptions()

@@ -114,7 +114,8 @@ def test_two_videos_of_one_name_are_two(rdstitch: Run, frames: list[Path], tmp_p
         video.parent.mkdir()
         write_video(video, (read_image(frame).pixels for frame in part))
     rdstitch("trajectory", *videos, "-o", tmp_path / "path.csv", "--focal", "380", *CACHED)
-    assert [row["name"] for row in _rows(tmp_path / "path.csv")] == [f"drive_00000{k}.png" for k in (0, 1, 0)]
+    names = [f"{name}.png" for name in ("a/drive_000000", "drive_000001", "b/drive_000000")]
+    assert [row["name"] for row in _rows(tmp_path / "path.csv")] == names
 
 
 def _write_bag(folder: Path, frames: list[Path], version: int, kind: str, focal: float = 0.0) -> Path:

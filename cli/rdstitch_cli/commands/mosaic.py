@@ -37,7 +37,9 @@ if TYPE_CHECKING:
 @option("--bands", BANDS)
 @option("--all-blocks", bool)
 @option("--poses", options.IMAGE)
-@option("--frame", ("enu", "camera", "map"), "enu", of="mosaic")
+@option("--frame", ("enu", "ros", "camera", "map"), "enu", of="mosaic")
+@option("--height", RealNumber(0.0, min_open=True), 1.0)
+@option("--map-server", options.IMAGE)
 @options.follow
 @option("--refresh", RealNumber(0.0), 5.0)
 def mosaic(
@@ -49,6 +51,7 @@ def mosaic(
     following: bool,
     idle: float | None,
     refresh: float,
+    map_server: Path | None,
     as_json: bool,
     reporter: Reporter,
     **given: Any,
@@ -90,6 +93,10 @@ def mosaic(
                 live.print_result(result.registration, reporter, output)
             else:
                 summarize(result, reporter, as_json=as_json)
+            if map_server is not None and result.plan is None and result is results[0]:
+                from rdstitch.pipeline.map_server import write_map
+
+                write_map(result, map_server, beside.height, overwrite=stitch.overwrite)
             if result.plan is None:
                 images = f" ({shortened(result.registration.used_names)})" if all_blocks else ""
                 reporter.made(f"{result.summary}{images}")

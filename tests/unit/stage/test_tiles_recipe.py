@@ -44,6 +44,12 @@ def test_arrays_of_any_library_with_positions() -> None:
     assert min(item.reads for item in lazy) > 0
 
 
+def test_one_array_of_all_tiles_is_read_tile_by_tile() -> None:
+    zarr = pytest.importorskip("zarr")
+    result = rdstitch.tiles(zarr.array(TILES, chunks=(1, 256, 256)), positions=STAGE.nominal)
+    assert _errors(result, STAGE.places).max() < 0.5
+
+
 def _write(folder: Path) -> list[Path]:
     return STAGE.write(folder)
 

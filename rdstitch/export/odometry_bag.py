@@ -1,0 +1,55 @@
+"""A trajectory as ``nav_msgs/Odometry`` in a ROS bag, on ``/odom``; no ROS is needed, only ``rosbags``."""
+
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.errors import OutputError
+from rdstitch.export.trajectory_files import TrajectoryFrame, has_times, heading, positions_in_frame, ros_covariance
+
+_UNKNOWN = 1e6  # variance of what is not estimated
+
+
+def write_bag(path: Trajectory, file: Path, frame: TrajectoryFrame, *, overwrite: bool = False) -> None:
+    """Write a bag of ROS 1 (``.bag``), or a folder, the bag of ROS 2; numbers of frames stand for times not known."""
+    try:
+        from rosbags.rosbag1 import Writer as Writer1
+        from rosbags.rosbag2 import StoragePlugin
+        from rosbags.rosbag2 import Writer as Writer2
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise OutputError(f'{file}: writing ROS bags needs the extra ros: pip install "rdstitch[ros]"') from None
+    if overwrite and (file / "metadata.yaml").is_file():
+        shutil.rmtree(file)
+    elif overwrite:
+        file.unlink(missing_ok=True)
+    old = file.suffix.lower() == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
+    kinds = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+    writer = Writer1(file) if old else Writer2(file, version=9, storage_plugin=StoragePlugin.MCAP)
+    times = path.timestamp if path.timestamp is not None and has_times(path) else path.frame
+    nothing = np.diag(np.full(6, _UNKNOWN)).ravel()
+    covariances = (
+        np.tile(nothing, (len(path), 1))
+        if path.covariance is None
+        else ros_covariance(path.covariance, frame).reshape(len(path), 36)
+    )
+    rows = zip(times.tolist(), positions_in_frame(path, frame).tolist(), heading(path, frame), covariances, strict=True)
+    with writer as bag:
+        kind = kinds["Odometry"].__msgtype__
+        topic = bag.add_connection("/odom", kind, typestore=store)
+        for number, (time, place, turn, covariance) in enumerate(rows):
+            stamp = round(time * 1e9)
+            seconds = kinds["Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+            head = kinds["Header"](stamp=seconds, frame_id="odom", **({"seq": number} if old else {}))
+            quaternion = kinds["Quaternion"](x=0.0, y=0.0, z=math.sin(turn / 2), w=math.cos(turn / 2))
+            pose = kinds["Pose"](position=kinds["Point"](*place), orientation=quaternion)
+            still = kinds["Vector3"](x=0.0, y=0.0, z=0.0)
+            twist = kinds["TwistWithCovariance"](twist=kinds["Twist"](linear=still, angular=still), covariance=nothing)
+            posed = kinds["PoseWithCovariance"](pose=pose, covariance=covariance)
+            message = kinds["Odometry"](header=head, child_frame_id="camera", pose=posed, twist=twist)
+            data = store.serialize_ros1(message, kind) if old else store.serialize_cdr(message, kind)
+            bag.write(topic, max(stamp, 0), data)

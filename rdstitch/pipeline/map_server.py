@@ -1,0 +1,86 @@
+"""A mosaic as a map of ROS: the image and the ``map.yaml`` that ``nav2_map_server`` loads.
+
+The map lies in the frame "ros" of a trajectory of the same images: the first image's camera stands at the origin, x
+points to the top of that image and y to its left; see :mod:`rdstitch.export.trajectory_files`.
+"""
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.arrays import FloatArray
+from rdstitch.errors import ArgumentError
+from rdstitch.export.trajectory_files import AXES
+from rdstitch.io.read import read_image
+from rdstitch.io.write import write_image
+from rdstitch.pipeline.result_files import make_folder
+from rdstitch.results.stitch_result import StitchResult
+from rdstitch.system.outputs import check_outputs, text_bytes, write_bytes_atomic
+
+_LEVEL = 1e-9  # rounding of what a turn within the plane leaves as it is
+
+
+def write_map(result: StitchResult, folder: str | Path, height: float, *, overwrite: bool = False) -> list[Path]:
+    """Write ``map.yaml`` and ``map.png`` of a mosaic that was written, in metres by the height of the first image.
+
+    Raises
+    ------
+    ArgumentError
+        When the images have no metric poses.
+    OutputError
+        When a file exists, unless ``overwrite``, or cannot be written.
+    """
+    folder = Path(folder)
+    files = [folder / "map.yaml", folder / "map.png"]
+    make_folder(folder)
+    check_outputs(files, overwrite, [])
+    to_metres = _pixel_to_metres(result, height)
+    assert result.output is not None
+    image = read_image(result.output)
+    grey = image.pixels if image.pixels.ndim == 2 else cv2.cvtColor(image.pixels[..., :3], cv2.COLOR_RGB2GRAY)
+    if grey.dtype != np.uint8:
+        low, high = float(grey.min()), float(grey.max())
+        grey = np.rint((grey - low) * (255.0 / max(high - low, 1e-12))).astype(np.uint8)
+    alpha = np.full(grey.shape, 255, np.uint8) if image.alpha is None else image.alpha
+    resolution = math.sqrt(abs(float(np.linalg.det(to_metres[:, :2]))))
+    rows, columns = grey.shape
+    corners = np.array([(0, 0), (columns, 0), (columns, rows), (0, rows)]) - 0.5
+    outline = corners @ to_metres[:, :2].T + to_metres[:, 2]
+    origin = outline.min(axis=0)
+    width, length = np.ceil((outline.max(axis=0) - origin) / resolution - 1e-6).astype(int).tolist()
+    # The first pixel is at the top left, the origin at the bottom left of it all.
+    to_map = np.array([[1.0, 0.0], [0.0, -1.0]]) @ np.column_stack([to_metres[:, :2], to_metres[:, 2] - origin])
+    to_map = to_map / resolution + np.array([[0.0, 0.0, -0.5], [0.0, 0.0, length - 0.5]])
+    shown = [cv2.warpAffine(layer, to_map, (width, length), flags=cv2.INTER_LINEAR) for layer in (grey, alpha)]
+    write_image(files[1], np.asarray(shown[0], np.uint8), np.asarray(shown[1], np.uint8), overwrite=overwrite)
+    fields = {
+        "image": files[1].name,
+        "mode": "scale",
+        "resolution": resolution,
+        "origin": [*origin.tolist(), 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
+    }
+    lines = "".join(f"{name}: {json.dumps(value)}\n" for name, value in fields.items())
+    write_bytes_atomic(files[0], text_bytes(lines))
+    return files
+
+
+def _pixel_to_metres(result: StitchResult, height: float) -> FloatArray:
+    """From pixels of the output to metres in the frame "ros" of the first image, a similarity (2, 3)."""
+    poses = result.registration.alignment.poses
+    if poses is None or result.canvas.projection.name != "plane":
+        raise ArgumentError("a map needs metric poses over a plane; leave out --map-server, or choose a planar --model")
+    turned = np.eye(3) if result.canvas.orientation is None else result.canvas.orientation
+    if np.abs(turned[2, :2]).max() > _LEVEL * abs(turned[2, 2]):
+        raise ArgumentError("there is no map where the plane was tilted to be upright; leave out --straighten")
+    to_plane = np.linalg.inv(result.canvas.matrix @ (turned / turned[2, 2]))
+    first = int(Trajectory.from_poses(poses).frame[0])
+    c, s, unit = math.cos(poses.yaw[first]), math.sin(poses.yaw[first]), height / poses.height[first]
+    to_first = AXES["ros"] @ np.array([[c, -s], [s, c]]) * unit
+    return np.column_stack([to_first @ to_plane[:2, :2], to_first @ (to_plane[:2, 2] - poses.position[first])])

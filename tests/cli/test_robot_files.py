@@ -1,0 +1,51 @@
+"""What robots load: a map of nav2, odometry in a bag, all in one frame."""
+
+import csv
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from tests.cli.running import CACHED, Run
+
+
+def _poses(file: Path) -> np.ndarray[Any, Any]:
+    with file.open(encoding="utf-8", newline="") as stream:
+        return np.array([[float(row[key]) for key in ("x", "y", "yaw_deg")] for row in csv.DictReader(stream)])
+
+
+def test_map_poses_and_odometry_lie_in_one_frame(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    known = ("--focal", "380", "--height", "0.42", *CACHED)
+    rdstitch(
+        *("mosaic", *frames, "-o", tmp_path / "floor.png", "--map-server", tmp_path / "maps"),
+        *("--poses", tmp_path / "poses.csv", "--frame", "ros", *known),
+    )
+    rdstitch("trajectory", *frames, "-o", tmp_path / "path.csv", "--frame", "ros", *known)
+    poses = _poses(tmp_path / "path.csv")
+    np.testing.assert_allclose(_poses(tmp_path / "poses.csv"), poses, atol=1e-4)
+    rdstitch("trajectory", *frames, "-o", tmp_path / "enu.csv", *known)
+    enu = _poses(tmp_path / "enu.csv")
+    np.testing.assert_allclose(poses[:, :2], np.column_stack([enu[:, 1], -enu[:, 0]]), atol=1e-9)
+
+    content = yaml.safe_load((tmp_path / "maps" / "map.yaml").read_text(encoding="utf-8"))
+    assert content.keys() >= {"image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"}
+    with Image.open(tmp_path / "maps" / content["image"]) as image:
+        seen = np.asarray(image.convert("LA"))[..., 1] > 0
+    # Below each camera there is floor on the map.
+    column, row = ((poses[:, :2] - content["origin"][:2]) / content["resolution"]).astype(int).T
+    assert seen[seen.shape[0] - 1 - row, column].all()
+    assert content["resolution"] == pytest.approx(0.42 / 380.0, rel=0.2)
+
+    highlevel = pytest.importorskip("rosbags.highlevel")
+    rdstitch("trajectory", *frames, "-o", tmp_path / "odom", "--format", "bag", *known)
+    with highlevel.AnyReader([tmp_path / "odom"]) as reader:
+        messages = [reader.deserialize(data, connection.msgtype) for connection, _, data in reader.messages()]
+    for message, (x, y, yaw) in zip(messages, poses, strict=True):
+        at, turn = message.pose.pose.position, message.pose.pose.orientation
+        assert (at.x, at.y, at.z) == pytest.approx((x, y, 0.42), abs=1e-3)
+        assert 2.0 * math.atan2(turn.z, turn.w) == pytest.approx(math.radians(yaw), abs=1e-6)
+        assert message.pose.covariance.shape == (36,)
