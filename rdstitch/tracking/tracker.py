@@ -41,6 +41,7 @@ _KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of an image of 640
 _MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
 _GRID = 8  # points a side by which that is measured
+_FOCAL_CHECKS = 8, 16, 32  # keyframes at which a given focal length is compared with what they show
 _CONTRADICTED = 3.7  # standard deviations: odds of a thousand to one
 _TILT_STD, _RIGID = 0.004, 1.0  # radians and pixels, up to which a tilt found by few keyframes makes metric poses
 _MAX_LOST_FRAMES = 10  # frames in a row without a place, after which a new map begins, if all keyframes were searched
@@ -180,7 +181,6 @@ class Tracker:
         self._focal: float | None = None  # half diagonals, once one was found with a lens that is kept
         self._plane: MetricPlane | None = None
         self._doubt = 0.0  # of the logarithm of the focal length, where the images contradict it
-        self._settled = False  # whether an alignment has weighed what is given
         self.messages: list[Message] = []
         self._start_map()
 
@@ -477,7 +477,7 @@ class Tracker:
             pairs.append(SeenPair(rays1, rays2, one, two))
         shown = shown_camera(pairs)
         uncertain = math.hypot(shown.log_focal_std, frame.camera.focal_log_std)
-        if abs(shown.log_focal) > _CONTRADICTED * uncertain:
+        if frame.attitude is None and abs(shown.log_focal) > _CONTRADICTED * uncertain:
             self._doubt = math.hypot(shown.log_focal, shown.log_focal_std)
             self._length_std = max(self._length_std, self._doubt)
             self._tell(
@@ -489,7 +489,13 @@ class Tracker:
 
     def _find_plane(self, frame: _Frame) -> list[Tracked]:
         """The map by the tilt that a few keyframes show, where lens and focal length are given."""
-        if not self._metric_camera(frame.camera) or self._settled or self._model not in ("auto", "rigid"):
+        if not self._metric_camera(frame.camera) or self._model not in ("auto", "rigid"):
+            return []
+        if (self._plane is not None or self._mapped) and (
+            frame.attitude is not None  # whose errors would be taken for those of the focal length
+            or self._keyframes_seen not in _FOCAL_CHECKS
+            or any(message.code == "focal-contradicted" for message in self.messages)
+        ):
             return []
         shown, focal = self._shown_camera(frame), frame.camera.focal
         if self._plane is not None or self._mapped:
@@ -584,7 +590,7 @@ class Tracker:
             )
             if used
         ]
-        self._mapped = self._settled = True
+        self._mapped = True
         if self._focal is None:
             self._length_std = alignment.length_std
         if any(message.code == "focal-contradicted" for message in alignment.messages):
