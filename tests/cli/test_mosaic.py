@@ -169,7 +169,7 @@ def test_images_of_another_block_are_named_in_one_line(rdstitch: Run, tmp_path: 
     own, others = flight(3, 3).write(tmp_path, "a{}.png"), flight(29, 2).write(tmp_path, "b{}.png")
     done = rdstitch("mosaic", *own, *others, "-o", tmp_path / "out.png", *CACHED)
     (line,) = [line for line in done.err.splitlines() if "left out" in line]
-    assert f"left out {others[0]}, {others[1].name}: in block 2 of 2, whose 2 images overlap with none" in line
+    assert f"left out {others[0]}, {others[1].name}: in block 2 of 2, whose 2 images overlap too little" in line
 
 
 # Without a focal length, a path says that its lengths are guessed.
