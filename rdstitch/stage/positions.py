@@ -145,7 +145,8 @@ def grid_from_arrays(
     positions: Any, numbers: Sequence[int], size: tuple[int, int], pixel_size: float | None
 ) -> TileGrid:
     """Places of tiles by their numbers in an array (N, 2), pixels, or in the columns x and y, or x_um and y_um."""
-    unit, places = None, np.empty(0)
+    unit = None
+    places: FloatArray = np.empty(0)
     if isinstance(positions, Mapping) or hasattr(positions, "columns"):
         pair = next((p for p in (("x", "y"), ("x_um", "y_um")) if all(name in positions for name in p)), None)
         if pair is None:
