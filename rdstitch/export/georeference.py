@@ -25,7 +25,7 @@ MIN_POSITIONS = 3
 # says less than nothing.
 _MAX_ERROR = 0.25
 GPS, CONTROL = "GPS positions", "ground control points"
-_MODEL_SCALE, _MODEL_TIEPOINT, _MODEL_TRANSFORMATION, _GEO_KEYS = 33550, 33922, 34264, 34735
+MODEL_SCALE, MODEL_TIEPOINT, MODEL_TRANSFORMATION, GEO_KEYS = 33550, 33922, 34264, 34735
 _SHORT, _DOUBLE = 3, 12
 
 
@@ -163,13 +163,13 @@ class Georeference:
         keys = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, self.crs.epsg)
         if self.north_up:  # as more programs read it
             place = [
-                (_MODEL_SCALE, _DOUBLE, 3, (a, a, 0.0), True),
-                (_MODEL_TIEPOINT, _DOUBLE, 6, (0.0, 0.0, 0.0, corner.real, corner.imag, 0.0), True),
+                (MODEL_SCALE, _DOUBLE, 3, (a, a, 0.0), True),
+                (MODEL_TIEPOINT, _DOUBLE, 6, (0.0, 0.0, 0.0, corner.real, corner.imag, 0.0), True),
             ]
         else:
             matrix = (a, b, 0.0, corner.real, b, -a, 0.0, corner.imag, *(0.0,) * 7, 1.0)
-            place = [(_MODEL_TRANSFORMATION, _DOUBLE, len(matrix), matrix, True)]
-        return [*place, (_GEO_KEYS, _SHORT, len(keys), keys, True)]
+            place = [(MODEL_TRANSFORMATION, _DOUBLE, len(matrix), matrix, True)]
+        return [*place, (GEO_KEYS, _SHORT, len(keys), keys, True)]
 
     def world_file_texts(self) -> tuple[str, str]:
         """The contents of :func:`world_file_paths`."""

@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.errors import InputError
-from rdstitch.export.georeference import Georeference
+from rdstitch.export.georeference import GEO_KEYS, MODEL_SCALE, MODEL_TIEPOINT, MODEL_TRANSFORMATION, Georeference
 from rdstitch.geometry.crs import Crs, NotMetricError
 from rdstitch.io.opening import check_readable, decoding
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
 
-_SCALE, _TIEPOINT, _TRANSFORMATION, _GEO_KEYS = 33550, 33922, 34264, 34735
 _PROJECTED, _RASTER_TYPE, _IS_POINT = 3072, 1025, 2
 _SIMILAR = 1e-6  # relative: rounding of numbers in files
 
@@ -54,18 +53,20 @@ def read_grid(file: str | Path) -> MapGrid:
         page = tiff.pages.first
         size = int(page.imagewidth), int(page.imagelength)
         tags = {
-            code: page.tags[code].value for code in (_SCALE, _TIEPOINT, _TRANSFORMATION, _GEO_KEYS) if code in page.tags
+            code: page.tags[code].value
+            for code in (MODEL_SCALE, MODEL_TIEPOINT, MODEL_TRANSFORMATION, GEO_KEYS)
+            if code in page.tags
         }
-    keys = np.array(tags.get(_GEO_KEYS, ()), dtype=np.int64).reshape(-1, 4)[1:]
-    values = {int(key): int(value) for key, location, _, value in keys if location == 0}
-    epsg = values.get(_PROJECTED, 0)
-    if _TRANSFORMATION in tags:
-        matrix = np.array(tags[_TRANSFORMATION], dtype=np.float64).reshape(4, 4)[:2, [0, 1, 3]]
-    elif _SCALE in tags and _TIEPOINT in tags:
-        (sx, sy), (i, j, _, x, y) = tags[_SCALE][:2], tags[_TIEPOINT][:5]
-        matrix = np.array([[sx, 0.0, x - i * sx], [0.0, -sy, y + j * sy]])
-    else:
-        matrix = np.zeros((2, 3))
+        keys = np.array(tags.get(GEO_KEYS, ()), dtype=np.int64).reshape(-1, 4)[1:]
+        values = {int(key): int(value) for key, location, _, value in keys if location == 0}
+        epsg = values.get(_PROJECTED, 0)
+        if MODEL_TRANSFORMATION in tags:
+            matrix = np.array(tags[MODEL_TRANSFORMATION], dtype=np.float64).reshape(4, 4)[:2, [0, 1, 3]]
+        elif MODEL_SCALE in tags and MODEL_TIEPOINT in tags:
+            (sx, sy), (i, j, _, x, y) = tags[MODEL_SCALE][:2], tags[MODEL_TIEPOINT][:5]
+            matrix = np.array([[sx, 0.0, x - i * sx], [0.0, -sy, y + j * sy]])
+        else:
+            matrix = np.zeros((2, 3))
     scale = complex(matrix[0, 0], matrix[0, 1])
     square = abs(scale) > 0.0 and abs(matrix[1, 0] - scale.imag) + abs(matrix[1, 1] + scale.real) < _SIMILAR * abs(
         scale

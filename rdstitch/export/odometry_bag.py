@@ -17,20 +17,26 @@ from rdstitch.export.trajectory_files import (
 )
 
 
-def write_bag(path: Trajectory, file: Path, frame: TrajectoryFrame, *, overwrite: bool = False) -> None:
-    """Write a bag of ROS 1 (``.bag``), or a folder, the bag of ROS 2; numbers of frames stand for times not known."""
+def check_bag(file: str | Path) -> None:
+    """Refuse a bag before long work where the package that writes it is missing."""
     try:
-        from rosbags.rosbag1 import Writer as Writer1
-        from rosbags.rosbag2 import StoragePlugin
-        from rosbags.rosbag2 import Writer as Writer2
-        from rosbags.typesys import Stores, get_typestore
+        import rosbags.rosbag1  # noqa: F401
     except ImportError:
         raise OutputError(f'{file}: writing ROS bags needs the extra ros: pip install "rdstitch[ros]"') from None
-    if overwrite:
-        file.unlink(missing_ok=True)
+
+
+def write_bag(path: Trajectory, file: Path, frame: TrajectoryFrame) -> None:
+    """Write a bag of ROS 1 (``.bag``), or a folder, the bag of ROS 2; numbers of frames stand for times not known."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
     old = file.suffix.lower() == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
-    kinds = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+    # Other packages have a Time of their own.
+    packages = "builtin_interfaces/", "geometry_msgs/", "nav_msgs/", "std_msgs/msg/Header"
+    kinds = {name.rpartition("/")[2]: kind for name, kind in store.types.items() if name.startswith(packages)}
     writer = Writer1(file) if old else Writer2(file, version=9, storage_plugin=StoragePlugin.MCAP)
     times = path.timestamp if path.timestamp is not None and has_times(path) else path.frame
     nothing = np.diag(np.full(6, NOT_MEASURED)).ravel()

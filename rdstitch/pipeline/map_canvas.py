@@ -44,14 +44,14 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
         place, reason = None, ""
     elif placed.turned:
         place, reason = None, "the camera turned on the spot"
-    elif placed.place is not None:
-        place, reason = placed.place.after(canvas.matrix), ""
-        epsg = options.epsg if options.like is None else read_grid(options.like).place.crs.epsg
-        if epsg is not None:
-            place = place.in_system(Crs(epsg), np.concatenate(canvas.footprints))
     else:
         epsg = options.epsg if options.like is None else read_grid(options.like).place.crs.epsg
-        place, reason = georeference(placed.located(canvas), epsg, force=options.georeference == "force")
+        if placed.place is not None:
+            place, reason = placed.place.after(canvas.matrix), ""
+            if epsg is not None:
+                place = place.in_system(Crs(epsg), np.concatenate(canvas.footprints))
+        else:
+            place, reason = georeference(placed.located(canvas), epsg, force=options.georeference == "force")
     if place is None:
         for name in ("gsd", "like", "extent"):
             if getattr(options, name) is not None:

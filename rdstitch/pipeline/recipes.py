@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,6 +12,7 @@ from rdstitch.alignment.frames import stored, turned_alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import Purpose
 from rdstitch.errors import OutputError, RdstitchError, RegistrationError
+from rdstitch.export.odometry_bag import check_bag, write_bag
 from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
 from rdstitch.geometry.exif_orientation import quarter_turn
 from rdstitch.inputs.find import FoundImages, found_images
@@ -366,6 +367,8 @@ def trajectory(
     """
     options = replace(options or StitchOptions(), pose_covariance=True)
     options = options if timestamps is None else replace(options, timestamps=timestamps)
+    if layout == "bag" and output is not None:
+        check_bag(output)
     given = as_inputs(inputs, options.channel_order)
     options, notes = with_camera_in_bag(given, options)
     with found_images(given, every=every, topic=options.topic) as listed:
@@ -389,9 +392,9 @@ def trajectory(
     with Outputs(options.overwrite) as outputs:
         if output is not None:
             if layout == "bag":
-                from rdstitch.export.odometry_bag import write_bag
-
-                write_bag(path, Path(output), frame or frame_of(layout), overwrite=options.overwrite)
+                bag = Path(output)
+                with outputs.writing(bag) if bag.suffix.lower() == ".bag" else nullcontext(bag) as staged:
+                    write_bag(path, staged, frame or frame_of(layout))
             else:
                 outputs.write(output, text_bytes(WRITERS[layout](path, frame or frame_of(layout))))
         if plot is not None:

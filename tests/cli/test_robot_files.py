@@ -2,6 +2,7 @@
 
 import csv
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -57,3 +58,20 @@ def test_of_several_bands_the_first_one_is_the_map(rdstitch: Run, frames: list[P
     assert {file.name for file in (tmp_path / "maps").iterdir()} == {"map.yaml", "map.png"}
     rdstitch(*wanted, status=None, told="map.yaml: exists already")
     assert not (tmp_path / "f.png").exists()
+
+
+def test_a_bag_replaces_another_one_whole_and_needs_rosbags_before_the_work(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    highlevel = pytest.importorskip("rosbags.highlevel")
+    bag = tmp_path / "odom.bag"
+    bag.write_bytes(b"older")
+    wanted = ("-o", bag, "--format", "bag", "--focal", "380", "--overwrite", *CACHED)
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "rosbags.rosbag1", None)
+        rdstitch("trajectory", frames[0], *wanted, status=None, told="pip install")
+    assert bag.read_bytes() == b"older"
+    rdstitch("trajectory", *frames, *wanted)
+    with highlevel.AnyReader([bag]) as reader:
+        heads = [reader.deserialize(data, c.msgtype).header for c, _, data in reader.messages()]
+    assert [(head.seq, head.frame_id) for head in heads] == [(k, "odom") for k in range(len(frames))]

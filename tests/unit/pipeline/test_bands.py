@@ -7,9 +7,11 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+import tifffile
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.export.map_grid import read_grid
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
 from rdstitch.pipeline.apply_sidecar import apply
@@ -125,6 +127,10 @@ def test_the_grid_of_another_file(rig: Path, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "plain.tif"), np.zeros((9, 9), dtype=np.uint8))
     with pytest.raises(InputError, match="is no GeoTIFF with square pixels"):
         apply(sidecar, files, options, CompositeOptions(like=str(tmp_path / "plain.tif")))
+    keys = [(34735, 3, 5, (1, 1, 0, 1, 3072), True)]  # cut off
+    tifffile.imwrite(tmp_path / "cut.tif", np.zeros((9, 9), dtype=np.uint8), extratags=keys)
+    with pytest.raises(InputError, match=r"cut\.tif: not an image that can be read"):
+        read_grid(tmp_path / "cut.tif")
 
 
 def _same_pixels(first: Path, second: Path) -> bool:
