@@ -1,16 +1,20 @@
 """A trajectory as ``nav_msgs/Odometry`` in a ROS bag, on ``/odom``; no ROS is needed, only ``rosbags``."""
 
 import math
-import shutil
 from pathlib import Path
 
 import numpy as np
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import OutputError
-from rdstitch.export.trajectory_files import TrajectoryFrame, has_times, heading, positions_in_frame, ros_covariance
-
-_UNKNOWN = 1e6  # variance of what is not estimated
+from rdstitch.export.trajectory_files import (
+    NOT_MEASURED,
+    TrajectoryFrame,
+    has_times,
+    heading,
+    positions_in_frame,
+    ros_covariance,
+)
 
 
 def write_bag(path: Trajectory, file: Path, frame: TrajectoryFrame, *, overwrite: bool = False) -> None:
@@ -22,16 +26,14 @@ def write_bag(path: Trajectory, file: Path, frame: TrajectoryFrame, *, overwrite
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise OutputError(f'{file}: writing ROS bags needs the extra ros: pip install "rdstitch[ros]"') from None
-    if overwrite and (file / "metadata.yaml").is_file():
-        shutil.rmtree(file)
-    elif overwrite:
+    if overwrite:
         file.unlink(missing_ok=True)
     old = file.suffix.lower() == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
     kinds = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
     writer = Writer1(file) if old else Writer2(file, version=9, storage_plugin=StoragePlugin.MCAP)
     times = path.timestamp if path.timestamp is not None and has_times(path) else path.frame
-    nothing = np.diag(np.full(6, _UNKNOWN)).ravel()
+    nothing = np.diag(np.full(6, NOT_MEASURED)).ravel()
     covariances = (
         np.tile(nothing, (len(path), 1))
         if path.covariance is None

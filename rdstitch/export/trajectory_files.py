@@ -33,7 +33,7 @@ AXES: dict[TrajectoryFrame, FloatArray] = {
 }
 """x and y by those of the first image, to its right and its bottom."""
 
-_NOT_MEASURED = 1e6
+NOT_MEASURED = 1e6
 """Variance that programs of ROS take for "not measured"."""
 
 _SIDE = 800.0  # pixels of the drawing's longer side
@@ -103,7 +103,7 @@ def ros_covariance(covariance: FloatArray, frame: TrajectoryFrame) -> FloatArray
     sign = -_turn(frame)
     whole = np.zeros((*covariance.shape[:-2], 6, 6))
     whole[..., place[:, None], place] = known * np.outer([1.0, 1.0, sign, sign], [1.0, 1.0, sign, sign])
-    whole[..., 3, 3] = whole[..., 4, 4] = _NOT_MEASURED
+    whole[..., 3, 3] = whole[..., 4, 4] = NOT_MEASURED
     return whole
 
 

@@ -14,7 +14,7 @@ from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import tilt_from_normal, turned_tilt
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import Row, by_image, csv_rows, image_name
+from rdstitch.inputs.tables import Row, by_image, csv_rows
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.results.messages import shortened
 from rdstitch.system.file_access import canonical_name, file_state, read_text
@@ -225,15 +225,15 @@ def _read_times(file: str | Path, state: tuple[int, int] | None) -> list[float] 
         return [float(line) for _, line in lines]
     if not lines or not _is_number(lines[0][1].split()[0]):
         rows = csv_rows(text, where, _TIME_COLUMNS, ("name,timestamp",), ("s",))
-        return {name: row.needed("timestamp") for name, row in by_image(rows).items()}
-    times: dict[str, float] = {}
-    for number, line in lines:
-        time, _, name = line.partition(" ")
-        if not name or not _is_number(time):
-            wanted = f"a table with the columns {','.join(_TIME_COLUMNS)}, lines TIMESTAMP NAME, or one time a line"
-            raise InputError(f"{file}: line {number}: found '{line}'; give {wanted}")
-        times[image_name(name)] = float(time)
-    return times
+    else:
+        rows = []
+        for number, line in lines:
+            time, name = (*line.split(maxsplit=1), "")[:2]
+            if not name or not _is_number(time):
+                wanted = f"a table with the columns {','.join(_TIME_COLUMNS)}, lines TIMESTAMP NAME, or one time a line"
+                raise InputError(f"{file}: line {number}: found '{line}'; give {wanted}")
+            rows.append(Row(f"{file}: line {number}", {"name": name, "timestamp": time}, "."))
+    return {name: row.needed("timestamp") for name, row in by_image(rows).items()}
 
 
 def _is_number(text: str) -> bool:

@@ -28,7 +28,7 @@ def corrected(image: DecodedImage, camera: Camera, reduction: int) -> DecodedIma
     for top in range(0, height, _ROWS):
         rows = slice(top, min(top + _ROWS, height))
         at = _places(camera, reduction, top, rows.stop - top, width)
-        inside = np.all((at >= -0.5) & (at <= np.array([width, height]) - 0.5), axis=-1, keepdims=False)
+        inside = np.all((at >= -0.5) & (at <= np.array([width, height]) - 0.5), axis=-1)
         x, y = (np.where(inside, at[..., k], -1.0).astype(np.float32) for k in range(2))
         pixels[rows] = _resampled(image.pixels, x, y)
         shown = cv2.remap(alpha, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -179,7 +179,7 @@ def apply(
     channel_order: ChannelOrder = "bgr",
     progress: Progress = silent,
 ) -> Recomposition:
-    """Compose images by a registration that was found before; nothing is estimated.
+    """Compose images by a registration that was found before; only the lens of another band is estimated.
 
     Parameters
     ----------
@@ -214,12 +214,12 @@ def apply(
         Only plan; nothing is written.
     channel_order : str
         Of arrays: "bgr" or "rgb".
+    progress : callable
 
     Returns
     -------
     Recomposition
         The image, or what was written, with the images left out and what else the user should know.
-    progress : callable
 
     Raises
     ------

@@ -34,10 +34,7 @@ def write_map(result: StitchResult, folder: str | Path, height: float, *, overwr
     OutputError
         When a file exists, unless ``overwrite``, or cannot be written.
     """
-    folder = Path(folder)
-    files = [folder / "map.yaml", folder / "map.png"]
-    make_folder(folder)
-    check_outputs(files, overwrite, [])
+    files = map_files(Path(folder), overwrite=overwrite)
     to_metres = _pixel_to_metres(result, height)
     assert result.output is not None
     image = read_image(result.output)
@@ -68,6 +65,14 @@ def write_map(result: StitchResult, folder: str | Path, height: float, *, overwr
     }
     lines = "".join(f"{name}: {json.dumps(value)}\n" for name, value in fields.items())
     write_bytes_atomic(files[0], text_bytes(lines))
+    return files
+
+
+def map_files(folder: Path, *, overwrite: bool) -> list[Path]:
+    """The two files of a map, once it is clear that they can be written; makes their folder."""
+    files = [folder / "map.yaml", folder / "map.png"]
+    make_folder(folder)
+    check_outputs(files, overwrite)
     return files
 
 

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -135,11 +136,9 @@ def _fiji_places(text: str, file: str | Path) -> dict[str, tuple[float, float]]:
 
 def fiji_list(names: Sequence[str], places: FloatArray) -> str:
     """The places as Fiji's list of tiles."""
+    heading = ("# Define the number of dimensions we are working on", "dim = 2", "", "# Define the image coordinates")
     lines = [f"{name}; ; ({x:.3f}, {y:.3f})" for name, (x, y) in zip(names, places.tolist(), strict=True)]
-    return "\n".join(["# Define the number of dimensions we are working on", "dim = 2", "", *_HEADING, *lines, ""])
-
-
-_HEADING = ("# Define the image coordinates",)
+    return "\n".join([*heading, *lines, ""])
 
 
 def grid_from_arrays(
@@ -147,17 +146,17 @@ def grid_from_arrays(
 ) -> TileGrid:
     """Places of tiles by their numbers in an array (N, 2), pixels, or in the columns x and y, or x_um and y_um."""
     unit = None
+    places: FloatArray = np.empty(0)
     if isinstance(positions, Mapping) or hasattr(positions, "columns"):
         pair = next((p for p in (("x", "y"), ("x_um", "y_um")) if all(name in positions for name in p)), None)
         if pair is None:
             raise ArgumentError("positions need x and y, pixels, or x_um and y_um, micrometres")
         unit = 1.0 if pair[0].endswith("um") else None
-        positions = np.stack([np.asarray(positions[name], dtype=np.float64) for name in pair], axis=1)
-    places = np.asarray(positions, dtype=np.float64)
+        positions = zip(*(positions[name] for name in pair), strict=True)
+    with suppress(TypeError, ValueError):  # of what is no array of numbers
+        places = np.asarray(list(positions), dtype=np.float64)
     if places.ndim != 2 or places.shape[1] != 2 or len(places) <= max(numbers):
-        raise ArgumentError(
-            f"positions must be x and y of each of {max(numbers) + 1} tiles, not of shape {places.shape}"
-        )
+        raise ArgumentError(f"positions must be numbers, x and y of each of {max(numbers) + 1} tiles")
     return _grid(places[list(numbers)], unit, size, pixel_size, "positions")
 
 

@@ -79,7 +79,7 @@ def _check_place(file: Path, overwrite: bool) -> None:
     if is_zarr(file):
         check_zarr_folder(file, overwrite)
     elif file.is_dir():
-        raise OutputError(f"{file}: is a folder; name a file in it")
+        raise OutputError(f"{file}: is a folder; choose another name")
     if not folder.is_dir():
         raise OutputError(f"{file}: the folder {folder} does not exist; create it first")
     if file.suffix.lower() == ".dzi":

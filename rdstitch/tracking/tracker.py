@@ -633,7 +633,7 @@ class Tracker:
             for keyframe in self._keyframes:
                 if keyframe.aligned:
                     reached = keyframe.covariance = reached if keyframe.covariance is None else keyframe.covariance
-        elif self._plane is not None:
+        else:
             self._plane = None
         if self.distortion_known and self._focal is None:
             self._model, self._focal = alignment.model, alignment.focal

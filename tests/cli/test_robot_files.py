@@ -49,3 +49,11 @@ def test_map_poses_and_odometry_lie_in_one_frame(rdstitch: Run, frames: list[Pat
         assert (at.x, at.y, at.z) == pytest.approx((x, y, 0.42), abs=1e-3)
         assert 2.0 * math.atan2(turn.z, turn.w) == pytest.approx(math.radians(yaw), abs=1e-6)
         assert message.pose.covariance.shape == (36,)
+
+
+def test_of_several_bands_the_first_one_is_the_map(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    wanted = ("mosaic", *frames, "-o", tmp_path / "f.png", "--map-server", tmp_path / "maps", "--focal", "380", *CACHED)
+    rdstitch(*wanted, "--bands", "A=*.png,B=*.png")
+    assert {file.name for file in (tmp_path / "maps").iterdir()} == {"map.yaml", "map.png"}
+    rdstitch(*wanted, status=None, told="map.yaml: exists already")
+    assert not (tmp_path / "f.png").exists()

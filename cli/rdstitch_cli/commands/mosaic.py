@@ -18,6 +18,8 @@ from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
+    from rdstitch.pipeline.apply_sidecar import Recomposition
+    from rdstitch.results.stitch_result import StitchResult
 
 
 @command(
@@ -63,6 +65,7 @@ def mosaic(
     With --follow, frames are registered as they arrive.
     """
     from rdstitch.pipeline.bands import mosaic_bands
+    from rdstitch.pipeline.map_server import map_files, write_map
     from rdstitch.pipeline.recipes import mosaic as recipe
     from rdstitch.pipeline.recipes import mosaic_blocks
 
@@ -70,6 +73,8 @@ def mosaic(
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
     if bands and (all_blocks or following or given["dry_run"]):
         raise click.UsageError("--bands goes neither with --all-blocks, --follow nor --dry-run")
+    if map_server is not None and not given["dry_run"]:
+        map_files(map_server, overwrite=given["overwrite"])
     with ExitStack() as stack:
         named = list(inputs) if following else options.resolve(inputs)
         with_poses = given["poses"] is not None
@@ -80,23 +85,23 @@ def mosaic(
             watched: dict[str, Any] = {"output": output, "every": every, "idle": idle, "refresh": refresh}
             paths = stack.enter_context(live.followed(inputs, stitch, reporter, **watched, beside=beside))
         how: dict[str, Any] = {"every": every, "progress": beside.timer, "beside": beside}
+        others: Sequence[Recomposition] = ()
         if bands:
             first, others = mosaic_bands(paths, output, bands, stitch, **how)
-            summarize(first, reporter, as_json=as_json)
-            reporter.made(first.summary)
-            for other in others:
-                report_applied(other, reporter)
-            return
-        results = mosaic_blocks(paths, output, stitch, **how) if all_blocks else [recipe(paths, output, stitch, **how)]
+            results: Sequence[StitchResult] = [first]
+        elif all_blocks:
+            results = mosaic_blocks(paths, output, stitch, **how)
+        else:
+            results = [recipe(paths, output, stitch, **how)]
         for result in results:
             if following and not as_json:
                 live.print_result(result.registration, reporter, output)
             else:
                 summarize(result, reporter, as_json=as_json)
             if map_server is not None and result.plan is None and result is results[0]:
-                from rdstitch.pipeline.map_server import write_map
-
                 write_map(result, map_server, beside.height, overwrite=stitch.overwrite)
             if result.plan is None:
                 images = f" ({shortened(result.registration.used_names)})" if all_blocks else ""
                 reporter.made(f"{result.summary}{images}")
+        for other in others:
+            report_applied(other, reporter)

@@ -39,3 +39,12 @@ def test_those_of_a_video_are_for_all_of_its_frames(
 def test_two_videos_have_one_time_after_the_other(tmp_path: Path) -> None:
     frames = [Frame(Path(f"{name}/v_{k}.png"), k) for name in "ab" for k in range(2)]
     assert [frame.timestamp for frame in with_times(frames, times(tmp_path, 4))] == [100, 101, 102, 103]
+
+
+def test_a_list_has_one_time_of_each_name(tmp_path: Path) -> None:
+    file = tmp_path / "list.txt"
+    file.write_text("# time name\n1.5 rgb/a b.png\n2.5\trgb/c.png\n", encoding="utf-8")
+    assert [frame.timestamp for frame in with_times([Frame(Path("c.png")), Frame(Path("a b.png"))], file)] == [2.5, 1.5]
+    file.write_text("1.5 a.png\n2.5 a.png\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"line 2: a\.png is here twice"):
+        with_times([Frame(Path("a.png"))], file)

@@ -8,7 +8,7 @@ import tifffile
 from numpy.typing import NDArray
 
 import rdstitch
-from rdstitch.errors import InputError
+from rdstitch.errors import ArgumentError, InputError
 from tests.stage_grid import StageGrid
 
 STAGE = StageGrid(rows=2, columns=3, tile=256, overlap=0.2, content=0.9, backlash=2.0, seed=5)
@@ -42,6 +42,12 @@ def test_arrays_of_any_library_with_positions() -> None:
     assert again.image.shape == (*result.image.shape[:2], 2)
     np.testing.assert_array_equal(again.image[..., 0], result.image.reshape(result.image.shape[:2]))
     assert min(item.reads for item in lazy) > 0
+
+
+@pytest.mark.parametrize("places", [[[1, 2], [3]], [["a", "b"]] * 6, {"x": [1] * 6, "y": [1] * 5}])
+def test_positions_that_are_no_numbers_of_each_tile_are_refused(places: object) -> None:
+    with pytest.raises(ArgumentError, match="numbers, x and y of each of 6 tiles"):
+        rdstitch.tiles(TILES, positions=places)
 
 
 def test_one_array_of_all_tiles_is_read_tile_by_tile() -> None:
