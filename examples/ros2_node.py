@@ -8,6 +8,7 @@ Takes images of ``image_raw`` and the calibration of ``camera_info`` (or the par
 """
 
 import math
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -69,6 +70,7 @@ def odometry(pose: rdstitch.Pose) -> dict[str, Any]:
 
 def main() -> None:
     """Run the node."""
+    ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter).parse_known_args()
     import rclpy  # type: ignore[import-not-found]
     from geometry_msgs.msg import TransformStamped  # type: ignore[import-not-found]
     from nav_msgs.msg import Odometry  # type: ignore[import-not-found]

@@ -76,6 +76,10 @@ def _plausible(option: click.Option) -> Any:
         "local_alignment": "auto",
         "every": "auto",
         "epsg": "25832",
+        "extent": "0,0,9,9",
+        "bands": "NIR=*_NIR.TIF,RED=*_RED.TIF",
+        "distortion": "auto",
+        "z": "max",
         "rectangle": "0,0,9,0,9,9,0,9",
         "straighten": "auto",
     }.get(option.name or "", "name")
