@@ -393,30 +393,32 @@ class OmeImage:
 
     channels: int  # pages that are channels of one plane; 1 where there are several planes or times
     pixel_size: float | None  # micrometres
-    position: tuple[float, float] | None  # of the first plane
-    unit: float | None  # micrometres that the position counts; None for pixels ("reference frame")
 
 
 def read_ome(text: str | None) -> OmeImage | None:
     """Give what the OME-XML of a file says; None where it is none."""
-    try:
-        elements = list(ElementTree.fromstring(text or "").iter())
-    except ElementTree.ParseError:
-        return None
-    images = [element for element in elements if element.tag.rpartition("}")[2] == "Pixels"]
+    root = ome_tree(text)
+    images = [] if root is None else list(root.iter("Pixels"))
     if not images:
         return None
-    pixels = images[0]
-    planes = (e for e in pixels.iter() if e.tag.rpartition("}")[2] == "Plane")
-    plane = next((e for e in planes if {"PositionX", "PositionY"} <= e.attrib.keys()), None)
-    counts = [int(pixels.get(f"Size{axis}", 1)) for axis in "CZT"]
-    samples = [int(e.get("SamplesPerPixel", 1)) for e in pixels.iter() if e.tag.rpartition("}")[2] == "Channel"]
+    counts = [int(images[0].get(f"Size{axis}", 1)) for axis in "CZT"]
+    samples = [int(channel.get("SamplesPerPixel", 1)) for channel in images[0].iter("Channel")]
     apart = len(images) == 1 and counts[1:] == [1, 1] and all(count == 1 for count in samples)
+    return OmeImage(counts[0] if apart else 1, ome_pixel_size(images[0]))
+
+
+def ome_tree(text: str | None) -> ElementTree.Element | None:
+    """The tree of OME-XML without name spaces; None where it is none."""
+    try:
+        root = ElementTree.fromstring(text or "")
+    except ElementTree.ParseError:
+        return None
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]
+    return root
+
+
+def ome_pixel_size(pixels: ElementTree.Element) -> float | None:
+    """Micrometres; None where it is not said, or in no unit of length."""
     size, scale = pixels.get("PhysicalSizeX"), MICROMETRES.get(pixels.get("PhysicalSizeXUnit", "µm"))
-    return OmeImage(
-        counts[0] if apart else 1,
-        float(size) * scale if size and scale else None,
-        None if plane is None else (float(plane.attrib["PositionX"]), float(plane.attrib["PositionY"])),
-        # What programs write that do not know the unit counts pixels.
-        None if plane is None else MICROMETRES.get(plane.get("PositionXUnit", "µm")),
-    )
+    return float(size) * scale if size and scale else None

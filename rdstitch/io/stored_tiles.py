@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.errors import InputError
-from rdstitch.io.metadata import MICROMETRES
+from rdstitch.io.metadata import MICROMETRES, ome_pixel_size, ome_tree
 from rdstitch.io.opening import TIFF_MAGIC, decoding
 from rdstitch.io.read_tiff import read_page
 from rdstitch.system.file_access import canonical_name, canonical_text, open_regular
@@ -173,12 +173,12 @@ def _stack(plain: StoredTile, tiff: "tifffile.TiffFile") -> StoredTile:
 
 def _ome(file: Path, text: str | None) -> list[StoredTile]:
     """The images of OME-XML that have a plane in a file."""
-    root = _xml(text)
+    root = ome_tree(text)
     if root is None:
         return []
     own, elsewhere = root.get("UUID", ""), root.find("BinaryOnly")
     if elsewhere is not None:
-        root = _xml(_companion(file.parent / str(elsewhere.get("MetadataFile", ""))))
+        root = ome_tree(_companion(file.parent / str(elsewhere.get("MetadataFile", ""))))
         if root is None:
             return []
     known = {element.get("FileName"): (element.text or "").strip() for element in root.iter("UUID")}
@@ -194,17 +194,6 @@ def _ome(file: Path, text: str | None) -> list[StoredTile]:
             tiles.append(_ome_tile(file, image, pixels, planes))
     shared = len(tiles) > 1
     return [replace(tile, name=Path(f"{file}#{k}")) if shared else tile for k, tile in enumerate(tiles)]
-
-
-def _xml(text: str | None) -> ElementTree.Element | None:
-    """The tree of a text without name spaces."""
-    try:
-        root = ElementTree.fromstring(text or "")
-    except ElementTree.ParseError:
-        return None
-    for element in root.iter():
-        element.tag = element.tag.rpartition("}")[2]
-    return root
 
 
 def _companion(file: Path) -> str | None:
@@ -249,7 +238,6 @@ def _ome_planes(file: Path, pixels: ElementTree.Element, own: str | None) -> dic
 def _ome_tile(
     file: Path, image: ElementTree.Element, pixels: ElementTree.Element, planes: dict[tuple[int, int, int], Page]
 ) -> StoredTile:
-    size, scale = pixels.get("PhysicalSizeX"), MICROMETRES.get(pixels.get("PhysicalSizeXUnit", "µm"))
     names = tuple(channel.get("Name", "") for channel in pixels.iter("Channel"))
     told = [(plane, "Position") for plane in pixels.iter("Plane")] + [(label, "") for label in image.iter("StageLabel")]
     place = next((t for t in told if {f"{t[1]}X", f"{t[1]}Y"} <= t[0].attrib.keys()), None)
@@ -259,8 +247,7 @@ def _ome_tile(
         position = float(element.attrib[f"{prefix}X"]), float(element.attrib[f"{prefix}Y"])
         # What programs write that do not know the unit counts pixels.
         unit = MICROMETRES.get(element.get(f"{prefix}XUnit", "µm"))
-    pixel_size = float(size) * scale if size and scale else None
-    return StoredTile(file, planes, position, unit, pixel_size, names if all(names) else ())
+    return StoredTile(file, planes, position, unit, ome_pixel_size(pixels), names if all(names) else ())
 
 
 def _micro_manager_tag(page: Any) -> dict[str, Any] | None:
