@@ -14,15 +14,16 @@ from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.system.records import parse_xml
 
+_NUMBER = r"(?<![\d.])-?\d+(?:\.\d+)?(?![\d.])"
 _EVENT = re.compile(
-    r"\s*(\d+)\s+[\d.]+\s+\[\d+\].*?(-?[\d.]+),\s*Lat\s+(-?[\d.]+),\s*Lon\s+(-?[\d.]+),\s*Ellh\s+([\d.]+),\s*([\d.]+),"
-    r"\s*([\d.]+)"
+    rf"\s*(\d+)\s+[\d.]+\s+\[\d+\].*?({_NUMBER}),\s*Lat\s+({_NUMBER}),\s*Lon\s+({_NUMBER}),\s*Ellh\s+({_NUMBER}),"
+    rf"\s*({_NUMBER}),\s*({_NUMBER})"
 )
 _SEQUENCE = re.compile(r"_(\d{4})(?:_[A-Z]+)?$", re.IGNORECASE)
 _SUBTITLE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _IN_SUBTITLE = re.compile(
-    r"lat\w*\s*:\s*(?P<lat>-?[\d.]+).*?lon\w*\s*:\s*(?P<lon>-?[\d.]+)(?:.*?abs_alt\s*:\s*(?P<alt>-?[\d.]+))?"
-    r"|GPS\s*\((?P<lon2>-?[\d.]+),\s*(?P<lat2>-?[\d.]+)",
+    rf"lat\w*\s*:\s*(?P<lat>{_NUMBER}).*?lon\w*\s*:\s*(?P<lon>{_NUMBER})(?:.*?abs_alt\s*:\s*(?P<alt>{_NUMBER}))?"
+    rf"|GPS\s*\((?P<lon2>{_NUMBER}),\s*(?P<lat2>{_NUMBER})",
     re.IGNORECASE | re.DOTALL,
 )
 

@@ -195,6 +195,18 @@ def test_subtitles_of_a_video_are_a_track(tmp_path: Path) -> None:
     assert three is None
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1\n00:00:00,000 --> 00:00:00,033\n[latitude: 1.2.3] [longitude: 4.0]\n",
+        "1\t43.6\t[2107]\t-4,N\t-16,E\t194,V\t22.6.1,Lat\t-113.8,Lon\t76.4,Ellh\t0.01, 0.01, 0.02\t50,Q",
+    ],
+)
+def test_what_is_no_number_is_no_place(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError):
+        _read(tmp_path, text)
+
+
 def test_events_of_a_receiver_have_positions_with_accuracies(tmp_path: Path) -> None:
     lines = [
         f"{k}\t435237.6{k}\t[2107]\t   -4,N\t  -16,E\t 194,V\t22.6{k},Lat\t-113.8{k},Lon\t76.412,Ellh\t"
