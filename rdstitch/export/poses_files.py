@@ -9,11 +9,11 @@ quaternions and translations lead from there to a camera with x to the right, y 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.planar_motion import rigid_in_plane, rotation_from_tilt
+from rdstitch.system.late_imports import spatial
 
 
 def images_of_colmap(names: Sequence[str], poses: PlanarPoses, to_map: FloatArray | None) -> str:
@@ -29,7 +29,7 @@ def images_of_colmap(names: Sequence[str], poses: PlanarPoses, to_map: FloatArra
     lines = ["# origin (east, north, up): {:.0f} {:.0f} {:.0f}".format(*origin)]
     for number, (k, centre) in enumerate(zip(known.tolist(), centres - origin, strict=True), start=1):
         rotation = rotation_from_tilt(poses.tilt[k]) @ rigid_in_plane(poses.yaw[k], np.zeros(2)) @ axes.T
-        x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
+        x, y, z, w = spatial.transform.Rotation.from_matrix(rotation).as_quat().tolist()
         values = " ".join(f"{value:.10g}" for value in (w, x, y, z, *(-rotation @ centre).tolist()))
         lines += [f"{number} {values} 1 {names[k]}", ""]
     return "\n".join(lines) + "\n"

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from rdstitch.compositing.composite_options import CompositeOptions, Interpolation
 from rdstitch.compositing.tables import CompositeTables
 from rdstitch.inputs.frame import in_order
-from rdstitch.pipeline.apply_sidecar import Recomposition
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.opencv_state import one_opencv_thread
+
+if TYPE_CHECKING:
+    from rdstitch.pipeline.apply_sidecar import Recomposition
 
 
 class Composer:
@@ -52,7 +54,7 @@ class Composer:
     """
 
     @one_opencv_thread()
-    def __init__(self, result: StitchResult | Recomposition, interpolation: Interpolation = "linear") -> None:
+    def __init__(self, result: "StitchResult | Recomposition", interpolation: Interpolation = "linear") -> None:
         placed, options = placed_by(result)
         images, options = placed.images(result.canvas.near), replace(options, interpolation=interpolation)
         self.names = tuple(source.name for source in placed.sources)
@@ -79,7 +81,7 @@ class Composer:
         )
 
 
-def placed_by(result: StitchResult | Recomposition) -> tuple[PlacedImages, CompositeOptions]:
+def placed_by(result: "StitchResult | Recomposition") -> tuple[PlacedImages, CompositeOptions]:
     """The images of a result in their places, and how they are put together."""
     if isinstance(result, StitchResult):
         placed = PlacedImages.of(result.registration, result.local_alignment.fields or None)

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -23,11 +23,13 @@ from rdstitch.geometry.exif_orientation import quarter_turn, turning_matrix
 from rdstitch.geometry.planar_motion import nearest_rotation, rotation_from_tilt
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.io.tiff import write_cropped_tiff
-from rdstitch.pipeline.apply_sidecar import Recomposition
 from rdstitch.pipeline.composer import placed_by
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_outputs, file_name
+
+if TYPE_CHECKING:
+    from rdstitch.pipeline.apply_sidecar import Recomposition
 
 
 def layer_files(names: list[str], folder: str | Path) -> list[Path]:
@@ -53,7 +55,7 @@ def make_folder(folder: str | Path) -> None:
 
 @one_opencv_thread()
 def write_layers(
-    result: StitchResult | Recomposition,
+    result: "StitchResult | Recomposition",
     folder: str | Path,
     *,
     whole: bool = False,

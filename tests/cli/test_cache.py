@@ -14,6 +14,7 @@ import pytest
 from rdstitch_cli.main import run
 
 from rdstitch.matching import two_view
+from rdstitch.pipeline import detect_features
 from rdstitch.verification import overlap_check
 from tests.cli.running import FAST, Run, finished, start
 from tests.sampled import sampled
@@ -48,9 +49,9 @@ def work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
         monkeypatch.setattr(module, name, wrapped)
 
-    # The package has a function of the module's name.
-    watch(import_module("rdstitch.features.detect"), "_detect")
+    watch(detect_features, "detect_view")
     watch(two_view, "estimate_radial_homographies")
+    # The package has a function of the module's name.
     watch(import_module("rdstitch.alignment.align"), "_chosen")
     watch(overlap_check, "overlap_agreement")
     return called
@@ -61,7 +62,7 @@ def test_only_what_depends_on_a_changed_option_is_done_again(
 ) -> None:
     output = tmp_path / "out.png"
     arguments = ("mosaic", *frames, "-o", output, "--overwrite", "--cache", tmp_path / "new" / "cache", *FAST)
-    for expected in ({"_detect", "estimate_radial_homographies", "_chosen", "overlap_agreement"}, set()):
+    for expected in ({"detect_view", "estimate_radial_homographies", "_chosen", "overlap_agreement"}, set()):
         work.clear()
         first = rdstitch(*arguments)
         assert (first.status, set(work)) == (0, expected)
@@ -69,7 +70,7 @@ def test_only_what_depends_on_a_changed_option_is_done_again(
     for options, expected in (
         (("--blend", "feather", "--scale", "0.5"), set()),
         (("--seed", "1"), {"estimate_radial_homographies", "_chosen", "overlap_agreement"}),
-        (("--features", "orb"), {"_detect", "estimate_radial_homographies", "_chosen", "overlap_agreement"}),
+        (("--features", "orb"), {"detect_view", "estimate_radial_homographies", "_chosen", "overlap_agreement"}),
     ):
         work.clear()
         rdstitch(*arguments, *options)
@@ -88,7 +89,7 @@ def test_an_image_more_needs_only_its_own(
     rdstitch("calibrate", *frames[:2], "-o", tmp_path / "camera.json", *cached)
     work.clear()
     rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", *cached)
-    assert work.count("_detect") == 1
+    assert work.count("detect_view") == 1
     assert _result(tmp_path / "out.png") == plain
 
 

@@ -62,10 +62,10 @@ def test_own_outputs_and_damaged_images_are_named(rdstitch: Run, frames: list[Pa
 
 
 def _photograph(path: Path, size: tuple[int, int] = (400, 300)) -> Path:
-    """With the tags of a camera of 24 mm for 35 mm film, shrunk from four times the size, and a position."""
+    """With the tags of a camera of 35 mm for 35 mm film, shrunk from four times the size, and a position."""
     exif = Image.Exif()
     exif[0x010F], exif[0x013B] = "Maker", "Somebody"
-    photo = {0x920A: 4.0, 0xA20E: 4000.0, 0xA210: 3, 0xA002: 4 * size[0], 0xA405: 24}
+    photo = {0x920A: 4.0, 0xA20E: 4000.0, 0xA210: 3, 0xA002: 4 * size[0], 0xA405: 35}
     exif[0x8769] = {**photo, 0x9003: "2024:05:06 07:08:09", 0x829A: 0.01}
     exif[0x8825] = {1: "N", 2: (52.0, 30.0, 1.5), 3: "E", 4: (1.0, 2.0, 3.0)}
     samples = np.random.default_rng(1).integers(0, 256, (size[1] // 4, size[0] // 4, 3), dtype=np.uint8)
@@ -141,7 +141,8 @@ def test_a_camera_file_without_a_size_takes_it_from_the_images(
     values = "distortion_coefficients:\n   rows: 1\n   cols: 5\n   data: [-0.2, 0.05, 0., 0., 0.]\n"
     camera.write_text("%YAML:1.0\n---\n" + matrix + values)
     done = rdstitch("undistort", frames[0], "--camera", camera, "-o", tmp_path / "out")
-    assert "focal lengths along x and y differ by 5.7%" in done.err
+    assert "OpenCV lens model, rms 3.96 pixels" in done.err
+    assert "by which images are corrected" in done.err
     (tmp_path / "list").write_text(str(tmp_path / "absent.png"))
     done = rdstitch("undistort", f"@{tmp_path / 'list'}", "--camera", camera, "-o", tmp_path / "none", status=3)
     assert "has no image size; add image_width and image_height" in done.line
