@@ -64,7 +64,6 @@ def mosaic(
     list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
-    from rdstitch.pipeline.bands import mosaic_bands
     from rdstitch.pipeline.map_server import map_files, write_map
     from rdstitch.pipeline.recipes import mosaic as recipe
     from rdstitch.pipeline.recipes import mosaic_blocks
@@ -87,6 +86,8 @@ def mosaic(
         how: dict[str, Any] = {"every": every, "progress": beside.timer, "beside": beside}
         others: Sequence[Recomposition] = ()
         if bands:
+            from rdstitch.pipeline.bands import mosaic_bands
+
             first, others = mosaic_bands(paths, output, bands, stitch, **how)
             results: Sequence[StitchResult] = [first]
         elif all_blocks:
