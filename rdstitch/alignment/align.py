@@ -228,7 +228,7 @@ def _checked_focal(told: AdjustedImages) -> AdjustedImages:
         return told
     if options != told.options:
         shown = _adjusted(_chosen(cameras, told.links, told.options))
-    return replace(shown, messages=(*shown.messages, doubt))
+    return replace(shown, messages=(*told.messages, *shown.messages, doubt))
 
 
 def most_matches_read(links: int, options: AlignmentOptions) -> int | None:

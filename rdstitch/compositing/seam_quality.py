@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection
-from rdstitch.system.late_imports import csgraph, sparse
+from rdstitch.system.late_imports import csgraph, sparse, spatial
 
 DIAGONAL = 1000.0
 """Pixels of an image's diagonal at which seams are looked at: about what a screen shows of it."""
@@ -337,9 +337,10 @@ def _breaks(
     """Broken places of one border that follow each other, as one."""
     chosen = np.flatnonzero(broken)
     at, pairs = places[chosen], images[chosen]
-    near = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1)) <= 2.2 * _STEP
-    near &= (pairs[:, None] == pairs[None]).all(axis=2)
-    _, group = csgraph.connected_components(sparse.csr_array(near), directed=False)
+    near = spatial.cKDTree(at).query_pairs(2.2 * _STEP, output_type="ndarray")
+    one, two = near[(pairs[near] == pairs[near[:, :1]]).all(axis=(1, 2))].T
+    graph = sparse.coo_array((np.ones(len(one)), (one, two)), shape=(len(at),) * 2)
+    _, group = csgraph.connected_components(graph, directed=False)
     breaks = []
     for k in range(int(group.max(initial=-1)) + 1):
         members = group == k

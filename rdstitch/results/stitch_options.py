@@ -230,6 +230,7 @@ class StitchOptions:
             self.check_points,
             self.lightglue_model,
             self.features.aliked_model,
+            self.composite.like,
         )
         given = [Path(file) for file in named if file is not None]
         return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]

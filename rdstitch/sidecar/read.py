@@ -246,13 +246,13 @@ class TileRecord(Struct):
     std_px: NonNegative = 0.0
 
 
-class StageRecord(Struct):
+class StageRecord(Struct, kw_only=True):
     """What a stage does: the matrix from its pixels to the camera's, and what its lines are off, px."""
 
     source: str
     pixel_um: _Positive | None
-    z: int | Literal["max"] | None
-    time: int | None
+    z: int | Literal["max"] | None = None
+    time: int | None = None
     matrix: tuple[Pair, Pair]
     rows_px: list[Pair]
     columns_px: list[Pair]

@@ -303,7 +303,7 @@ def _is_alive(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except OSError:
+    except (OSError, OverflowError):  # one that may not be asked, or a number that none has
         return True
     return True
 
