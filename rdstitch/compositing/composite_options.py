@@ -135,7 +135,9 @@ class CompositeOptions(UprightOptions):
             raise ArgumentError("like says the size of pixels and the map; leave out gsd, crs, scale and rotate")
         if (self.like or self.extent) and (self.crop != "none" or self.max_size is not None):
             raise ArgumentError("like and extent say how large the output is; leave out crop and max_size")
-        if self.extent is not None and not (self.extent[0] < self.extent[2] and self.extent[1] < self.extent[3]):
+        if self.extent is not None and not (
+            len(self.extent) == 4 and self.extent[0] < self.extent[2] and self.extent[1] < self.extent[3]
+        ):
             raise ArgumentError(f"extent must be west, south, east and north, not {self.extent}")
         if self.max_memory is not None and self.max_memory <= 0:
             raise ArgumentError(f"max_memory must be positive, not {self.max_memory}")

@@ -336,13 +336,15 @@ def _breaks(
 ) -> tuple[SeamBreak, ...]:
     """Broken places of one border that follow each other, as one."""
     chosen = np.flatnonzero(broken)
+    if not len(chosen):
+        return ()
     at, pairs = places[chosen], images[chosen]
     near = spatial.cKDTree(at).query_pairs(2.2 * _STEP, output_type="ndarray")
     one, two = near[(pairs[near] == pairs[near[:, :1]]).all(axis=(1, 2))].T
     graph = sparse.coo_array((np.ones(len(one)), (one, two)), shape=(len(at),) * 2)
     _, group = csgraph.connected_components(graph, directed=False)
     breaks = []
-    for k in range(int(group.max(initial=-1)) + 1):
+    for k in range(int(group.max()) + 1):
         members = group == k
         length = float(np.hypot(*np.ptp(at[members], axis=0))) + _STEP
         middle = at[members][np.argmin(np.hypot(*(at[members] - at[members].mean(axis=0)).T))]

@@ -165,7 +165,8 @@ def poses_file(result: StitchResult, file: str | Path, frame: PosesFrame = "enu"
         poses, to_map = _poses_and_map(result)
         assert place is not None
         unit = math.hypot(to_map[0, 0], to_map[1, 0])
-        altitudes = [math.nan if s.metadata.gps is None else s.metadata.gps.altitude or math.nan for s in sources]
+        known = (None if s.metadata.gps is None else s.metadata.gps.altitude for s in sources)
+        altitudes = [math.nan if altitude is None else altitude for altitude in known]
         above = np.array(altitudes) - unit * poses.height
         ground = float(np.median(above[np.isfinite(above)])) if np.isfinite(above).any() else 0.0
         return geo_of_opendronemap(names, poses, to_map, place.crs.epsg, ground)

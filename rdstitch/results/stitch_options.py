@@ -168,7 +168,7 @@ class StitchOptions:
             if isinstance(given := getattr(self, name), str | Path):
                 object.__setattr__(self, name, convert(given))
         for name, angles in (("tilt", self.tilt or ()), ("attitude_std", (self.attitude_std,))):
-            if any(abs(angle) > math.pi / 2 for angle in angles):
+            if not all(abs(angle) <= math.pi / 2 for angle in angles):
                 raise ArgumentError(f"{name} is in radians, and at most pi/2, not {angles}; use math.radians")
         if self.solver not in SOLVERS:
             raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
