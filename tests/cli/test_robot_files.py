@@ -58,6 +58,8 @@ def test_of_several_bands_the_first_one_is_the_map(rdstitch: Run, frames: list[P
     assert {file.name for file in (tmp_path / "maps").iterdir()} == {"map.yaml", "map.png"}
     rdstitch(*wanted, status=None, told="map.yaml: exists already")
     assert not (tmp_path / "f.png").exists()
+    tiled = ("mosaic", *frames, "-o", tmp_path / "f.dzi", "--map-server", tmp_path / "maps")
+    rdstitch(*tiled, status=2, told="instead of .dzi")
 
 
 def test_a_bag_replaces_another_one_whole_and_needs_rosbags_before_the_work(

@@ -72,6 +72,8 @@ def mosaic(
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
     if bands and (all_blocks or following or given["dry_run"]):
         raise click.UsageError("--bands goes neither with --all-blocks, --follow nor --dry-run")
+    if map_server is not None and output.suffix.lower() == ".dzi":
+        raise click.UsageError("--map-server is made from the output: write .png, .jpg or .tif instead of .dzi")
     if map_server is not None and not given["dry_run"]:
         map_files(map_server, overwrite=given["overwrite"])
     with ExitStack() as stack:
