@@ -13,9 +13,6 @@ from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
 
-LocalAlignmentMode = Literal["auto", "off"] | int
-
-MAX_CELLS = 100
 _CELLS = 12
 # Of the grids of all images together: of more than some 800 images the cells are larger, to bound memory.
 _MAX_NODES = 120_000

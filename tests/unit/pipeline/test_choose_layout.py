@@ -11,10 +11,10 @@ import pytest
 from rdstitch.compositing import SeamBreak, SeamQuality, plan_canvas
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import write_image
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.choose_layout import _is_stretched
 from rdstitch.pipeline.compose import seam_messages
 from rdstitch.pipeline.recipes import mosaic, pano
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic.textures import ground
 
 
