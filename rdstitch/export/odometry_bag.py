@@ -19,7 +19,7 @@ from rdstitch.system.outputs import TemporaryFolder, naming
 
 
 def check_bag(file: Path, *, overwrite: bool) -> None:
-    """Refuse a bag before long work where the package that writes it is missing, or a folder that is no bag is there."""
+    """Refuse a bag before long work where what writes it is missing, or a folder is there that is no bag."""
     try:
         import rosbags.rosbag1  # noqa: F401
     except ImportError:
