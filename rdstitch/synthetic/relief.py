@@ -91,7 +91,7 @@ class Relief:
 
 
 def hills(size: tuple[int, int], seed: int, *, height: float, width: int = 200) -> Relief:
-    """Smooth bumps at random places, the highest ``height`` texels above the lowest point, tops about ``width`` apart."""
+    """Smooth bumps at random, the highest ``height`` texels above the lowest point, tops about ``width`` apart."""
     # Noise on a coarse grid, enlarged by cubic interpolation: as smooth as hills are, at any size of the plane.
     rng = np.random.default_rng(seed)
     nodes = rng.random((2 * size[1] // width + 4, 2 * size[0] // width + 4), dtype=np.float32)
