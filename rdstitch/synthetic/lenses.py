@@ -85,7 +85,7 @@ class FisheyeLens(_FixedFocalLens):
 
 @dataclass(frozen=True)
 class BrownLens(_FixedFocalLens):
-    """Brown's polynomial, as OpenCV has it: ``x_d = x_u (1 + k1 r² + k2 r⁴ + k3 r⁶) + tangential part``, ``r = |x_u|``"""
+    """OpenCV's polynomial of Brown: ``x_d = x_u (1 + k1 r² + k2 r⁴ + k3 r⁶) + tangential part``, ``r = |x_u|``."""
 
     k1: float = 0.0
     k2: float = 0.0
