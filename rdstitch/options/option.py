@@ -132,5 +132,10 @@ def _in_words(kind: Any, option: Option) -> str:
     if get_origin(kind) is tuple:
         parts = get_args(kind)
         return f"{len(parts)} numbers{unit}{option.limits}" if parts[-1] is not Ellipsis else "a list"
-    names = {int: f"a whole number{unit}{option.limits}", float: f"a number{unit}{option.limits}", Path: "a file"}
+    names = {
+        bool: "true or false",
+        int: f"a whole number{unit}{option.limits}",
+        float: f"a number{unit}{option.limits}",
+        Path: "a file",
+    }
     return names.get(kind, "a text")
