@@ -33,13 +33,10 @@ _TIME_COLUMNS = {"name": _NAMES, "timestamp": _TIME}
 def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list[Source]:
     """The sources, each with its attitude, if these are wanted.
 
-    Parameters
-    ----------
-    wanted : str, path or None
-        The text :data:`XMP`: what drones write into images, see :mod:`rdstitch.io.attitude`; the plane is then taken
-        to be level. Or a CSV file with a header that names the columns ``name`` (of the image's file), ``psi`` and
-        ``theta``, degrees; or ``timestamp``, s, instead of the name, between which is interpolated; or the quaternion
-        ``qx``, ``qy``, ``qz``, ``qw`` of a body of ROS instead of the angles.
+    By :data:`XMP`: what drones write into images, see :mod:`rdstitch.io.attitude`; the plane is then taken to be level.
+    Or by a CSV file with the columns ``name`` (of the image's file), ``psi`` and ``theta``, degrees; or ``timestamp``,
+    s, instead of the name, between which is interpolated; or the quaternion ``qx``, ``qy``, ``qz``, ``qw`` of a body of
+    ROS instead of the angles.
     """
     if wanted is None:
         return list(sources)
@@ -171,12 +168,9 @@ def timestamps_of(sources: Sequence[Source]) -> FloatArray:
 def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
     """Everything that was named, each with its time by a file; before anything of it is left out.
 
-    Parameters
-    ----------
-    file : path or None
-        CSV with a header that names the columns ``name`` and ``timestamp``; or lines ``TIMESTAMP NAME`` as in the lists
-        of the TUM benchmark; or one time a line, the n-th for the n-th image or frame of the video, as KITTI's
-        ``times.txt``. Lines that begin with ``#`` are ignored.
+    The file is a CSV with the columns ``name`` and ``timestamp``; or has lines ``TIMESTAMP NAME`` as in the lists of
+    the TUM benchmark; or one time a line, the n-th for the n-th image or frame of the video, as KITTI's ``times.txt``.
+    Lines that begin with ``#`` are ignored.
     """
     if file is None:
         return list(frames)
