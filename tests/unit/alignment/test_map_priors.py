@@ -132,7 +132,8 @@ def _off(found: Alignment, sightings: tuple[Sighting, ...]) -> FloatArray:
         seen.append(complex(x, -y))
         places.append(complex(*one.place))
     a, b = np.array(seen) - np.mean(seen), np.array(places) - np.mean(places)
-    return np.abs(b - np.vdot(a, b) / np.vdot(a, a) * a)
+    off: FloatArray = np.abs(b - np.vdot(a, b) / np.vdot(a, a) * a)
+    return off
 
 
 def test_a_strip_bends_back_onto_its_control_points() -> None:
