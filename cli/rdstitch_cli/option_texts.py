@@ -138,7 +138,7 @@ tiles --lambda L|auto: Known λ (half-diagonal frame), or auto: estimate it; oth
     reads.
 --whole-layers: With --layers: on the whole canvas instead of cropped.
 --bands: Images of several bands by their names: the first one is registered, and the lenses of the others to it; each
-    becomes a file, OUTPUT with - and the band's name before its suffix, all on the same pixels.
+    becomes a file, OUTPUT with - and the band's name before its suffix, and a TIFF of all becomes OUTPUT.
 --all-blocks: Stitch every block of overlapping images: the largest becomes OUTPUT, the others OUTPUT with -2, -3, …
     before its suffix.
 --poses FILE: Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does;
