@@ -12,8 +12,8 @@ import click
 _PAGE = """
 Options that matter first: *output *overwrite *images *preview *reference *camera *focal *mask *scale *report format
     frame *height *view *quiet
-Places: *grid columns order origin *overlap *positions positions-offset gcp check-points *positions-only *pixel-size
-    *search
+Places: *grid columns order origin *overlap *positions positions-offset position-accuracy gcp check-points
+    *positions-only *pixel-size *search
 Tiles: *channel *z time *flat-field *save-flat-field
 Input: *follow idle refresh *every *exclude include-only match topic timestamps
 Camera: *lambda lens tilt attitude attitude-std save-camera camera-format

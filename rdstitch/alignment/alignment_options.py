@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
+from rdstitch.alignment.plane_marks import ControlPoints, Sighting
 from rdstitch.alignment.priors import CameraPriors, known_focal
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError
@@ -28,7 +29,9 @@ class AlignmentOptions:
     attitudes_std: float = 0.0  # radians; 0: exact
     # direction down (N, 3) in the axes of each camera (right, down, ahead); NaN where unknown; it levels panoramas
     gravity: ArrayLike | None = None
-    positions: ArrayLike | None = None  # metres east and north (N, 2); NaN where unknown; a weak prior
+    positions: ArrayLike | None = None  # metres east and north (N, 2); NaN where unknown; a prior
+    positions_std: ArrayLike | None = None  # standard deviation (N,) of one coordinate of these, m; NaN where unknown
+    control: tuple[Sighting, ...] = ()  # ground control points in the images; a prior where there are three or more
     lens: str = "auto"  # one of :data:`rdstitch.choices.LensName`; "auto": the simplest that the data allow
     purpose: Purpose = "mosaic"
     pose_covariance: bool = False  # its time grows with the square of the number of images
@@ -66,6 +69,8 @@ class AlignmentOptions:
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
             positions=positions,
+            positions_std=np.full(count, np.nan) if self.positions_std is None else np.asarray(self.positions_std),
+            control=ControlPoints.of(self.control, cameras),
         )
 
     @property

@@ -107,9 +107,17 @@ class StitchOptions:
     positions_offset: Annotated[
         float, Option("Seconds from the times of the images to those of the GPX track (UTC).", "S")
     ] = 0.0
+    position_accuracy: Annotated[
+        float | None,
+        Option("Standard deviation of a horizontal coordinate of positions that tell none, metres.", "M", above=0.0),
+    ] = None
     gcp: Annotated[
         str | Path | None,
-        Option("Ground control points, as OpenDroneMap's gcp_list.txt; they place the output on the Earth.", "FILE"),
+        Option(
+            "Ground control points, as OpenDroneMap's gcp_list.txt, or CSV x,y,px,py,image,name,accuracy (see --crs); "
+            "they bend the alignment, and place the output on the Earth.",
+            "FILE",
+        ),
     ] = None
     check_points: Annotated[
         str | Path | None,

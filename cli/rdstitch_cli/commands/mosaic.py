@@ -44,7 +44,8 @@ def mosaic(
         str | None,
         Option(
             "Images of several bands by their names: the first one is registered, and the lenses of the others to it; "
-            "each becomes a file, OUTPUT with - and the band's name before its suffix, all on the same pixels.",
+            "each becomes a file, OUTPUT with - and the band's name before its suffix, and a TIFF of all becomes "
+            "OUTPUT.",
             "NAME=PATTERN,…",
         ),
     ] = None,

@@ -151,6 +151,17 @@ def test_a_tenth_of_an_overlap_must_look_alike(
     assert all(f"({confirming} of {cells}" in message.text for message in found)
 
 
+@pytest.mark.parametrize(("coarsely", "picture", "poses"), [(0.8, 0, 1), (0.4, 1, 1)])
+def test_depth_shifts_what_a_picture_shows_by_a_little(
+    good: Registration, monkeypatch: pytest.MonkeyPatch, coarsely: float, picture: int, poses: int
+) -> None:
+    """Few cells agree to 2.5 pixels then, but most at a coarse scale."""
+    checked = _checked(100, 6)
+    checked = replace(checked, agreement=replace(checked.agreement, coarsely=coarsely))
+    monkeypatch.setattr(evidence, "check_overlaps", lambda *_: [checked])
+    assert [len(judge(good, THRESHOLD, purpose)) for purpose in ("mosaic", "trajectory")] == [picture, poses]
+
+
 @pytest.mark.parametrize(("clear", "severity"), [(True, "warning"), (False, "failure")])
 def test_poses_need_to_know_which_of_two_motions_is_the_plane(
     good: Registration, monkeypatch: pytest.MonkeyPatch, clear: bool, severity: str
