@@ -67,12 +67,8 @@ def band_lens(
 ) -> tuple[BandLens | None, list[Message]]:
     """The lens of a band from registered images and those that take their place, by numbers; None where it is the same.
 
-    Where the images show nothing in common, as masks do, nothing is known, and nothing changed.
-
-    Raises
-    ------
-    InputError
-        When images were evidently not taken from the same places.
+    Where the images show nothing in common, as masks do, nothing is known, and nothing changed. Raises InputError where
+    images were evidently not taken from the same places.
     """
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_IMAGES)).astype(np.intp)).tolist()
     compared = [list(pairs.values())[k] for k in chosen]
