@@ -50,7 +50,9 @@ trajectory --frame: Axes of positions. enu: x to the right and y to the top of t
 * tiles --positions FILE: CSV with name,x,y (pixels) or name,x_um,y_um, or Fiji's TileConfiguration.txt; otherwise what
     OME-TIFF or Micro-Manager say.
 --positions-offset S: Seconds from the times of the images to those of the GPX track (UTC).
---gcp FILE: Ground control points, as OpenDroneMap's gcp_list.txt; they place the output on the Earth.
+--position-accuracy M: Standard deviation of a horizontal coordinate of positions that tell none, metres.
+--gcp FILE: Ground control points, as OpenDroneMap's gcp_list.txt, or CSV x,y,px,py,image,name,accuracy (see --crs);
+    they bend the alignment, and place the output on the Earth.
 --check-points FILE: Points like those of --gcp that are compared with the map, and take no part in it.
 * --positions-only FILE: Write the places of the tiles to this CSV file, or to a .txt as Fiji's list; without --output
     nothing is composed.
@@ -136,7 +138,7 @@ tiles --lambda L|auto: Known λ (half-diagonal frame), or auto: estimate it; oth
     reads.
 --whole-layers: With --layers: on the whole canvas instead of cropped.
 --bands: Images of several bands by their names: the first one is registered, and the lenses of the others to it; each
-    becomes a file, OUTPUT with - and the band's name before its suffix, all on the same pixels.
+    becomes a file, OUTPUT with - and the band's name before its suffix, and a TIFF of all becomes OUTPUT.
 --all-blocks: Stitch every block of overlapping images: the largest becomes OUTPUT, the others OUTPUT with -2, -3, …
     before its suffix.
 --poses FILE: Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does;

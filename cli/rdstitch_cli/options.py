@@ -115,6 +115,7 @@ known = together(
     option("--timestamps", IMAGE),
     option("--positions", IMAGE),
     option("--positions-offset", RealNumber(), 0.0),
+    option("--position-accuracy", RealNumber(0.0, min_open=True)),
 )
 mask = option("--mask", IMAGE)
 workers = option("-j --workers", WholeNumber(0), default=0)

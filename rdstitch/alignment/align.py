@@ -19,16 +19,16 @@ from rdstitch.alignment.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjus
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
+from rdstitch.alignment.map_priors import hold_on_map
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, noise_of_links
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.position_priors import hold_positions
 from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
 from rdstitch.alignment.uncertainty import covariances, weigh_lens
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import LENS_STD, Camera
 from rdstitch.geometry.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
 from rdstitch.geometry.radial_homography import RadialHomography
@@ -95,7 +95,7 @@ class AlignmentTask:
     @cached_property
     def result(self) -> Alignment:
         """Adjusted to all matches."""
-        return build_alignment(_checked_focal(_adjusted(self._chosen)))
+        return build_alignment(_checked_focal(_adjusted(self._chosen), self.options))
 
     @cached_property
     def _chosen(self) -> AdjustedImages:
@@ -193,7 +193,8 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
     fit = from_another_start(problem, fit)
     if len(options.lenses) > 1:
         problem, fit = with_third_coefficient(problem, fit)
-    problem, fit, disagreement = hold_positions(problem, fit)
+    held = hold_on_map(problem, fit)
+    problem, fit = held.problem, held.fit
     covariance, of_lens = covariances(problem, fit)
     fit = weigh_lens(problem, fit, covariance) if chosen.observable else fit
     return replace(
@@ -201,7 +202,8 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         problem=problem,
         choice=replace(choice, fit=fit),
         lens=chosen.lens.refined(fit.free_lens),
-        positions_disagree=disagreement,
+        positions_disagree=held.disagreement,
+        leverage=held.leverage_of(chosen.images),
         covariance=covariance,
         lens_covariance=of_lens,
     )
@@ -214,21 +216,23 @@ def from_another_start(problem: Problem, fit: Fit) -> Fit:
     return min((fit, problem.fit(fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
 
 
-def _checked_focal(told: AdjustedImages) -> AdjustedImages:
+def _checked_focal(told: AdjustedImages, given: AlignmentOptions) -> AdjustedImages:
     """Without the focal length that was given, where it gave way and the images by themselves show another one."""
     if told.covariance is None or not is_strained(told.whole.camera_priors, told.choice.fit):
         return told
     cameras = [replace(camera, focal=None, focal_std=None, focal_source=None).with_focal() for camera in told.cameras]
     # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
     options = told.options if told.options.attitudes is not None else replace(told.options, tilt=None)
-    shown = _adjusted(_chosen(cameras, told.links, options))
-    camera = told.cameras[shown.images[0]]
-    doubt = check_focal(camera, shown.choice.fit, shown.covariance)
-    if doubt is None:
-        return told
-    if options != told.options:
-        shown = _adjusted(_chosen(cameras, told.links, told.options))
-    return replace(shown, messages=(*told.messages, *shown.messages, doubt))
+    try:
+        shown = _adjusted(_chosen(cameras, told.links, options))
+        doubt = check_focal(told.cameras[shown.images[0]], shown.choice.fit, shown.covariance)
+        if doubt is None:
+            return told
+        if options != given:  # what seemed to be wrong may have been so with the wrong focal length only
+            shown = _adjusted(_chosen(cameras, told.links, given))
+    except (RegistrationError, ImpossibleCameraError, np.linalg.LinAlgError):
+        return told  # by themselves the images determine nothing
+    return replace(shown, messages=(*shown.messages, doubt))
 
 
 def most_matches_read(links: int, options: AlignmentOptions) -> int | None:

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
+from rdstitch.alignment.plane_marks import ControlPoints, Sighting
 from rdstitch.alignment.priors import CameraPriors, known_focal
 from rdstitch.choices import Purpose
 from rdstitch.errors import ArgumentError
@@ -37,7 +38,11 @@ class AlignmentOptions:
         Direction down in the axes of each camera (right, down, ahead), where it is known; NaN elsewhere. It levels
         panoramas.
     positions : ndarray of shape (N, 2), optional
-        Metres east and north where each image was taken; NaN where that is not known. A weak prior.
+        Metres east and north where each image was taken; NaN where that is not known. A prior.
+    positions_std : ndarray of shape (N,), optional
+        Standard deviation of one coordinate of these, m; NaN where that is not known.
+    control : tuple of Sighting
+        Ground control points in the images; a prior where there are three or more.
     lens : str
         One of :data:`rdstitch.alignment.lens_selection.LENSES`, or "auto": the simplest that the data allow.
     purpose : str
@@ -56,6 +61,8 @@ class AlignmentOptions:
     attitudes_std: float = 0.0
     gravity: ArrayLike | None = None
     positions: ArrayLike | None = None
+    positions_std: ArrayLike | None = None
+    control: tuple[Sighting, ...] = ()
     lens: str = "auto"
     purpose: Purpose = "mosaic"
     pose_covariance: bool = False
@@ -95,6 +102,8 @@ class AlignmentOptions:
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
             positions=positions,
+            positions_std=np.full(count, np.nan) if self.positions_std is None else np.asarray(self.positions_std),
+            control=ControlPoints.of(self.control, cameras),
         )
 
     @property

@@ -17,19 +17,10 @@ _FLAT = 1e-6  # grey levels² per pixel⁴: a product of curvatures that is none
 
 
 def find_crossings(image: PreparedImage) -> FloatArray:
-    """Crossings in an image.
+    """Crossings in an image, pixels of its full size (N, 2).
 
     Around the crossing of two straight edges the image looks the same when it is turned by 180 degrees, at any
     perspective: smoothing does not move it, whereas it moves the middle of a blob.
-
-    Parameters
-    ----------
-    image : PreparedImage
-
-    Returns
-    -------
-    ndarray of shape (N, 2)
-        Pixels of the full-size image.
     """
     smooth = cv2.GaussianBlur(image.grey.astype(np.float32), (0, 0), _SIGMA)
     xx, xy, yy = (cv2.Sobel(smooth, cv2.CV_32F, *order, scale=0.25) for order in ((2, 0), (1, 1), (0, 2)))

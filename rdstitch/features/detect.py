@@ -40,21 +40,11 @@ def strongest(response: FloatArray, count: int) -> NDArray[np.intp]:
 
 
 def spread(points: FloatArray, response: FloatArray, count: int, cell: float) -> NDArray[np.intp]:
-    """Indices of ``count`` keypoints that are spread over the image, strongest first.
+    """Indices of ``count`` keypoints at most (N, 2) that are spread over the image, strongest first.
 
-    The cells of a grid take turns, each giving its strongest keypoint that is left, until ``count`` are
-    taken: no cell gets more than another that still has some. The corners, where the distortion is seen, thus
-    keep what they have however strong the middle of the image is.
-
-    Parameters
-    ----------
-    points : ndarray of shape (N, 2)
-        pixels.
-    response : ndarray of shape (N,)
-    count : int
-        Keypoints to keep at most.
-    cell : float
-        Side of a cell, pixels.
+    The cells of a grid, ``cell`` pixels a side, take turns, each giving its strongest keypoint that is left: no cell
+    gets more than another that still has some. The corners, where the distortion is seen, thus keep what they have
+    however strong the middle of the image is.
     """
     if len(points) <= count:
         return strongest(response, count)
@@ -73,33 +63,17 @@ ViewLoader = Callable[[float | None], View]
 
 
 def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask | None = None) -> Features:
-    """Detect and describe the features of one image.
+    """Detect and describe the features of one image: the same whatever the number of threads, strongest first.
 
-    Parameters
-    ----------
-    image : ndarray of shape (height, width) or (height, width, bands)
-        Grey, grey with alpha, RGB or RGB with alpha; uint8, or uint16 or float, which are stretched to 8
-        bits. Nothing is detected where alpha is zero or a float is not finite.
-    mask : ndarray of shape (height, width), bool or uint8, optional
-        Where to look: True, or not zero. A keypoint whose extent reaches into the rest is dropped.
-
-    Returns
-    -------
-    Features
-        Points in pixels of ``image``, strongest first; none for a blank image. The same for the same image,
-        whatever the number of threads.
+    The image is grey, grey with alpha, RGB or RGB with alpha; uint8, or uint16 or float, which are stretched to 8 bits.
+    Nothing is detected where alpha is zero, a float is not finite, or the mask is False or zero; a keypoint whose
+    extent reaches into such a place is dropped.
     """
     return detect_view(lambda _: View(image, mask), options or FeatureOptions())
 
 
 def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
-    """As :func:`detect`, for an image that is loaded as large as it is needed.
-
-    Parameters
-    ----------
-    source : callable
-        See :data:`ViewLoader`.
-    """
+    """As :func:`detect`, for an image that is loaded as large as it is needed."""
     most, megapixels = options.limits
     image, detection, usable = _look(source, options, megapixels)
     shown, few = len(usable), len(usable) < _MIN_KEYPOINT_SHARE * most

@@ -66,12 +66,7 @@ class AlikedDetection:
 class LightGlue:
     """Matches learned features by a network that sees all keypoints of both images at once.
 
-    Parameters
-    ----------
-    model : path
-        ONNX file, trained for the kind of features to match.
-    min_score : float
-        Least confidence of a match, in [0, 1).
+    ``model`` is an ONNX file, trained for the kind of features to match; ``min_score`` the least confidence, in [0, 1).
     """
 
     def __init__(self, model: str | Path, min_score: float = 0.1) -> None:

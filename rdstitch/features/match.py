@@ -33,20 +33,13 @@ _CELLS = 24  # a side, by which places are distinguished
 def match(
     features1: Features, features2: Features, ratio: float | None = None, block_bytes: int = _BLOCK_BYTES
 ) -> Correspondences:
-    """Match the features of two images.
+    """Match the features of two images, which are of the same kind.
 
-    A match is the nearest neighbour in both directions, and in both directions nearer than ``ratio`` times the
-    second nearest. Exchanging the images exchanges the columns of the result. A tie for the nearest is no
-    match. Keypoints at one location (SIFT's several orientations) count as one, and give one match at most.
-
-    Parameters
-    ----------
-    features1, features2 : Features
-        Of the same kind. Where they have signs of the Laplacian, only equal signs match.
-    ratio : float, optional
-        Limit to the ratio of distances, in (0, 1]; 1 keeps all mutual nearest neighbours.
-    block_bytes : int
-        Memory for one block of distances, bytes; the result is the same for any, and for any number of threads.
+    A match is the nearest neighbour in both directions, and in both directions nearer than ``ratio`` times the second
+    nearest (1 keeps all mutual nearest neighbours). Exchanging the images exchanges the columns of the result. A tie
+    for the nearest is no match. Where features have signs of the Laplacian, only equal signs match. Keypoints at one
+    location (SIFT's several orientations) count as one, and give one match at most. One block of distances takes
+    ``block_bytes``; the result is the same for any, and for any number of threads.
     """
     limit = check_ratio(ratio)
     if features1.kind != features2.kind:
@@ -74,21 +67,9 @@ def match_near(
 ) -> Correspondences:
     """Match features with those near the places where they are expected.
 
-    As in :func:`rdstitch.features.match`, a match is the nearest in both directions and passes the ratio test in both,
-    but only features within the radius compete. And it is no less alike than matches that are known to be right.
-
-    Parameters
-    ----------
-    features1, features2 : Features
-        Of the same kind. Where they have signs of the Laplacian, only equal signs match.
-    expected : ndarray of shape (N1, 2)
-        Where the features of image 1 should be in image 2, pixels; NaN where nowhere.
-    radius : float
-        How far from there is searched, pixels.
-    known : ndarray of shape (K, 2), intp
-        Matches that are right, as indices into features 1 and 2; at least one.
-    ratio : float, optional
-        As in :func:`rdstitch.features.match`.
+    As in :func:`match`, but only features within ``radius`` pixels of the ``expected`` places (N1, 2) in image 2, NaN
+    where nowhere, compete; and a match is no less alike than the matches ``known`` to be right, indices (K, 2) of one
+    at least.
     """
     limit = check_ratio(ratio)
     candidates = _within(expected, features2.points, radius)
@@ -157,20 +138,10 @@ Part = NDArray[np.intp]
 
 
 def overlapping(features1: Features, features2: Features, matches: Correspondences) -> tuple[Part, Part] | None:
-    """The features of two images that lie where these overlap, generously.
+    """Indices of the features of two images that lie where these overlap, generously.
 
-    An overlap is what lies around the matches, twice as far as these are apart there: where texture is poor and matches
-    are few, it goes on for longer.
-
-    Parameters
-    ----------
-    matches : Correspondences
-        Some matches of the two, such as those of their strongest features, the most distinctive first.
-
-    Returns
-    -------
-    (ndarray of shape (N1,), ndarray of shape (N2,)), intp, or None
-        None where the matches are too few or too scattered.
+    An overlap is what lies around the matches, the most distinctive first, twice as far as these are apart there: where
+    texture is poor and matches are few, it goes on for longer. None where they are too few or too scattered.
     """
     size1, size2 = features1.image_size, features2.image_size
     if len(matches) < _MIN_MATCHES or size1 is None or size2 is None:

@@ -124,23 +124,11 @@ class Locations:
 def mutual_nearest(
     features1: Features, features2: Features, block_bytes: int, limit: float = np.inf
 ) -> tuple[NDArray[np.intp], FloatArray]:
-    """Pairs of keypoints that are each other's nearest in descriptor space, and how distinct they are.
+    """Pairs of keypoints (M, 2) that are each other's nearest in descriptor space, and how distinct they are (M,).
 
-    Parameters
-    ----------
-    features1, features2 : Features
-        Of one kind.
-    block_bytes : int
-        Size of the blocks in which the matrix of similarities is made, bytes; at least one row of it.
-    limit : float
-        Pairs with this ratio or a larger one are left out.
-
-    Returns
-    -------
-    pairs : ndarray of shape (M, 2), intp
-        Indices into features 1 and 2. Where several are equally near there is no pair.
-    ratio : ndarray of shape (M,)
-        Distance to the nearest over distance to the second nearest location, the worse of both directions.
+    That is the distance to the nearest over the distance to the second nearest location, the worse of both directions;
+    pairs of ``limit`` or more are left out, and so are those of which several are equally near. The matrix of
+    similarities is made in blocks of ``block_bytes``, one row of it at least.
     """
     pairs, ratios = [np.zeros((0, 2), dtype=np.intp)], [np.zeros(0)]
     for chosen1, chosen2 in _comparable(features1, features2):

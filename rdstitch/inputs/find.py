@@ -94,21 +94,12 @@ def find_images(
 ) -> FoundImages:
     """The frames that the arguments stand for.
 
-    Parameters
-    ----------
-    arguments : iterable of path or Frame
-        Each an image file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line or
-        separated by NUL, a video file, a ROS bag, or a frame, which stays as it is.
-    exclude : iterable of path
-        Files that are no input, such as the output, where rdstitch wrote them. Any other image stays: its user must
-        hear that it would be written over.
-    frames_folder : callable, optional
-        Gives the folder where frames of videos are written, losslessly; without it a video is refused.
-    every : int, optional
-        Use every n-th frame of videos and ROS bags; without it those that show new ground, see
-        :mod:`rdstitch.inputs.keyframes`.
-    topic : str, optional
-        Topic of the images in ROS bags; without one, the only topic of images.
+    Each is an image file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line or
+    separated by NUL, a video file, a ROS bag, or a frame, which stays as it is. Files to ``exclude``, such as the
+    output, are left out where rdstitch wrote them; any other image stays: its user must hear that it would be written
+    over. Frames of videos are written to ``frames_folder``, losslessly; without it a video is refused. Every n-th frame
+    of videos and bags is used, or else those that show new ground, see :mod:`rdstitch.inputs.keyframes`. ``topic`` is
+    that of the images in bags; without one, the only one.
     """
     unwanted = {_entry(Path(path)) for path in exclude}
     frames: list[Frame] = []

@@ -53,15 +53,10 @@ Named = str | os.PathLike[str] | Frame
 def as_inputs(images: Images, channel_order: ChannelOrder = "bgr") -> list[Named]:
     """What the user gave as a list: names stay as they are, arrays become frames.
 
-    Parameters
-    ----------
-    images : path, ndarray, or iterable of them
-        A single path or array is one input. An array is of shape (H, W), (H, W, 1), (H, W, 3), or with alpha as the
-        last channel (H, W, 2) or (H, W, 4), or of more bands; uint8, uint16 or floating point. An array of shape
-        (N, H, W, C) is a sequence of N images. A Pillow image is in its own colours, whatever ``channel_order`` is,
-        with its EXIF. The i-th input, if it is an array or such an image, is called ``image_000i``.
-    channel_order : str
-        "bgr" or "rgb": order of the channels of colour arrays; that of five bands and more stays.
+    A single path or array is one input. An array is of shape (H, W), (H, W, 1), (H, W, 3), or with alpha as the last
+    channel (H, W, 2) or (H, W, 4), or of more bands, whose order stays; uint8, uint16 or floating point. An array of
+    shape (N, H, W, C) is a sequence of N images. A Pillow image is in its own colours, whatever ``channel_order`` is,
+    with its EXIF. The i-th input, if it is an array or such an image, is called ``image_000i``.
     """
     if channel_order not in get_args(ChannelOrder):
         raise ArgumentError(f"channel_order must be 'bgr' or 'rgb', not {channel_order!r}")

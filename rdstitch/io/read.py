@@ -96,15 +96,9 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
     counts. CMYK (by its profile), CIELAB and palette colours become RGB. NaN or infinite samples of a floating-point
     file become transparent zeros.
 
-    Parameters
-    ----------
-    path
-    reduction : int
-        Blocks of so many pixels a side become one pixel, the last ones of what is there of them. The metadata stay
-        those of the whole image. JPEG files are decoded at 1/2, 1/4 or 1/8 of the size, in a fraction of the time.
-    metadata : Metadata, optional
-        What :func:`read_metadata` has found in the file, which is not looked for again: of a small JPEG file that takes
-        as long as its pixels.
+    Blocks of ``reduction`` pixels a side become one pixel, the last ones of what is there of them; the metadata stay
+    those of the whole image. JPEG files are decoded at 1/2, 1/4 or 1/8 of the size, in a fraction of the time.
+    ``metadata`` is what :func:`read_metadata` has found in the file, which is not looked for again.
     """
     file, factor, damage = Path(path), 1, ""
     check_readable(file)

@@ -71,8 +71,11 @@ class StitchOptions:
         system of ``composite.epsg``.
     positions_offset : float
         Seconds to add to the images' times for those of a GPX track, which are in UTC.
+    position_accuracy : float, optional
+        Standard deviation, m, of a horizontal coordinate of positions that tell none.
     gcp : path, optional
-        Ground control points, as OpenDroneMap's ``gcp_list.txt``: they alone place the output on the Earth.
+        Ground control points, as OpenDroneMap's ``gcp_list.txt`` or CSV: they bend the alignment, and they alone place
+        the output on the Earth.
     check_points : path, optional
         Points in the same format that are compared with the map, and take no part in it.
     mask : path, optional
@@ -140,6 +143,7 @@ class StitchOptions:
     timestamps: str | Path | None = None
     positions: str | Path | None = None
     positions_offset: float = 0.0
+    position_accuracy: float | None = None
     gcp: str | Path | None = None
     check_points: str | Path | None = None
     mask: str | Path | None = None
@@ -190,6 +194,8 @@ class StitchOptions:
             raise ArgumentError(f"the standard deviation of attitudes must not be negative, not {self.attitude_std}")
         if not math.isfinite(self.positions_offset):
             raise ArgumentError(f"positions_offset must be seconds, not {self.positions_offset}")
+        if self.position_accuracy is not None and not 0.0 < self.position_accuracy < float("inf"):
+            raise ArgumentError(f"position_accuracy must be metres above 0, not {self.position_accuracy}")
         if not self.threshold > 0.0 or not 0.0 < self.confidence < 1.0 or self.max_iterations < 1:
             raise ArgumentError("threshold and max_iterations must be positive, confidence between 0 and 1")
         if not self.threshold <= _MAX_THRESHOLD:

@@ -31,25 +31,10 @@ def _take(values: "FloatArray | SampleArrays", samples: IndexArray) -> "FloatArr
 
 
 def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int, block_size: int = 4096) -> Solutions:
-    """Check a batch of samples, and solve it block by block.
+    """Check a batch of samples, and solve it block by block; ArgumentError when a shape is wrong.
 
-    Samples with a coordinate that is not finite have no solution.
-
-    Parameters
-    ----------
-    solve : callable
-        Takes the points of a block, (2, 2, count, b), and the place of the block's samples in the batch, (b,).
-    x1, x2 : array_like of shape (B, count, 2) or (count, 2)
-        Normalized points of image 1 and image 2.
-    count : int
-        Points in a sample.
-    block_size : int
-        Samples in a block.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong.
+    Samples (B, count, 2), or one (count, 2), with a coordinate that is not finite have no solution. ``solve`` takes the
+    points of a block, (2, 2, count, b), and the place of the block's samples in the batch, (b,).
     """
     a, b = as_samples(x1, x2, count)
     index = np.arange(len(a))

@@ -38,14 +38,9 @@ class Quadrangles(SampleArrays):
         return cls(points, opposite, triangle_determinants(points, opposite))
 
     def homography(self, distortion: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """H for one λ a sample (b,).
+        """H (b, 3, 3) for one λ a sample (b,), with unit Frobenius norm and the points in front of the camera.
 
-        Returns
-        -------
-        homography : ndarray of shape (b, 3, 3)
-            With unit Frobenius norm, and the sign that puts the points in front of the camera.
-        possible : ndarray of shape (b,), bool
-            False where the points change sides, are mirrored, or three are collinear.
+        It is not possible, (b,), where the points change sides, are mirrored, or three are collinear.
         """
         minors = self.triangles[0] + self.triangles[1] * distortion
         size = np.abs(minors)

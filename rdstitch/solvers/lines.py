@@ -60,15 +60,10 @@ def determinants(points: FloatArray, lines: Lines) -> FloatArray:
 
 
 def triangle_determinants(points: FloatArray, opposite: Lines) -> FloatArray:
-    """Determinants of the triangles of the first three or four points, shape (2, 2, 1 or 4, b).
+    """Determinants of the triangles of the first three or four points (2, 2, k, b), shape (2, 2, 1 or 4, b).
 
-    First ``det(p_1, p_2, p_3)``; with four points then the same with point 1, 2 and 3 replaced by point 4.
-
-    Parameters
-    ----------
-    points : ndarray of shape (2, 2, k, b)
-    opposite : Lines
-        From :meth:`Lines.opposite`.
+    First ``det(p_1, p_2, p_3)``; with four points then the same with point 1, 2 and 3 replaced by point 4. ``opposite``
+    comes from :meth:`Lines.opposite`.
     """
     first_side = Lines(opposite.constant[:, :, :1], opposite.slope[:, :, :1])
     whole = determinants(points[:, :, :1], first_side)

@@ -36,10 +36,7 @@ class TiltRotations(SampleArrays):
     def from_tilt(cls, tilt: ArrayLike, count: int) -> Self:
         """From one tilt (2,), one an image (2, 2), or one a sample and image (B, 2, 2).
 
-        Raises
-        ------
-        ArgumentError
-            When the shape is another, a value is not finite, or the camera does not look at the plane.
+        ArgumentError when the shape is another, a value is not finite, or the camera does not look at the plane.
         """
         angles = np.asarray(tilt, dtype=np.float64)
         if angles.shape not in ((2,), (2, 2), (count, 2, 2)):
@@ -71,12 +68,9 @@ def depths(points: FloatArray, rotations: TiltRotations) -> FloatArray:
 
 
 def differences(lines: Lines, rotations: TiltRotations) -> FloatArray:
-    """``(R' (p_i × p_j))_xy`` of lines: the numerator of ``X_i - X_j`` after a quarter turn.
+    """``(R' (p_i × p_j))_xy`` of lines: the numerator of ``X_i - X_j`` after a quarter turn, (2, 2, 2, L, b).
 
-    Returns
-    -------
-    ndarray of shape (2, 2, 2, L, b)
-        Constant and slope in λ, coordinate, image, line, sample.
+    The axes are constant and slope in λ, coordinate, image, line, sample.
     """
     turn = rotations.matrices[:, :2]
     (c1, c2, c3), (s1, s2) = lines.constant, lines.slope
@@ -88,18 +82,8 @@ def visible_range(
 ) -> tuple[FloatArray, FloatArray]:
     """The λ for which all points lie within the lens model and in front of the camera, and no two coincide.
 
-    ``1 + λ r²`` and the depth of each point are linear in λ, so that each leaves a half-line.
-
-    Parameters
-    ----------
-    points : ndarray of shape (2, 2, k, b)
-    depth : ndarray of shape (2, 2, k, b)
-        From :func:`depths`.
-
-    Returns
-    -------
-    low, high : ndarray of shape (b,)
-        Empty, ``low > high``, for a degenerate sample.
+    Of points and their :func:`depths` (2, 2, k, b): ``1 + λ r²`` and the depth of each point are linear in λ, so that
+    each leaves a half-line. Of a degenerate sample the range (b,) is empty, ``low > high``.
     """
     low, high = lens_range(points, distortion_range)
     constant, slope = depth
@@ -139,19 +123,11 @@ def plane_points(points: FloatArray, rotations: TiltRotations, distortion: Float
 def motion_homography(
     points: FloatArray, rotations: TiltRotations, distortion: FloatArray, height_free: bool = False
 ) -> FloatArray:
-    """Homography ``R2 Rz(φ) diag(1, 1, height) T R1'`` of the plane motion that fits the points best.
+    """Homography ``R2 Rz(φ) diag(1, 1, height) T R1'`` (b, 3, 3) of the plane motion that fits the points best.
 
-    The least-squares rigid motion, or similarity, of the plane points: as complex numbers about their means,
-    ``Σ conj(X) X̂`` has φ as its argument, and over ``Σ |X|²`` the scale, 1 / height, as its modulus.
-
-    Parameters
-    ----------
-    points : ndarray of shape (2, 2, k, b)
-    distortion : ndarray of shape (b,)
-
-    Returns
-    -------
-    ndarray of shape (b, 3, 3)
+    The least-squares rigid motion, or similarity, of the plane points (2, 2, k, b) at a λ (b,): as complex numbers
+    about their means, ``Σ conj(X) X̂`` has φ as its argument, and over ``Σ |X|²`` the scale, 1 / height, as its
+    modulus.
     """
     plane = plane_points(points, rotations, distortion)
     mean = plane.mean(axis=2)

@@ -29,10 +29,7 @@ def chebyshev_from_values(degree: int) -> FloatArray:
 def value_and_slope_from_values(degree: int) -> FloatArray:
     """Matrices from values at the Chebyshev nodes to the Chebyshev series of a polynomial and of its derivative.
 
-    Returns
-    -------
-    ndarray of shape (2, degree + 1, degree + 1)
-        Value and slope, coefficient, node.
+    Shape (2, degree + 1, degree + 1): value and slope, coefficient, node.
     """
     series = chebyshev_from_values(degree)
     slope = np.polynomial.chebyshev.chebder(series)
@@ -58,14 +55,10 @@ def chebyshev_values(series: FloatArray, t: FloatArray) -> FloatArray:
 def bernstein_from_values(degree: int, cells: int) -> FloatArray:
     """Matrix from values at the Chebyshev nodes to Bernstein coefficients on equal cells of [-1, 1].
 
-    Coefficient j on the cell [a, b] is the blossom of the polynomial at ``degree - j`` times a and j times b. That of a
-    Lagrange polynomial ``Π (t - t_m) / Π (t_k - t_m)`` is coefficient j of ``Π ((a - t_m) + (b - t_m) z)``
-    over the binomial: a product whose factors, but for nodes inside the cell, do not cancel.
-
-    Returns
-    -------
-    ndarray of shape (cells, degree + 1, degree + 1)
-        Cell, coefficient, node.
+    Shape (cells, degree + 1, degree + 1): cell, coefficient, node. Coefficient j on the cell [a, b] is the blossom of
+    the polynomial at ``degree - j`` times a and j times b. That of a Lagrange polynomial ``Π (t - t_m) / Π (t_k -
+    t_m)`` is coefficient j of ``Π ((a - t_m) + (b - t_m) z)`` over the binomial: a product whose factors, but for nodes
+    inside the cell, do not cancel.
     """
     nodes = chebyshev_nodes(degree)
     edges = np.linspace(-1.0, 1.0, cells + 1)

@@ -52,22 +52,9 @@ class Equation(Protocol):
 
 
 def real_roots(equation: Equation, degree: int, low: FloatArray, high: FloatArray) -> tuple[IndexArray, FloatArray]:
-    """All real roots of each equation in its interval.
+    """All real roots (M,) of each of B equations in its interval, after the equation of each (M,), ascending.
 
-    Parameters
-    ----------
-    equation : Equation
-        B equations.
-    degree : int
-        Degree of their polynomials, or more.
-    low, high : ndarray of shape (B,)
-        Interval of each; empty where ``low < high`` does not hold.
-
-    Returns
-    -------
-    sample : ndarray of shape (M,), intp
-        Equation of each root, ascending.
-    root : ndarray of shape (M,)
+    ``degree`` is that of their polynomials, or more; an interval is empty where ``low < high`` (B,) does not hold.
     """
     half = 0.5 * (high - low)
     middle = low + half
@@ -92,16 +79,10 @@ def real_roots(equation: Equation, degree: int, low: FloatArray, high: FloatArra
 
 
 def polish(equation: Equation, start: FloatArray, slope: FloatArray, half: FloatArray) -> FloatArray:
-    """Improve one root of each equation by two steps on the equation itself, where they do improve it.
+    """Improve one root (M,) of each equation by two steps on the equation itself, where they do improve it.
 
-    Parameters
-    ----------
-    equation : Equation
-        M equations.
-    start, slope : ndarray of shape (M,)
-        The root, and the derivative of the polynomial there, as far as the values at the nodes tell.
-    half : ndarray of shape (M,)
-        Half the length of each interval.
+    ``slope`` is the derivative of the polynomial there, as far as the values at the nodes tell, ``half`` half the
+    length of each interval.
     """
     value = equation.polynomial(start)
     step = value / np.where(slope != 0.0, slope, np.inf)
@@ -218,12 +199,7 @@ def bracketed_newton(series: FloatArray, brackets: Brackets) -> tuple[FloatArray
     """The root of each Chebyshev series in its bracket, and the derivative there; shape (M,).
 
     Newton's method from where the chord crosses zero; a step that leaves the bracket is replaced by its middle.
-
-    Parameters
-    ----------
-    series : ndarray of shape (2, degree + 1, M)
-        Of each polynomial and of its derivative.
-    brackets : Brackets
+    ``series`` (2, degree + 1, M) are those of each polynomial and of its derivative.
     """
     left, right = brackets.left, brackets.right
     change = brackets.value_right - brackets.value_left

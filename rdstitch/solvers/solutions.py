@@ -42,17 +42,9 @@ class Solutions:
 
 
 def as_samples(x1: ArrayLike, x2: ArrayLike, count: int) -> tuple[FloatArray, FloatArray]:
-    """Check a batch of samples of ``count`` correspondences, and give a single sample its batch axis.
+    """Check samples of ``count`` normalized points of both images, and give a single one its batch axis.
 
-    Parameters
-    ----------
-    x1, x2 : array_like of shape (B, count, 2) or (count, 2)
-        Normalized points of image 1 and image 2.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong.
+    ArgumentError when a shape is not (B, count, 2) or (count, 2).
     """
     a, b = np.asarray(x1, dtype=np.float64), np.asarray(x2, dtype=np.float64)
     if a.shape != b.shape or a.ndim not in (2, 3) or a.shape[-2:] != (count, 2):

@@ -172,15 +172,8 @@ def _cross(a: RealArray, b: RealArray) -> RealArray:
 def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, FloatArray]:
     """Different solutions that Newton's method reaches from every start of every sample.
 
-    The first steps need no accuracy and run in single precision. By then most starts of a sample have met; those that
-    have go on as one.
-
-    Returns
-    -------
-    sample : ndarray of shape (M,), intp
-        Ascending.
-    state : ndarray of shape (3, M)
-        (a, b, λ).
+    The sample of each (M,), ascending, and the states (3, M): a, b and λ. The first steps need no accuracy and run in
+    single precision. By then most starts of a sample have met; those that have go on as one.
     """
     count = system.rows.shape[-1]
     single = DistanceSystem(np.tile(system.rows.astype(np.float32), len(starts)))

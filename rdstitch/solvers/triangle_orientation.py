@@ -14,24 +14,12 @@ from rdstitch.arrays import FloatArray
 def oriented_samples(
     triangles: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
-    """Samples whose triangles can have equal orientations in both images, and ranges of λ narrowed accordingly.
+    """Samples (M,) whose triangles can have equal orientations in both images, and the ranges of λ for that.
 
-    Between the zeros of the determinants no sign changes, so that the middle of each piece tells for all of it. Most
-    samples with a wrong match have no such piece, and need no further work.
-
-    Parameters
-    ----------
-    triangles : ndarray of shape (2, 2, T, b)
-        From :func:`rdstitch.solvers.lines.triangle_determinants`.
-    low, high : ndarray of shape (b,)
-        Ranges of λ, empty where ``low < high`` does not hold.
-
-    Returns
-    -------
-    sample : ndarray of shape (M,), intp
-        Samples with any such λ.
-    low, high : ndarray of shape (M,)
-        From the first to the last piece where all orientations agree.
+    Of ranges (b,), empty where ``low < high`` does not hold, and :func:`rdstitch.solvers.lines.triangle_determinants`
+    (2, 2, T, b). Between the zeros of the determinants no sign changes, so that the middle of each piece tells for all
+    of it; a range goes from the first to the last piece where all orientations agree. Most samples with a wrong match
+    have no such piece, and need no further work.
     """
     batch = len(low)
     constant, slope = triangles.reshape(2, -1, batch)

@@ -22,20 +22,11 @@ _FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatAr
 
 @dataclass(frozen=True)
 class _FixedFocalLens:
-    """A lens with a focal length and a principal point.
+    """A lens with a focal length and a principal point."""
 
-    Attributes
-    ----------
-    image_size : (int, int)
-        Width and height, pixels.
-    focal : float
-        Focal length at the centre, pixels.
-    offset : (float, float)
-        From the image centre to the principal point, pixels.
-    """
-
-    image_size: tuple[int, int]
-    focal: float
+    image_size: tuple[int, int]  # width and height, pixels
+    focal: float  # at the centre, pixels
+    # from the image centre to the principal point, pixels
     offset: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
 
     @property
@@ -58,12 +49,8 @@ class _FixedFocalLens:
 class FisheyeLens(_FixedFocalLens):
     """A fisheye: the angle θ of a ray to the axis alone says how far from the centre it is measured.
 
-    Attributes
-    ----------
-    kind : str
-        "equidistant" (``focal * θ``), "equisolid" (``2 focal sin(θ/2)``) or "stereographic" (``2 focal tan(θ/2)``).
-    image_circle : float
-        Radius about the centre, pixels, beyond which the image is black.
+    ``kind`` is "equidistant" (``focal * θ``), "equisolid" (``2 focal sin(θ/2)``) or "stereographic" (``2 focal
+    tan(θ/2)``); beyond the radius ``image_circle`` about the centre, pixels, the image is black.
     """
 
     kind: str = field(default="equidistant", kw_only=True)
@@ -98,15 +85,7 @@ class FisheyeLens(_FixedFocalLens):
 
 @dataclass(frozen=True)
 class BrownLens(_FixedFocalLens):
-    """Brown's polynomial, OpenCV's model: ``x_d = x_u (1 + k1 r² + k2 r⁴ + k3 r⁶) + tangential part``, ``r = |x_u|``.
-
-    Attributes
-    ----------
-    k1, k2, k3 : float
-        Radial coefficients, focal-normalized.
-    p1, p2 : float
-        Tangential coefficients.
-    """
+    """OpenCV's polynomial of Brown: ``x_d = x_u (1 + k1 r² + k2 r⁴ + k3 r⁶) + tangential part``, ``r = |x_u|``."""
 
     k1: float = 0.0
     k2: float = 0.0

@@ -19,12 +19,7 @@ from rdstitch.synthetic.textures import LinearPixels, Texture, ground
 def camera_rotations(heading: ArrayLike, pitch: ArrayLike = 0.0, roll: ArrayLike = 0.0) -> FloatArray:
     """Rotations (N, 3, 3) from the scene to cameras: ``(Ry(heading) Rx(pitch) Rz(roll))'``.
 
-    Parameters
-    ----------
-    heading : array_like of shape (N,)
-        Where each camera looks, radians to the right.
-    pitch, roll : array_like of shape (N,) or ()
-        Radians upwards, and clockwise.
+    Cameras look ``heading`` radians (N,) to the right and ``pitch`` upwards, and are turned by ``roll`` clockwise.
     """
     heading, pitch, roll = np.broadcast_arrays(*(np.atleast_1d(np.asarray(a, float)) for a in (heading, pitch, roll)))
     one, zero = np.ones_like(heading), np.zeros_like(heading)
@@ -39,16 +34,8 @@ def camera_rotations(heading: ArrayLike, pitch: ArrayLike = 0.0, roll: ArrayLike
 def panorama_rotations(count: int, step: float, *, rows: int = 1, jitter: float = 0.05, seed: int = 0) -> FloatArray:
     """Rotations (rows count, 3, 3) of images taken by hand, one row after the other.
 
-    Parameters
-    ----------
-    count : int
-        Images of a row.
-    step : float
-        Between neighbours, radians.
-    rows : int
-        Rows, whose pitches are half a radian apart, around the horizon.
-    jitter : float
-        Headings, pitches and rolls are uniform in ± this, radians, around what is aimed at.
+    Neighbours of a row are ``step`` radians apart, rows half a radian, around the horizon; headings, pitches and rolls
+    are uniform in ± ``jitter`` radians around what is aimed at.
     """
     rng = np.random.default_rng(seed)
     row, column = np.divmod(np.arange(rows * count), count)
@@ -84,15 +71,10 @@ class _Around:
 class TurningSequence(Sequence):
     """Images of a camera that turns about its centre; made by :func:`turning_sequence`.
 
-    Attributes
-    ----------
-    rotations : ndarray of shape (N, 3, 3)
-        From the scene to each camera.
-    position : ndarray of shape (N, 3)
-        Where each camera's centre is, in radii of the sphere: zeros for a turn on the spot, other numbers for parallax.
-    near : ndarray of shape (K, 4)
-        Centres and radii of balls that stand before the sphere, in its radii. Their texture is that of the sphere
-        behind them, seen from its centre.
+    ``rotations`` (N, 3, 3) are those from the scene to each camera; ``position`` (N, 3) is each camera's centre in
+    radii of the sphere: zeros for a turn on the spot, other numbers for parallax. ``near`` (K, 4) are centres and radii
+    of balls that stand before the sphere, in its radii; their texture is that of the sphere behind them, seen from its
+    centre.
     """
 
     rotations: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
@@ -132,17 +114,7 @@ def turning_sequence(
     position: ArrayLike | None = None,
     near: ArrayLike = (),
 ) -> TurningSequence:
-    """Images that a camera takes of a sphere around it.
-
-    Parameters
-    ----------
-    rotations : ndarray of shape (N, 3, 3)
-        From the scene to each camera, as :func:`camera_rotations` gives them.
-    seed : int
-        Of the texture and the noise.
-    position : array_like of shape (N, 3), optional
-        Of each camera's centre, in radii of the sphere; all at its centre if not given.
-    """
+    """Images that a camera takes of a sphere around it; :class:`TurningSequence` says what the arrays are."""
     circumference = round(2 * np.pi * focal_length(lens))
     texture = ground((circumference, circumference // 2), seed=seed)
     count = len(rotations)

@@ -27,24 +27,12 @@ _PARKING_ANGLE = 0.7  # radians: how far a robot is turned in the middle of the 
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of N images.
+    """Poses of N images."""
 
-    Attributes
-    ----------
-    position : ndarray of shape (N, 2)
-        Foot of the camera on the plane, texels.
-    height : ndarray of shape (N,)
-        Height above the plane, texels.
-    yaw : ndarray of shape (N,)
-        φ, radians.
-    tilt : ndarray of shape (N, 2)
-        (ψ, θ), radians.
-    """
-
-    position: FloatArray
-    height: FloatArray
-    yaw: FloatArray
-    tilt: FloatArray
+    position: FloatArray  # (N, 2): foot of the camera on the plane, texels
+    height: FloatArray  # (N,): above the plane, texels
+    yaw: FloatArray  # (N,): φ, radians
+    tilt: FloatArray  # (N, 2): ψ and θ, radians
 
     def __post_init__(self) -> None:
         if not (self.height > 0.0).all():
@@ -82,14 +70,8 @@ class Poses:
     ) -> Self:
         """The same poses with independent uniform jitter on each image.
 
-        Parameters
-        ----------
-        position : float
-            ± texels on either coordinate.
-        height : float
-            ± share of the height.
-        yaw, tilt : float
-            ± radians, on ψ and θ alike.
+        Within ± ``position`` texels on either coordinate, ± a share of the height, ± ``yaw`` radians, and ± ``tilt``
+        radians on ψ and θ alike.
         """
         rng = np.random.default_rng(seed)
         n = len(self)
@@ -147,16 +129,8 @@ def pair_poses(
 ) -> Poses:
     """Two images.
 
-    Parameters
-    ----------
-    overlap : float
-        Share of the extent along ``direction`` that both images show.
-    yaw : float
-        Of the second image, radians.
-    direction : float
-        Where the camera goes, radians from the plane's X axis.
-    scale : float
-        Height of the second image in units of the first's.
+    Of the extent along ``direction``, radians from the plane's X axis, both show the share ``overlap``. The second
+    image is turned by ``yaw`` radians, and ``scale`` times as high as the first.
     """
     along = np.array([np.cos(direction), np.sin(direction)])
     extent = np.min(_extent(lens, tilt) / np.maximum(np.abs(along), 1e-12))
@@ -177,14 +151,8 @@ def grid_poses(
 ) -> Poses:
     """Views side by side, row after row, each second row backwards.
 
-    Parameters
-    ----------
-    overlap : float
-        Of neighbours, along both axes.
-    yaw : float
-        Each image is turned by a random angle within ± this, radians.
-    shift : float
-        Each image is moved by a random share, within ± this, of the step to its neighbours.
+    Neighbours share ``overlap`` along both axes. Each image is turned by a random angle within ± ``yaw`` radians, and
+    moved by a random share, within ± ``shift``, of the step to its neighbours.
     """
     step = (1.0 - overlap) * _extent(lens, tilt)
     j, i = np.meshgrid(np.arange(columns), np.arange(rows))
@@ -206,14 +174,9 @@ def drive_poses(
 ) -> Poses:
     """A robot, to which the camera is fixed, drives a path of the paper (§5.5).
 
-    Parameters
-    ----------
-    path : str
-        "line"; "turn": on, through a right angle, and on; "parking": past the gap, back into it in an S, and up.
-    overlap : float
-        Of consecutive images, along the image's shorter side.
-    heading : float
-        At the start, radians from the plane's X axis; the robot drives along its image's u axis.
+    ``path`` is "line"; "turn": on, through a right angle, and on; or "parking": past the gap, back into it in an S, and
+    up. Consecutive images share ``overlap`` along their shorter side. The robot drives along its image's u axis, at
+    first ``heading`` radians from the plane's X axis.
     """
     turning, forward = np.zeros(count - 1), np.ones(count - 1)
     if path == "turn":
@@ -246,16 +209,9 @@ def survey_poses(
 ) -> Poses:
     """A drone mows a nearly square field (paper Fig. 10: 117 and 158 frames).
 
-    Parameters
-    ----------
-    count : int
-        Images; the last lane may be shorter.
-    forward_overlap, side_overlap : float
-        Within a lane and between lanes. The drone flies towards the top of its image, and turns round after each lane.
-    height_jitter : float
-        Each height is changed by a random share within ± this.
-    attitude_jitter : float
-        ψ and θ are changed by random angles within ± this, radians.
+    It takes ``count`` images, the last lane may be shorter; flies towards the top of its image, and turns round after
+    each lane. Each height is changed by a random share within ± ``height_jitter``, ψ and θ by random angles within ±
+    ``attitude_jitter`` radians.
     """
     extent = _extent(lens, tilt)
     side, ahead = (1.0 - side_overlap) * extent[0], (1.0 - forward_overlap) * extent[1]

@@ -27,12 +27,8 @@ _TOO_LONG = 32767
 class Relief:
     """Heights above the plane: they give parallax and occlusion, and no homography describes that.
 
-    The texture lies on the ground as seen from straight above: the texel (x, y) is at height ``height[y, x]``.
-
-    Attributes
-    ----------
-    height : ndarray of shape (h, w), float32
-        Height above the plane in texels, for each texel of the texture; outside, the lowest height of the map.
+    The texture lies on the ground as seen from straight above: the texel (x, y) is at height ``height[y, x]`` texels;
+    outside of the map, at the lowest height of it.
     """
 
     height: HeightMap
@@ -56,17 +52,9 @@ class Relief:
     def seen_from(self, position: FloatArray, height: float, foot: FloatArray) -> FloatArray:
         """Texels (..., 2) at which rays first meet the ground, which is interpolated linearly between texels.
 
-        Each ray is tested at levels from the highest point down to the lowest; bisection finds where, between the
-        last level above the ground and the first one in it, the ray meets the ground.
-
-        Parameters
-        ----------
-        position : ndarray of shape (2,)
-            Foot of the camera, texels.
-        height : float
-            Of the camera above the plane, texels.
-        foot : ndarray of shape (..., 2)
-            Where the rays would meet the plane; NaN for rays that do not.
+        The rays go from a camera over ``position``, ``height`` above the plane, to ``foot`` (..., 2), where they would
+        meet the plane; NaN where they do not. Each is tested at levels from the highest point down to the lowest;
+        bisection finds where, between the last level above the ground and the first one in it, it meets the ground.
         """
         top, bottom = float(self.height.max()), float(self.height.min())
         if top >= height:
@@ -103,15 +91,7 @@ class Relief:
 
 
 def hills(size: tuple[int, int], seed: int, *, height: float, width: int = 200) -> Relief:
-    """Smooth bumps at random places.
-
-    Parameters
-    ----------
-    height : float
-        Of the highest point above the lowest, which is on the plane, texels.
-    width : int
-        Typical distance between two tops, texels.
-    """
+    """Smooth bumps at random, the highest ``height`` texels above the lowest point, tops about ``width`` apart."""
     # Noise on a coarse grid, enlarged by cubic interpolation: as smooth as hills are, at any size of the plane.
     rng = np.random.default_rng(seed)
     nodes = rng.random((2 * size[1] // width + 4, 2 * size[0] // width + 4), dtype=np.float32)
@@ -127,10 +107,7 @@ def hills(size: tuple[int, int], seed: int, *, height: float, width: int = 200) 
 def boxes(size: tuple[int, int], seed: int, *, height: float, width: int = 60) -> Relief:
     """Flat ground with boxes, between a quarter and the whole of ``height`` high: a town.
 
-    Parameters
-    ----------
-    width : int
-        Of the widest box, texels; the narrowest is a third of that, and all cover about a third of the ground.
+    Boxes are from a third of ``width`` texels to ``width`` wide, and cover about a third of the ground.
     """
     rng = np.random.default_rng(seed)
     ground = np.zeros((size[1], size[0]), dtype=np.float32)
@@ -142,13 +119,7 @@ def boxes(size: tuple[int, int], seed: int, *, height: float, width: int = 60) -
 
 
 def ridges(size: tuple[int, int], seed: int, *, height: float, width: int = 400) -> Relief:
-    """Parallel ridges and valleys with straight flanks, in a random direction.
-
-    Parameters
-    ----------
-    width : int
-        From ridge to ridge, texels.
-    """
+    """Parallel ridges and valleys with straight flanks, ``width`` texels apart, in a random direction."""
     rng = np.random.default_rng(seed)
     direction, phase = rng.uniform(0.0, np.pi), rng.random()
     x, y = np.arange(size[0], dtype=np.float32), np.arange(size[1], dtype=np.float32)

@@ -33,30 +33,14 @@ _APRON = 3
 
 @dataclass(frozen=True)
 class Photometry:
-    """The way from light to an image.
+    """The way from light to an image."""
 
-    Attributes
-    ----------
-    gain : float or ndarray of shape (N,)
-        Exposure, one for all images or one an image.
-    vignetting : float
-        Share of the light that is missing at the corners; it grows with the square of the radius.
-    gamma : float
-        Gain and vignetting act on ``value ** gamma``: 1 on the values themselves, 2.2 in linear light.
-    blur : float
-        Standard deviation of the lens's blur, pixels.
-    noise : float
-        Standard deviation of the noise, in units of full range; 0.01 is 2.5 grey levels of 8 bit.
-    bits : int
-        8 or 16.
-    """
-
-    gain: float | FloatArray = 1.0
-    vignetting: float = 0.0
-    gamma: float = 1.0
-    blur: float = 0.0
-    noise: float = 0.0
-    bits: int = 8
+    gain: float | FloatArray = 1.0  # exposure, one for all images or one an image (N,)
+    vignetting: float = 0.0  # share of the light that is missing at the corners; it grows with the square of the radius
+    gamma: float = 1.0  # gain and vignetting act on value ** gamma: 1 on the values themselves, 2.2 in linear light
+    blur: float = 0.0  # standard deviation of the lens's blur, pixels
+    noise: float = 0.0  # its standard deviation, in units of full range; 0.01 is 2.5 grey levels of 8 bit
+    bits: int = 8  # 8 or 16
 
     def __post_init__(self) -> None:
         if self.bits not in (8, 16):
@@ -67,21 +51,11 @@ class Photometry:
 class Sequence:
     """Images of a plane, rendered on demand, and their ground truth.
 
-    Attributes
-    ----------
-    texture : Texture
-        The plane. Its coordinates, texels, are the plane's; see :mod:`rdstitch.synthetic.poses`.
-    lens : Lens
-        Of all images; a :class:`rdstitch.geometry.camera.Camera` with a focal length, or another lens.
-    poses : Poses
-    photometry : Photometry
-    relief : Relief, optional
-        Height of the ground above the plane; a plane if not given.
-    seed : int
-        Of the noise.
-    samples : int, optional
-        Samples along each side of a pixel; if not given, as many as the texture needs, at least 2. With 1, large
-        images are rendered faster, and alias a little.
+    The coordinates of the texture, texels, are the plane's, see :mod:`rdstitch.synthetic.poses`; the lens is a
+    :class:`rdstitch.geometry.camera.Camera` with a focal length, or another one; ``relief`` is the height of the ground
+    above the plane, if it is no plane. ``seed`` is of the noise. Of each pixel ``samples`` are taken along each side:
+    as many as the texture needs, at least 2, if not given; with 1, large images are rendered faster, and alias a
+    little.
     """
 
     texture: Texture
@@ -260,14 +234,8 @@ def sequence_over(
     """Images of a plane that is made as large as they need it; the poses may lie anywhere and are moved.
 
     ``plane`` makes the plane for a given size, such as ``lambda size: ground(size, seed=1)``, or is a texture, on which
-    the poses are centred.
-
-    Parameters
-    ----------
-    relief : Relief or callable, optional
-        Heights, or what makes them for the size of the plane, such as ``lambda size: hills(size, 1, height=40.0)``.
-    margin : int
-        Texels that are left around what the images show.
+    the poses are centred. ``relief`` are heights, or what makes them for the size of the plane, such as ``lambda size:
+    hills(size, 1, height=40.0)``. Around what the images show ``margin`` texels are left.
     """
     moved, size = fit_to_plane(lens, poses, margin)
     settings = Photometry() if photometry is None else photometry

@@ -39,13 +39,7 @@ class Texture(Protocol):
 
 @dataclass(frozen=True)
 class ImageTexture:
-    """An image as texture.
-
-    Attributes
-    ----------
-    pixels : ndarray of shape (h, w) or (h, w, 3)
-        uint8 or uint16 of full range, or float32 in [0, 1].
-    """
+    """An image as texture: uint8 or uint16 of full range, or float32 in [0, 1], (h, w) or (h, w, 3)."""
 
     pixels: NDArray[Any]
 
@@ -74,21 +68,11 @@ class ImageTexture:
 
 @dataclass(frozen=True)
 class EndlessTexture:
-    """Ground of any size that never repeats: the mean of two periodic layers with coprime periods.
+    """Ground of any size that never repeats: the mean of two periodic layers with coprime periods."""
 
-    Attributes
-    ----------
-    size : (int, int)
-        Width and height, texels.
-    seed : int
-        Equal seeds give equal ground.
-    channels : int
-        1 for grey, 3 for RGB.
-    """
-
-    size: tuple[int, int]
+    size: tuple[int, int]  # width and height, texels
     seed: int
-    channels: int = 3
+    channels: int = 3  # 1 for grey, 3 for RGB
 
     def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
         x, y = np.arange(left, right), np.arange(top, bottom)

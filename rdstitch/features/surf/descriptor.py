@@ -43,16 +43,9 @@ _DESCRIBED_AT_ONCE = 512  # worked on at a time
 
 
 def orientations(levels: list[Grey], points: FloatArray, scale: FloatArray) -> FloatArray:
-    """Dominant direction of the gradient at each point, radians in [0, 2π), from u towards v.
+    """Direction of the gradient at points (N, 2) of a pyramid, radians in [0, 2π), from u towards v.
 
-    Parameters
-    ----------
-    levels : list of ndarray
-        The image's pyramid.
-    points : ndarray of shape (N, 2)
-        pixels.
-    scale : ndarray of shape (N,)
-        The s of the paper, pixels.
+    ``scale`` (N,) is the s of the paper, pixels.
     """
     angles = np.empty(len(points))
     for start in range(0, len(points), _ORIENTED_AT_ONCE):
@@ -104,18 +97,9 @@ _WINDOW_SPECTRUM = _window_spectrum()
 def describe_patches(
     levels: list[Grey], points: FloatArray, scale: FloatArray, angle: FloatArray
 ) -> NDArray[np.float32]:
-    """Descriptors of unit length, shape (N, 64); of no contrast: zeros.
+    """Descriptors (N, 64) of unit length at points (N, 2) of a pyramid; of no contrast: zeros.
 
-    Parameters
-    ----------
-    levels : list of ndarray
-        The image's pyramid.
-    points : ndarray of shape (N, 2)
-        pixels.
-    scale : ndarray of shape (N,)
-        The s of the paper, pixels.
-    angle : ndarray of shape (N,)
-        Orientation, radians.
+    ``scale`` (N,) is the s of the paper, pixels, ``angle`` (N,) the orientation, radians.
     """
     descriptors = np.empty((len(points), 4 * _CELLS**2), np.float32)
     for start in range(0, len(points), _DESCRIBED_AT_ONCE):

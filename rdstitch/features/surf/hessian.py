@@ -54,19 +54,10 @@ def from_level(points: FloatArray, level: int) -> FloatArray:
 
 
 def vertex(values: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Locate the maximum of the quadric through each neighbourhood (Brown and Lowe, BMVC 2002).
+    """Locate the maximum of the quadric through each neighbourhood (N, 3, 3, 3) (Brown and Lowe, BMVC 2002).
 
-    Parameters
-    ----------
-    values : ndarray of shape (N, 3, 3, 3)
-        Axes scale, row, column.
-
-    Returns
-    -------
-    offset : ndarray of shape (N, 3)
-        Vertex relative to the middle, in steps along column, row, scale.
-    is_maximum : ndarray of shape (N,), bool
-        Whether the quadric has a maximum there; elsewhere the offset is zero.
+    Neighbourhoods have the axes scale, row, column; offsets (N, 3) from the middle are in steps along column, row,
+    scale, and zero where the quadric has no maximum, which is told too (N,).
     """
     n = values.astype(np.float64)
     middle = n[:, 1, 1, 1]
@@ -114,17 +105,10 @@ class Blobs(Rows):
 
 
 def find_blobs(grey: Grey, threshold: float, octaves: int, layers: int) -> Blobs:
-    """Find blobs.
+    """Find blobs whose determinant of the Hessian, grey levels², is at least ``threshold``.
 
-    Parameters
-    ----------
-    grey : ndarray of shape (height, width), uint8
-    threshold : float
-        Least determinant of the Hessian, grey levels².
-    octaves : int
-        Octaves of scale, each on the image of half the size of the one before.
-    layers : int
-        Scales per octave at which there can be blobs; filters grow by 6 pixels from one to the next.
+    Each octave of scale works on the image of half the size of the one before, with so many ``layers`` of scales at
+    which there can be blobs; filters grow by 6 pixels from one to the next.
     """
     parts = []
     for octave, level in enumerate(pyramid(grey, octaves)):
@@ -251,20 +235,10 @@ _BLOBS = 2048  # worked on at a time
 
 
 def integer_kernels(kernels: FloatArray) -> tuple[NDArray[np.float32], float]:
-    """Round filters of zero sum to integers of zero sum, whose products with 8-bit patches are exact.
+    """Round filters (pixels, filters) of zero sum to integers of zero sum; divide products with them by the factor.
 
     A BLAS sums in an order of its own, which may change with the number of threads. Filters of integers small enough
-    for all sums to fit float32's 24 bits give the same result in any order.
-
-    Parameters
-    ----------
-    kernels : ndarray of shape (pixels, filters)
-
-    Returns
-    -------
-    rounded : ndarray of shape (pixels, filters), float32
-    factor : float
-        Divide the products by this.
+    for all sums with 8-bit patches to fit float32's 24 bits give the same result in any order.
     """
     factor = float(_MAX_SUM / np.abs(kernels).sum(axis=0).max())
     rounded = np.rint(kernels * factor)
@@ -281,25 +255,9 @@ def apply_kernels(patches: NDArray[np.uint8], kernels: NDArray[np.float32]) -> N
 def sample_patches(
     levels: list[Grey], points: FloatArray, spacing: FloatArray, angle: FloatArray, count: int
 ) -> NDArray[np.uint8]:
-    """Sample a square grid around each point.
+    """Sample square grids, (N, count, count), around points (N, 2) of a pyramid; rows along their second axis.
 
-    Parameters
-    ----------
-    levels : list of ndarray
-        The image's pyramid.
-    points : ndarray of shape (N, 2)
-        Centres of the grids, pixels.
-    spacing : ndarray of shape (N,)
-        Between neighbouring samples, pixels.
-    angle : ndarray of shape (N,)
-        Direction of the grids' first axis, radians.
-    count : int
-        Samples along each side.
-
-    Returns
-    -------
-    ndarray of shape (N, count, count), uint8
-        Rows along the second axis of the grid.
+    Samples are ``spacing`` (N,) pixels apart; the first axis points ``angle`` (N,) radians from u towards v.
     """
     patches = np.empty((len(points), count, count), np.uint8)
     finest = np.clip(np.floor(np.log2(spacing)), 0, len(levels) - 1).astype(np.intp)
@@ -325,18 +283,7 @@ def sample_patches(
 
 
 def refine(levels: list[Grey], blobs: Blobs) -> Blobs:
-    """Move blobs to the maxima of the Gaussian determinant of the Hessian, and drop those that have none near.
-
-    Parameters
-    ----------
-    levels : list of ndarray
-        The image's pyramid.
-
-    Returns
-    -------
-    Blobs
-        With the Gaussian determinant as response.
-    """
+    """Move blobs to the maxima of the Gaussian determinant of the Hessian, and drop those that have none near."""
     parts = [
         _refine(levels, blobs.take(np.arange(i, min(i + _BLOBS, len(blobs))))) for i in range(0, len(blobs), _BLOBS)
     ]

@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +28,7 @@ from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.second_motion import SecondMotion
 from rdstitch.verification.self_similarity import Ambiguity
 from tests.cli.running import flight
+from tests.registrations import registration
 
 THRESHOLD = 3.0
 
@@ -152,6 +151,17 @@ def test_a_tenth_of_an_overlap_must_look_alike(
     assert all(f"({confirming} of {cells}" in message.text for message in found)
 
 
+@pytest.mark.parametrize(("coarsely", "picture", "poses"), [(0.8, 0, 1), (0.4, 1, 1)])
+def test_depth_shifts_what_a_picture_shows_by_a_little(
+    good: Registration, monkeypatch: pytest.MonkeyPatch, coarsely: float, picture: int, poses: int
+) -> None:
+    """Few cells agree to 2.5 pixels then, but most at a coarse scale."""
+    checked = _checked(100, 6)
+    checked = replace(checked, agreement=replace(checked.agreement, coarsely=coarsely))
+    monkeypatch.setattr(evidence, "check_overlaps", lambda *_: [checked])
+    assert [len(judge(good, THRESHOLD, purpose)) for purpose in ("mosaic", "trajectory")] == [picture, poses]
+
+
 @pytest.mark.parametrize(("clear", "severity"), [(True, "warning"), (False, "failure")])
 def test_poses_need_to_know_which_of_two_motions_is_the_plane(
     good: Registration, monkeypatch: pytest.MonkeyPatch, clear: bool, severity: str
@@ -198,10 +208,8 @@ def test_only_pairs_without_which_the_images_fall_apart_decide() -> None:
 
 
 def test_of_doubtful_pairs_on_which_nothing_depends_the_images_are_named() -> None:
-    registration: Any = SimpleNamespace(sources=[SimpleNamespace(path=f"folder/{name}.jpg") for name in "abcd"])
-
     def said(*findings: Finding) -> list[Message]:
-        return messages_of(verdict._outvoted(findings), registration)
+        return messages_of(verdict._outvoted(findings), registration(4))
 
     (message,) = said(Finding("unlike", (2, 3)), Finding("pair misfits", (0, 2)))
     assert message.images == ("folder/a.jpg", "folder/c.jpg", "folder/d.jpg")
