@@ -175,7 +175,7 @@ def _worst(registration: Registration, findings: Iterable[Finding]) -> Offenders
 
 
 def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
-    """Share of the matches of each image that agree with the whole, shape (N,); 1 without any."""
+    """Share of the matches of each image that agree with the alignment of all, shape (N,); 1 without any."""
     given, kept = np.zeros(count), np.zeros(count)
     for fit in links:
         given[[fit.image1, fit.image2]] += fit.count

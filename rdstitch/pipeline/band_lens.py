@@ -58,7 +58,7 @@ class BandLens:
     @property
     def message(self) -> Message:
         """What the user should know of it."""
-        text = f"{self.shift:.1f} pixels from what was registered in the median: the lens of this band was registered"
+        text = f"shifted by {self.shift:.1f} pixels (median) from the registered band: its lens was registered too"
         return Message(f"{text}, to {self.error:.1f} pixels", severity="note", code="band-lens")
 
 
