@@ -185,7 +185,7 @@ def _encoded_tile(tile: NDArray[Any]) -> bytes:
 
 def _deflated(stored: NDArray[Any]) -> bytes:
     """Compressed by libdeflate, which is fast, and makes the same bytes of the same samples every time."""
-    return bytes(imagecodecs.deflate_encode(stored, _LEVEL))
+    return bytes(imagecodecs.deflate_encode(stored.tobytes(), _LEVEL))
 
 
 def _band_names(layout: Layout) -> Iterator[ExtraTag]:
