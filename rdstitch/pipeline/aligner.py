@@ -25,9 +25,9 @@ from rdstitch.matching.copies import copies_of, distinct
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.cache import Cache
 from rdstitch.system.file_access import canonical_name
 from rdstitch.system.process_memory import return_freed_memory

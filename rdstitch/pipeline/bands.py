@@ -17,11 +17,11 @@ from rdstitch.io import Layout, write_strips
 from rdstitch.io.encoding import Strip
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import written_strips
+from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import Recomposition, apply
-from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.results.messages import Message
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs, check_outputs
 from rdstitch.system.progress import Progress, silent

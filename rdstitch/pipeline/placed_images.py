@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import LocalAlignmentMode
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.compositing.canvas import NearPart
 from rdstitch.compositing.source_images import Displacement, PlacedImage
@@ -23,7 +24,7 @@ from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
-from rdstitch.local_alignment import LocalAlignment, LocalAlignmentMode, Match, align_locally, no_local_alignment
+from rdstitch.local_alignment import LocalAlignment, Match, align_locally, no_local_alignment
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
 

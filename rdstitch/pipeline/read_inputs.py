@@ -15,8 +15,8 @@ from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.flat_field import read_flat_field
 from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.process_memory import return_freed_memory
 
 NO_FLAT_FIELD = Message(

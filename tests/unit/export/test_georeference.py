@@ -21,11 +21,11 @@ from rdstitch.geometry.crs import Crs, NamedSystem, utm
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition, GroundControl
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.pipeline.result_files import poses_file, poses_table
 from rdstitch.report import report_page
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.robust.similarity_fit import fit_similarity
 from rdstitch.synthetic.poses import Poses

@@ -14,10 +14,10 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.map_grid import read_grid
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.bands import mosaic_bands
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.results.stitch_options import StitchOptions
 from tests.cli.running import flight
 
 _SHIFT = np.array([-7.0, 9.0])
