@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Self
 
@@ -192,6 +192,9 @@ class Alignment:
     relief : ReliefTest
     shape : ShapeTest or None
         None for a turn on the spot, and where λ is not observable.
+    leverage : mapping
+        How far (0 to 1) what is known of the map puts itself where the alignment has it: positions by the index of
+        their image, control points by name.
     messages : tuple of Message
         What the user should know of the whole: λ not observable, two cameras, ….
     """
@@ -218,6 +221,7 @@ class Alignment:
     links: tuple[LinkFit, ...]
     relief: ReliefTest
     shape: ShapeTest | None = None
+    leverage: Mapping[int | str, float] = field(default_factory=dict)
     messages: tuple[Message, ...] = ()
 
     def __repr__(self) -> str:
@@ -239,7 +243,7 @@ class Alignment:
         origin[list(placed)] = list(placed.values())
         poses = self.poses
         if poses is not None:
-            given = {field.name: getattr(poses, field.name) for field in fields(poses)}
+            given = {each.name: getattr(poses, each.name) for each in fields(poses)}
             poses = replace(poses, **{name: part[origin] for name, part in given.items() if part is not None})
         fits = [replace(fit, image1=i, image2=j) for fit, (i, j) in zip(self.links, pairs, strict=True)]
         groups = (tuple(k for k in group if k not in copies) for group in self.components)

@@ -13,9 +13,6 @@ from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
 
-LocalAlignmentMode = Literal["auto", "off"] | int
-
-MAX_CELLS = 100
 # Of a grid that finds what is far from the plane, and of the one that is used; and how many nodes the grids of all
 # images together may have: of more than some 70 images the finer one is coarser, of more than 800 both, to bound time
 # and memory.

@@ -10,11 +10,11 @@ from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.choices import Purpose
 from rdstitch.errors import PartialResultError, RegistrationError
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, names_of, told_once
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.cache import Cache
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding, messages_of

@@ -26,7 +26,6 @@ from rdstitch.compositing import (
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.projection import PLANE
 from rdstitch.compositing.tiles import Block, BlockRunner, OutputStrip
-from rdstitch.compositing.upright_options import Corners
 from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, has_place, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes
@@ -35,6 +34,7 @@ from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
+from rdstitch.options.upright_options import Corners
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened

@@ -14,11 +14,11 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
 from rdstitch.matching.mixed_lenses import TwoLenses
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import pano
 from rdstitch.pipeline.register import register
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import Photometry, camera_rotations, turning_sequence
 from rdstitch.verification import evidence, verdict
 from rdstitch.verification.evidence import Evidence
