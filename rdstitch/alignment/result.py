@@ -45,6 +45,11 @@ class LinkFit:
     used: bool
     reason: str = ""
 
+    @property
+    def images(self) -> tuple[int, int]:
+        """Indices of both images."""
+        return self.image1, self.image2
+
 
 @dataclass(frozen=True)
 class PlanarPoses:
@@ -288,3 +293,12 @@ class Alignment:
             return from_plane(self.cameras[image2], np.eye(3), seen)
         plane = to_plane(self.cameras[image1], self.homographies[image1], points)
         return from_plane(self.cameras[image2], self.homographies[image2], plane)
+
+
+def links_by_image(links: Iterable[LinkFit]) -> dict[int, list[LinkFit]]:
+    """The links of each image that has any."""
+    of_image: dict[int, list[LinkFit]] = {}
+    for fit in links:
+        for image in fit.images:
+            of_image.setdefault(image, []).append(fit)
+    return of_image

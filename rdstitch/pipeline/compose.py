@@ -10,6 +10,7 @@ from typing import Self
 
 import numpy as np
 
+from rdstitch.alignment.result import links_by_image
 from rdstitch.compositing import (
     Canvas,
     CompositeOptions,
@@ -341,10 +342,11 @@ def viewed_images(result: StitchResult) -> list[ViewedImage]:
     """The images of a result with what was found of each."""
     alignment, registration = result.registration.alignment, result.registration
     names = [source.name for source in registration.sources]
+    links_of = links_by_image(fit for fit in alignment.links if fit.used)
     viewed = []
     for outlines, index in zip(result.canvas.outlines, np.flatnonzero(alignment.used).tolist(), strict=True):
         source = registration.sources[index]
-        links = [fit for fit in alignment.links if fit.used and index in (fit.image1, fit.image2)]
+        links = links_of.get(index, [])
         facts = [
             ("size", "{} x {} pixels".format(*source.camera.image_size)),
             ("features", str(registration.keypoints[index])),
