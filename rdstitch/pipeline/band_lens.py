@@ -58,8 +58,10 @@ class BandLens:
     @property
     def message(self) -> Message:
         """What the user should know of it."""
-        text = f"shifted by {self.shift:.1f} pixels (median) from the registered band: its lens was registered too"
-        return Message(f"{text}, to {self.error:.1f} pixels", severity="note", code="band-lens")
+        text = (
+            f"{self.shift:.1f} pixels (median) from the registered band, {self.error:.1f} with its lens registered too"
+        )
+        return Message(text, severity="note", code="band-lens")
 
 
 def band_lens(
