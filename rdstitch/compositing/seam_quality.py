@@ -305,8 +305,10 @@ def _difference(windows1: Float32Array, windows2: Float32Array, mask: BoolArray)
 
 def _differ_coarsely(window1: Float32Array, window2: Float32Array, mask: BoolArray, contrast: float) -> bool:
     """Whether two windows differ where the mask is when what is finer than a seam's surroundings is smoothed away."""
-    blurred = (cv2.GaussianBlur(window, (0, 0), _BORDER)[None] for window in (window1, window2))
-    return bool(_difference(*blurred, mask[None])[0] > contrast)
+    first, second = (
+        cv2.GaussianBlur(window, (0, 0), _BORDER)[None].astype(np.float32) for window in (window1, window2)
+    )
+    return bool(_difference(first, second, mask[None])[0] > contrast)
 
 
 def _correlation(windows1: Float32Array, windows2: Float32Array) -> FloatArray:
