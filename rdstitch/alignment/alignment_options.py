@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.priors import CameraPriors, known_focal
+from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
@@ -31,6 +32,8 @@ class AlignmentOptions:
     attitudes : ndarray of shape (N, 2), optional
         (ψ, θ) of each image, radians, where an IMU or a gimbal has measured them; ``tilt`` is then how the camera
         is mounted on that.
+    delayed_attitudes : ndarray of shape (N, S, 2), optional
+        The same if their times are late by :data:`rdstitch.inputs.sensor_streams.DELAYS`.
     attitudes_std : float
         Their standard deviation, radians; 0 for exact ones.
     gravity : ndarray of shape (N, 3), optional
@@ -53,6 +56,7 @@ class AlignmentOptions:
     lens_known: bool = False
     tilt: tuple[float, float] | None = None
     attitudes: ArrayLike | None = None
+    delayed_attitudes: FloatArray | None = None
     attitudes_std: float = 0.0
     gravity: ArrayLike | None = None
     positions: ArrayLike | None = None
@@ -95,6 +99,7 @@ class AlignmentOptions:
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
             positions=positions,
+            delayed_attitudes=self.delayed_attitudes,
         )
 
     @property
@@ -119,7 +124,8 @@ class AlignmentOptions:
         """Models to be tried, from the least to the most free."""
         if self.model != "auto":
             return [self.model]
-        # Measured attitudes are a prior of the tilts; exact ones leave nothing of the tilts free.
+        # Measured attitudes are a prior of the tilts, which are free within it; exact ones leave nothing of them free.
         measured, exact = self.attitudes is not None, self.attitudes is not None and self.attitudes_std == 0.0
-        without = {"tilting": exact, "pose": measured}
+        inexact = measured and not exact
+        without = {"rigid": inexact, "similarity": inexact, "tilting": exact, "pose": measured}
         return [name for name in MODELS if not without.get(name, False)]

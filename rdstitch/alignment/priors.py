@@ -15,7 +15,8 @@ log f, guessed          1.2 ± 30 %; 1.5 ± 70 % (0.1) half diagonals: phones, d
                                                      fisheyes to long lenses
 log f, from EXIF        ± 5 %; as guessed (0.1)      rounded to a millimetre, mostly right; wrong by any factor
                                                      where a program has resized the image
-log f, given            ± 1 %                        the user, or a camera file
+log f, given            ± 1 %, or as stated;         the user, or a camera file. Live, the tail too: of another lens,
+                        any ± 20 % (0.05)            another zoom or another size of image
 tilt of a plane         0 ± 20°; 0 ± 45° (0.2)       what is laid flat is looked at from above; robots look ahead
 ======================= ============================ ==========================================================
 """
@@ -113,6 +114,9 @@ LENS = (
 )
 """Priors on :data:`rdstitch.geometry.camera.LENS_PARAMETERS`."""
 
+WRONG_GIVEN_FOCAL = 0.05, 0.2
+"""How often a given focal length is that of something else, and by how much its logarithm is off then."""
+
 TILT = Prior(((0.8, 0.0, math.radians(20.0)), (0.2, 0.0, math.radians(45.0))))
 
 
@@ -149,6 +153,7 @@ class CameraPriors:
     # position_priors
     places: FloatArray | None = None
     places_precision: FloatArray | None = None
+    delayed_attitudes: FloatArray | None = None  # (N, S, 2): the attitudes, if their times are late by DELAYS
 
     def priors(self, model: MotionModel, count: int, tilt_spread: float, log_focal: float | None = None) -> Priors:
         """For ``count`` images whose tilts scatter by ``tilt_spread`` where nothing else is known of them.
@@ -177,7 +182,10 @@ class CameraPriors:
 
     def of(self, images: IntArray) -> "CameraPriors":
         """Of some of the images only."""
-        return replace(self, attitudes=self.attitudes[images], positions=self.positions[images])
+        delayed = None if self.delayed_attitudes is None else self.delayed_attitudes[images]
+        return replace(
+            self, attitudes=self.attitudes[images], positions=self.positions[images], delayed_attitudes=delayed
+        )
 
 
 def known_focal(cameras: Sequence[Camera]) -> tuple[float, float, str]:

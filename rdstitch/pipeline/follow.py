@@ -4,7 +4,7 @@ import math
 import sys
 import time
 import weakref
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,8 +21,8 @@ from rdstitch.export.trajectory_files import TrajectoryFrame, covariance_in_fram
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.inputs.frame import Frame, Image, as_inputs
-from rdstitch.inputs.measurements import XMP, time_of, timestamps_of, with_attitudes
 from rdstitch.inputs.selection import is_selected, mask_of, with_masks
+from rdstitch.inputs.sensor_streams import DELAYS, XMP, time_of, timestamps_of, with_attitudes
 from rdstitch.inputs.source import Source
 from rdstitch.io.opening import check_readable
 from rdstitch.io.write import write_image
@@ -204,7 +204,7 @@ def follow(
     Yields
     ------
     Pose
-        One a frame; and one more for keyframes that find their place only later.
+        One a frame; and more for those that find their place, or another one, only later.
     """
     tracker = Tracker(options, poses, patient=True)
     sketch = None if preview is None else _Sketch(preview, refresh)
@@ -226,6 +226,7 @@ def follow(
             if sketch is not None:
                 sketch.add(source, result)
             source.decoded_images.clear()
+    yield from tracker.finish()
     if sketch is not None:
         sketch.write()
 
@@ -242,7 +243,7 @@ class Tracker:
     Attributes
     ----------
     revised : tuple of Pose
-        Of earlier frames that found their place with the last one.
+        Of earlier frames that found their place with the last one, or another one, where all lengths were revised.
 
     Examples
     --------
@@ -333,26 +334,30 @@ class Tracker:
         return [source] if source.attitude is not None else with_attitudes([source], options.attitude)
 
     def register(self, frame: Frame, source: Source | None, image: PreparedImage | None, reason: str) -> list[Pose]:
-        """Register a frame that was read; it comes last, after those before it that only now have found their place."""
+        """Register a frame that was read; it comes last, after those before it whose place is new."""
         label = Pose(frame.path.name, frame.number or 0, math.nan, None, reason, self._poses)
         if source is None or image is None:
             return [label]
         label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))
         camera = at_working_size(source.camera, self._detection.limits[1])
-        results = self._frames.add(image, camera, source.attitude)
+        attitude = source.attitude_by_delay
+        if attitude is None and source.attitude is not None:
+            attitude = np.tile(source.attitude, (len(DELAYS), 1))
+        results = self._frames.add(image, camera, attitude)
         self._labels[results[-1].number] = label
-        poses = [
-            replace(
-                self._labels[result.number],
-                tracked=result,
-                reason=result.reason,
-            )
-            for result in results
-        ]
+        return self._poses_of(results)
+
+    def finish(self) -> tuple[Pose, ...]:
+        """Poses of frames that find their place, or another one, when no other frame comes."""
+        return tuple(self._poses_of(self._frames.finish()))
+
+    def _poses_of(self, results: Sequence[Tracked]) -> list[Pose]:
+        poses = [replace(self._labels[result.number], tracked=result, reason=result.reason) for result in results]
         told, self._told = self._frames.messages[self._told :], len(self._frames.messages)
-        poses[-1] = replace(poses[-1], messages=tuple(told))
-        waiting = self._frames.numbers_without_place
-        self._labels = {number: known for number, known in self._labels.items() if number in waiting}
+        if poses:
+            poses[-1] = replace(poses[-1], messages=tuple(told))
+        revisable = self._frames.revisable
+        self._labels = {number: known for number, known in self._labels.items() if number in revisable}
         return poses
 
 

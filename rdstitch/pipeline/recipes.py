@@ -17,8 +17,8 @@ from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of,
 from rdstitch.geometry.exif_orientation import quarter_turn
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
-from rdstitch.inputs.measurements import timestamps_of, with_times
 from rdstitch.inputs.selection import selected
+from rdstitch.inputs.sensor_streams import timestamps_of, with_times
 from rdstitch.inputs.source import Source
 from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty
 from rdstitch.pipeline.choose_layout import LaidOut, choose_layout

@@ -21,7 +21,7 @@ from rdstitch.export.trajectory_files import as_csv
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import quarter_turn, turning_matrix
 from rdstitch.geometry.planar_motion import nearest_rotation, rotation_from_tilt
-from rdstitch.inputs.measurements import timestamps_of
+from rdstitch.inputs.sensor_streams import timestamps_of
 from rdstitch.io.tiff import write_cropped_tiff
 from rdstitch.pipeline.composer import placed_by
 from rdstitch.results.stitch_result import StitchResult

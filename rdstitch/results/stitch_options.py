@@ -64,8 +64,8 @@ class StitchOptions:
     attitude_std : float
         Standard deviation of these tilts, radians; 0: exact.
     timestamps : path, optional
-        Times of the images, see :func:`rdstitch.inputs.measurements.with_times`; otherwise those of the video, the bag,
-        or EXIF.
+        Times of the images, see :func:`rdstitch.inputs.sensor_streams.with_times`; otherwise those of the video, the
+        bag, or EXIF.
     positions : path, optional
         Positions of the images instead of those of EXIF; see :mod:`rdstitch.inputs.positions`. Their x and y are in the
         system of ``composite.epsg``.
