@@ -21,6 +21,7 @@ from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
+from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.local_alignment import LocalAlignment, Match, align_locally, no_local_alignment
@@ -156,6 +157,7 @@ class PlacedImages:
                 partial(_read_moving, reader, self.static) if camera.image_size == common else reader
                 for reader, camera in zip(read, self.cameras, strict=True)
             ]
+        located = self.place is not None
         return [
             PlacedImage(
                 reader,
@@ -165,6 +167,7 @@ class PlacedImages:
                 source.metadata.exposure,
                 displacement,
                 str(source.path),
+                source.metadata.radiometry or (Radiometry() if located or source.metadata.gps else None),
                 source.metadata.channels in (3, 4),
             )
             for reader, camera, matrix, source, displacement in zip(
