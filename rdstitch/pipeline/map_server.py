@@ -25,12 +25,7 @@ from rdstitch.system.outputs import check_outputs, text_bytes, write_bytes_atomi
 def write_map(result: StitchResult, folder: str | Path, height: float, *, overwrite: bool = False) -> list[Path]:
     """Write ``map.yaml`` and ``map.png`` of a mosaic that was written, in metres by the height of the first image.
 
-    Raises
-    ------
-    ArgumentError
-        When the images have no metric poses.
-    OutputError
-        When a file exists, unless ``overwrite``, or cannot be written.
+    Raises ArgumentError where the images have no metric poses.
     """
     files = map_files(Path(folder), overwrite=overwrite)
     to_metres = _pixel_to_metres(result, height)
