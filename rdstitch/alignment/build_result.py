@@ -15,7 +15,7 @@ from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
-from rdstitch.alignment.noise import EXACTNESS, coherence, judge_relief
+from rdstitch.alignment.noise import coherence, judge_relief
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.alignment.shape_test import judge_shape
@@ -30,6 +30,7 @@ from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.results.messages import Message, Severity
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
+from rdstitch.robust.posterior import EXACTNESS
 
 _STEP = 1e-5
 """Of differences of λ, μ and ν."""

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.alignment.result import Alignment, PlanarPoses
-from rdstitch.alignment.select import MAX_STRETCH
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.exif_orientation import inverse, turning_matrix
@@ -123,6 +122,9 @@ def stored(orientations: Sequence[int]) -> tuple[int, ...]:
 
 _POINTS_PER_SIDE = 8
 
+_MAX_STRETCH = 10.0
+"""Ratio of areas of what an image shows; seen from above a plane has up to 7."""
+
 
 def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
     """The same alignment with the undistorted image ``reference`` as its plane, and its height as unit of poses."""
@@ -138,7 +140,7 @@ def frontal_reference(alignment: Alignment) -> int:
     used = np.flatnonzero(alignment.used)
     nearness = np.array([_nearest_to_horizon(alignment, used, int(k)) for k in used])
     present = int(np.flatnonzero(used == alignment.reference)[0])
-    if nearness[present].min() > MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
+    if nearness[present].min() > _MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
         return alignment.reference
     crossing, least = (nearness <= 0.0).sum(axis=1), nearness.min(axis=1)
     return int(used[np.lexsort((-least, crossing))[0]])

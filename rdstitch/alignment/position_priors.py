@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.motion_models import PlanarModel, X, Y
-from rdstitch.alignment.noise import EXACTNESS
 from rdstitch.arrays import FloatArray
+from rdstitch.robust.posterior import EXACTNESS
 from rdstitch.robust.similarity_fit import OUTLYING, fit_similarity
 
 POSITION_STD = 3.0

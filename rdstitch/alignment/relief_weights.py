@@ -16,7 +16,7 @@ from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.lens_selection import left_coherence
 from rdstitch.alignment.link_equations import linearized_errors
 from rdstitch.alignment.motion_models import SIMILARITY, TILTING, PlanarModel
-from rdstitch.alignment.noise import judge_relief, noise_of_links
+from rdstitch.alignment.noise import independent_errors, judge_relief
 from rdstitch.alignment.relief_field import Parallax
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.arrays import FloatArray
@@ -45,7 +45,7 @@ def choose_over_relief(
     """
     if not _is_rough(problem, choice.fit) or weighted_by_relief(problem, choice.fit) is problem:
         return choice
-    problem = replace(problem, overdispersion=choice.overdispersion)
+    problem = replace(problem, overdispersion=choice.fit.overdispersion)
     fits: list[Fit] = []
     # From the least free one: a camera that is free to tilt has already followed the hills.
     for model in (SIMILARITY, TILTING):
@@ -83,7 +83,7 @@ def weighted_by_relief(problem: Problem, fit: Fit) -> Problem:
         seen = part.by_point2[:, 0, 0] != 0.0
         # Without the whitening, in half diagonals of the second image.
         moved[part.rows][seen] = np.linalg.solve(-part.by_point2[seen], parallax[part.rows][seen, :, None])[:, :, 0]
-    scatter = _scatter(errors, parallax, noise_of_links(o, plain.homographies, plain.lens).effective)
+    scatter = _scatter(errors, parallax, independent_errors(o, plain.homographies, plain.lens)[1])
     if scatter == 0.0:
         return problem if problem.observations.relief is None else plain
     return replace(problem, observations=replace(o, relief=scatter * moved * o.scale2[o.link, None]))
