@@ -150,12 +150,11 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
         problem,
         options.models,
         chosen.refinements,
-        prefer_turn=options.prefer_turn,
-        layout_matters=options.layout_matters,
+        options.purpose,
     )
     choice, images, wrong = _drop_wrong_pairs(whole, problem, images, choice, wrong)
     problem, _ = whole.part(~wrong, images)
-    choice = choose_over_relief(problem, choice, options.models, layout_matters=options.layout_matters)
+    choice = choose_over_relief(problem, choice, options.models, options.purpose)
     free_lens = choice.fit.free_lens
     whole = replace(whole, observations=everything, free_lens=free_lens, min_gain=MIN_GAIN)
     return AdjustedImages(

@@ -40,8 +40,8 @@ class AlignmentOptions:
         Metres east and north where each image was taken; NaN where that is not known. A weak prior.
     lens : str
         One of :data:`rdstitch.alignment.lens_selection.LENSES`, or "auto": the simplest that the data allow.
-    purpose : str
-        The recipe that the alignment is for, see :data:`rdstitch.choices.Purpose`.
+    purpose : Purpose
+        The recipe that the alignment is for.
     pose_covariance : bool
         Compute covariances of the poses, in time that grows with the square of the number of images.
     most : int
@@ -57,7 +57,7 @@ class AlignmentOptions:
     gravity: ArrayLike | None = None
     positions: ArrayLike | None = None
     lens: str = "auto"
-    purpose: Purpose = "mosaic"
+    purpose: Purpose = Purpose.MOSAIC
     pose_covariance: bool = False
     most: int = 250
 
@@ -96,16 +96,6 @@ class AlignmentOptions:
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
             positions=positions,
         )
-
-    @property
-    def prefer_turn(self) -> bool:
-        """Whether a turn on the spot is taken where a plane explains the images as well."""
-        return self.purpose == "pano"
-
-    @property
-    def layout_matters(self) -> bool:
-        """Whether images are to be laid out on the plane, so that an absurd layout rules a model out."""
-        return self.purpose in ("pano", "mosaic")
 
     @property
     def lenses(self) -> list[str]:

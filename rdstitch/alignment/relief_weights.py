@@ -20,6 +20,7 @@ from rdstitch.alignment.noise import independent_errors, judge_relief
 from rdstitch.alignment.relief_field import Parallax
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import Purpose
 
 _FEWEST = 3
 """Images: of two, tilts do what heights do, and the errors do not show which."""
@@ -36,9 +37,7 @@ _SIGNIFICANT = 3.0
 """Standard deviations of the logarithm of their ratio by which errors along the parallax must exceed those across."""
 
 
-def choose_over_relief(
-    problem: Problem, choice: ModelChoice, names: Sequence[str], *, layout_matters: bool
-) -> ModelChoice:
+def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[str], purpose: Purpose) -> ModelChoice:
     """The model of one camera chosen again, with heights that account for errors, where such heights show.
 
     Without a free distortion centre, which over rough ground bends the whole as the ground bends the images.
@@ -56,7 +55,7 @@ def choose_over_relief(
     if not fits:
         return replace(choice, fit=_settled(problem, choice.fit)[1], over_relief=True)
     refined = [_refined(problem, fit) for fit in fits]
-    best = best_of(problem, refined, requested=len(names) == 1, layout_matters=layout_matters)
+    best = best_of(problem, refined, purpose, requested=len(names) == 1)
     return choice if best is None else replace(best, over_relief=True)
 
 

@@ -21,6 +21,7 @@ from rdstitch.alignment.link_equations import split_lens, whitened_errors
 from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.alignment.noise import evidence_of
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.choices import Purpose
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.posterior import TWENTY_TO_ONE, ErrorCost, Evidence, freedom_cost
@@ -104,8 +105,7 @@ class Posterior:
     """Compares fits of one problem."""
 
     problem: Problem
-    prefer_turn: bool = False
-    layout_matters: bool = True
+    purpose: Purpose = Purpose.MOSAIC
 
     @cached_property
     def link_errors(self) -> FloatArray:
@@ -130,7 +130,7 @@ class Posterior:
     def of(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
         errors = self.cost(fit.adjusted)
-        if self.layout_matters and not stretch(fit) <= _REFUSED:
+        if self.purpose.picture and not stretch(fit) <= _REFUSED:
             return Hypothesis(fit, math.inf, float(errors.field[0]))
         wide = 0.0
         if fit.tilt_spread > 0.0:
@@ -142,7 +142,7 @@ class Posterior:
     def bound(self, model: MotionModel, errors: ErrorCost, free_lens: BoolArray | None = None) -> float:
         """The score of a model that leaves such errors, of a camera that is as cameras are."""
         free = parameter_count(self.problem, model, self.problem.free_lens if free_lens is None else free_lens)
-        preference = TWENTY_TO_ONE if model.on_sphere != self.prefer_turn else 0.0
+        preference = TWENTY_TO_ONE if model.on_sphere != (self.purpose is Purpose.PANO) else 0.0
         return float((errors.cost + freedom_cost(free, errors.count))[0]) + preference
 
     def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
@@ -156,9 +156,7 @@ def select_model(
     problem: Problem,
     names: Sequence[str],
     lenses: Sequence[BoolArray] = (),
-    *,
-    prefer_turn: bool = False,
-    layout_matters: bool = True,
+    purpose: Purpose = Purpose.MOSAIC,
 ) -> ModelChoice:
     """Adjust hypotheses from the least to the most free, and take the one with the best score.
 
@@ -167,7 +165,7 @@ def select_model(
     The best two and the least free one are then tried with more of the lens free: an off-centre lens acts like less
     regular motion. Free homographies are a model of another kind, taken only for what one camera cannot explain.
     """
-    posterior = Posterior(problem, prefer_turn, layout_matters)
+    posterior = Posterior(problem, purpose)
     tried: list[Hypothesis] = []
     later: list[tuple[float, MotionModel, FloatArray]] = []
     wide = replace(problem, free_lens=np.logical_or.reduce([problem.free_lens, *lenses]))
@@ -196,9 +194,9 @@ def select_model(
     return _choice(tried, _best(posterior, tried), requested=len(names) == 1)
 
 
-def best_of(problem: Problem, fits: Sequence[Fit], *, requested: bool, layout_matters: bool) -> ModelChoice | None:
+def best_of(problem: Problem, fits: Sequence[Fit], purpose: Purpose, *, requested: bool) -> ModelChoice | None:
     """Take the best of some fits of the problem; None where no image could be drawn by any."""
-    posterior = Posterior(problem, layout_matters=layout_matters)
+    posterior = Posterior(problem, purpose)
     tried = [posterior.of(fit) for fit in fits]
     best = _best(posterior, tried)
     return _choice(tried, best, requested=requested) if math.isfinite(best.score) else None

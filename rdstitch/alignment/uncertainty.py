@@ -24,6 +24,7 @@ from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.select import Posterior
 from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.choices import Purpose
 from rdstitch.robust.posterior import EXACTNESS, LENS
 
 _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
@@ -178,7 +179,7 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rou
     Each model counts as much as Schwarz's criterion makes it likely.
     """
     free = problem.fit(HOMOGRAPHY)
-    posterior = Posterior(problem, layout_matters=False)
+    posterior = Posterior(problem, Purpose.TRAJECTORY)
     against = float(np.clip((posterior.of(free).score - posterior.of(fit).score) / 2.0, -50.0, 50.0))
     share = 1.0 / (1.0 + math.exp(against))
     off = free.adjusted.parameters.lens - fit.adjusted.parameters.lens

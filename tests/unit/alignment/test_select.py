@@ -14,6 +14,7 @@ from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, RIGID, ROTATION, MotionModel
 from rdstitch.alignment.select import Hypothesis, ModelChoice, Posterior, _best, select_model
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import Purpose
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
@@ -120,7 +121,7 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
     found = align(*given)
     assert found.distortion == 0.0
     assert [message.severity for message in found.messages if "depth" in message.text] == ["detail"]
-    lens = align(*given, AlignmentOptions(purpose="calibrate"))
+    lens = align(*given, AlignmentOptions(purpose=Purpose.CALIBRATE))
     assert [message.severity for message in lens.messages if "depth" in message.text] == ["failure"]
 
 
@@ -158,9 +159,9 @@ def test_the_command_decides_between_what_is_as_good(monkeypatch: pytest.MonkeyP
     """`pano` is for turns, `mosaic` for planes: odds that evidence overrules."""
     scores = []
 
-    def spy(problem: Problem, names: list[str], *rest: object, **options: bool) -> ModelChoice:
+    def spy(problem: Problem, names: list[str], *rest: object) -> ModelChoice:
         choice = select_model(problem, ["rotation"])
-        scores.append([Posterior(problem, prefer_turn).of(choice.fit).score for prefer_turn in (True, False)])
+        scores.append([Posterior(problem, purpose).of(choice.fit).score for purpose in (Purpose.PANO, Purpose.MOSAIC)])
         return choice
 
     monkeypatch.setattr(import_module("rdstitch.alignment.align"), "select_model", spy)
