@@ -6,15 +6,14 @@ import numpy as np
 
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
-from rdstitch.features import Correspondences
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
+from tests.registrations import stored
 
 LENS = Camera((640, 480), -0.2, focal=520.0)
 _MATCHES = 300
@@ -58,18 +57,12 @@ def strip(kind: str, height: float, seed: int, images: int) -> Strip:
                 matched.append(PairMatches(points1, points2, own, own, np.zeros(len(points1)), None))
     relations = estimate_radial_homographies(matched, _OPTIONS)
     registered = [
-        PairRegistration(i, j, _stored(found), relation)
+        PairRegistration(i, j, stored(found.points1, found.points2), relation)
         for (i, j), found, relation in zip(pairs, matched, relations, strict=True)
         if relation
     ]
     links = [pair.link() for pair in over_rough_ground(registered, _OPTIONS.threshold)]
     return Strip(truth, lens.distortion, [Camera(lens.image_size).with_focal() for _ in range(images)], links)
-
-
-def _stored(found: PairMatches) -> StoredMatches:
-    count = len(found)
-    index = np.column_stack([np.arange(count)] * 2)
-    return StoredMatches.of(Correspondences(index, found.points1, found.points2, np.zeros(count)))
 
 
 def _matches(truth: Sequence, i: int, j: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from examples.benchmarks.driver import SUFFIXES, images_of, run
 from rdstitch.arrays import FloatArray
@@ -29,6 +30,9 @@ from rdstitch.arrays import FloatArray
 _GRID = np.stack(np.meshgrid([0.1, 0.5, 0.9], [0.1, 0.5, 0.9]), axis=-1).reshape(-1, 2)
 _MAX_DISTORTION, _MAX_STRETCH = 0.09, 30.0
 _MAX_SECONDS = 900
+
+_VARIANTS = ("as it is", "quality 92", "70 %", "other order")
+_FAMILIES = {"rotation": "turn", "homography": "homographies"}  # all others are planes under one camera
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,14 @@ class Row:
         """Whether a person would keep it, as far as numbers tell."""
         whole = self.status == 0 and self.used == self.count and not self.folded
         return whole and not abs(self.distortion) > _MAX_DISTORTION and self.stretch <= _MAX_STRETCH
+
+    @property
+    def kind(self) -> str:
+        """What kind of result it is."""
+        if self.status:
+            return f"status {self.status}"
+        breaks = any("[seam-break]" in line for line in self.messages)
+        return f"{_FAMILIES.get(self.model, 'plane')} {self.used}/{self.count}{' breaks' if breaks else ''}"
 
     def __str__(self) -> str:
         """One line of the table."""
@@ -130,13 +142,65 @@ def stitch(folder: Path, output: Path, options: list[str], peer: str | None) -> 
     return replace(row, stretch=stretch, folded=folded, focal=focal, broken=broken, longest=longest)
 
 
+def save_again(folder: Path, to: Path, variant: str) -> Path:
+    """The images of a set as a user may have them instead."""
+    files = images_of(folder)
+    saved = to / variant.replace(" ", "_") / folder.name
+    saved.mkdir(parents=True, exist_ok=True)
+    order = np.random.default_rng(len(files)).permutation(len(files))
+    order = order[::-1] if (order == np.arange(len(files))).all() else order
+    for position, file in zip(order, files, strict=True):
+        if variant == "other order":
+            (saved / f"{position:03d}{file.suffix}").write_bytes(file.read_bytes())
+            continue
+        with Image.open(file) as image:
+            again = image.convert("RGB")
+            if variant == "70 %":
+                width, height = image.size
+                again = again.resize((round(0.7 * width), round(0.7 * height)), Image.Resampling.LANCZOS)
+            kept = {"exif": image.info["exif"]} if "exif" in image.info else {}
+            again.save(saved / f"{file.stem}.jpg", quality=92, **kept)
+    return saved
+
+
+def compare_variants(sets: list[Path], output: Path, options: list[str], pool: ThreadPoolExecutor) -> None:
+    """Print the kind of result of each set in each variant, and the share that is of the kind of the set as it is."""
+    print(f"{'set':24s} " + " ".join(f"{variant:24s}" for variant in _VARIANTS))
+
+    def kinds_of(folder: Path) -> list[str]:
+        with tempfile.TemporaryDirectory() as scratch:
+            every = [folder, *(save_again(folder, Path(scratch), variant) for variant in _VARIANTS[1:])]
+            kinds = []
+            for variant, each in zip(_VARIANTS, every, strict=True):
+                written = output / variant.replace(" ", "_")
+                written.mkdir(parents=True, exist_ok=True)
+                kinds.append(stitch(each, written, options, None).kind)
+            return kinds
+
+    same = []
+    for folder, kinds in zip(sets, pool.map(kinds_of, sets), strict=True):
+        same += [kind == kinds[0] for kind in kinds[1:]]
+        print(f"{folder.name:24s} " + " ".join(f"{kind:24s}" for kind in kinds), flush=True)
+    print(f"{sum(same)} of {len(same)} of the same kind, {np.mean(same):.1%}")
+
+
 def main(
-    folders: tuple[Path, ...], *, output: Path | None = None, peer: str | None = None, jobs: int = 1, options: str = ""
+    folders: tuple[Path, ...],
+    *,
+    output: Path | None = None,
+    peer: str | None = None,
+    jobs: int = 1,
+    options: str = "",
+    resaved: bool = False,
 ) -> None:
     """Print a row a set."""
     sets = sorted({file.parent for folder in folders for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES})
     output = output or Path(tempfile.mkdtemp())
     output.mkdir(parents=True, exist_ok=True)
+    if resaved:
+        with ThreadPoolExecutor(jobs) as pool:
+            compare_variants(sets, output, options.split(), pool)
+        return
     columns = "areas   f/half  torn break lines  cpu s  peer s"
     print(f"     set                      status used  model           λ    {columns}")
     with ThreadPoolExecutor(jobs) as pool:

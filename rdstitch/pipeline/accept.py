@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -55,7 +56,7 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
     first, first_findings = registration, findings
     if _fails(findings) and not options.force:
         # What the matches hardly tell apart, the pixels do.
-        for other in [undamaged, *_by_other_models(registration, aligner)] if purpose.picture else [undamaged]:
+        for other in chain([undamaged], _by_other_models(registration, aligner) if purpose.picture else ()):
             if other is not None and not _fails(judged := checked(other)):
                 current, findings = other, judged
                 break

@@ -3,7 +3,7 @@
 import tracemalloc
 from dataclasses import replace
 from functools import lru_cache
-from types import SimpleNamespace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -12,15 +12,19 @@ import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.features.prepared_image import View
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
+from rdstitch.geometry.radial_homography import RadialHomography, from_directions, from_plane, to_directions, to_plane
+from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.source import Source
+from rdstitch.io import DecodedImage, Metadata
 from rdstitch.local_alignment import DisplacementField, LocalAlignment, Match, align_locally, fit
 from rdstitch.local_alignment.field import grid_shape, node_points
 from rdstitch.local_alignment.fit import Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches, place_matches
+from rdstitch.matching.two_view import PairRegistration
 from rdstitch.pipeline.placed_images import align_registration_locally
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
+from tests.registrations import registration, stored
 
 SIZE = (640, 480)
 SHAPE = grid_shape(SIZE, 12)
@@ -322,22 +326,20 @@ def test_a_turn_on_the_spot_is_left_alone() -> None:
 
 def test_registered_turns_are_aligned_locally() -> None:
     found, matrices, _ = turn(0.3)
-    pairs = [
-        SimpleNamespace(
-            image1=k.image1,
-            image2=k.image2,
-            relation=True,
-            correspondences=SimpleNamespace(points1=k.points1, points2=k.points2),
-        )
-        for k in found
-    ]
-    sources = [SimpleNamespace(view=lambda megapixels: View(np.zeros((480, 640), np.uint8)))] * 4
-    alignment = SimpleNamespace(
-        used=np.ones(4, dtype=np.bool_), cameras=CAMERAS[:4], homographies=matrices, on_sphere=True
+    pairs = []
+    for k in found:
+        relation = RadialHomography(np.eye(3), LENS, LENS, np.ones(len(k.points1), dtype=np.bool_))
+        pairs.append(PairRegistration(k.image1, k.image2, stored(k.points1, k.points2), relation))
+    frame = Frame(Path("blank.png"), image=DecodedImage(np.zeros((480, 640), np.uint8), None, Metadata(SIZE)))
+    given = registration(
+        [Source(frame.path, Metadata(SIZE), LENS, frame=frame)] * 4,
+        pairs,
+        cameras=tuple(CAMERAS[:4]),
+        homographies=matrices,
+        model="rotation",
     )
-    registration: Any = SimpleNamespace(pairs=pairs, alignment=alignment, sources=sources)
-    assert align_registration_locally(registration, "off").fields == ()
-    fields = align_registration_locally(registration, "auto").fields
+    assert align_registration_locally(given, "off").fields == ()
+    fields = align_registration_locally(given, "auto").fields
     assert [f.values.tolist() for f in fields] == [
         f.values.tolist() for f in align_locally(found, CAMERAS[:4], matrices, on_sphere=True).fields
     ]

@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features import Correspondences, Features
+from rdstitch.features import Features
 from rdstitch.features.keypoints import Descriptors
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.candidate_pairs import CANDIDATES, EXHAUSTIVE_UP_TO, neighbours, pairs_that_matter
 from rdstitch.matching.candidate_pairs import first_pairs as _first_pairs
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.system.cache import Cache
+from tests.registrations import stored
 
 
 def first_pairs(features: list[Features], seed: int, positions: FloatArray | None = None) -> list[tuple[int, int]]:
@@ -128,11 +129,6 @@ def test_images_that_overlap_by_a_fifth_are_neighbours(overlap: float, found: li
     assert neighbours([lens, lens], np.stack([np.eye(3), shifted]), {(0, 1)}) == []
 
 
-def _shared(points1: FloatArray, points2: FloatArray) -> StoredMatches:
-    count = len(points1)
-    return StoredMatches.of(Correspondences(np.zeros((count, 2), np.intp), points1, points2, np.zeros(count)))
-
-
 def _shared_by_squares(side: int) -> dict[tuple[int, int], StoredMatches]:
     """A survey of side x side images of 400 pixels, each 100 pixels from the next: one match every 20 pixels."""
     rng = np.random.default_rng(0)
@@ -144,7 +140,7 @@ def _shared_by_squares(side: int) -> dict[tuple[int, int], StoredMatches]:
         for i, corner1 in enumerate(corners[:j]):
             both = places[seen[i] & seen[j]]
             if len(both) > 8:
-                shared[i, j] = _shared(both - corner1, both - corner2)
+                shared[i, j] = stored(both - corner1, both - corner2)
     return shared
 
 
@@ -170,12 +166,12 @@ def test_of_many_overlapping_pairs_each_image_keeps_a_few_all_around_it() -> Non
 def test_a_weak_partner_on_the_other_side_is_kept_before_a_strong_one_on_the_same() -> None:
     rng = np.random.default_rng(1)
     right, left = rng.uniform((200, 0), (400, 400), (60, 2)), rng.uniform((0, 0), (100, 400), (25, 2))
-    shared = {(0, other): _shared(right, right) for other in range(1, 12)}
+    shared = {(0, other): stored(right, right) for other in range(1, 12)}
     # The others have partners enough among themselves.
     shared |= {
-        (i, j): _shared(np.tile(right, (4, 1)), np.tile(right, (4, 1))) for i in range(1, 12) for j in range(i + 1, 12)
+        (i, j): stored(np.tile(right, (4, 1)), np.tile(right, (4, 1))) for i in range(1, 12) for j in range(i + 1, 12)
     }
-    shared[0, 12] = _shared(left, left)
+    shared[0, 12] = stored(left, left)
     chosen = pairs_that_matter(shared, [Camera((400, 400))] * 13)
     assert (0, 12) in chosen
     assert sum(0 in pair for pair in chosen) == 6
@@ -245,8 +241,7 @@ def test_what_is_chosen_is_part_of_the_key(tmp_path: Path) -> None:
 
 def test_matches_are_read_in_the_pixels_that_are_wanted() -> None:
     points = np.array([[0.0, 0.0], [639.0, 479.0]])
-    indices = np.zeros((2, 2), np.intp)
-    matches = StoredMatches.of(Correspondences(indices, points, points[::-1].copy(), np.ones(2)))
+    matches = stored(points, points[::-1].copy())
     assert len(matches) == 2
     larger = matches.resized(((640, 480), (640, 480)), ((1280, 960), (640, 480))).load()
     np.testing.assert_allclose(larger.points1, [[0.5, 0.5], [1278.5, 958.5]], atol=0.01)

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features import Correspondences
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.distortion_consensus import vote
-from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.mixed_lenses import TwoLenses, Votes, two_lenses
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust import estimate_radial_homography
+from tests.registrations import stored
 
 LENS = Camera((640, 480), -0.2, focal=520.0)
 
@@ -27,10 +26,7 @@ def test_few_inliers_have_no_vote(count: int, votes: int) -> None:
     points2 += rng.normal(scale=0.1, size=points2.shape)
     relation = estimate_radial_homography(points1, points2, LENS.image_size, focal=520.0)
     assert relation.inliers.all()
-    indices = np.repeat(np.arange(count)[:, None], 2, axis=1)
-    pair = PairRegistration(
-        0, 1, StoredMatches.of(Correspondences(indices, points1, points2, np.ones(count))), relation
-    )
+    pair = PairRegistration(0, 1, stored(points1, points2), relation)
     assert len(Votes.of([pair], 3.0)) == votes
 
 

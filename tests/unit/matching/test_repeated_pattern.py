@@ -18,6 +18,7 @@ from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features, show_motion
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.synthetic import ImageTexture, Sequence, grid_poses, ground, sequence_over
+from tests.registrations import stored
 
 CAMERA = Camera((640, 480), -0.2)
 POINTS = np.random.default_rng(0).uniform((5.0, 5.0), (634.0, 474.0), (300, 2))
@@ -29,10 +30,8 @@ def _pair(parallax: FloatArray, plane: BoolArray = PLANE) -> PairRegistration:
     """A pair whose plane has no motion, of which ``plane`` are inliers."""
     points2 = POINTS + np.column_stack([parallax, np.zeros(300)])
     points2[~RIGHT] = np.random.default_rng(1).uniform((0.0, 0.0), (639.0, 479.0), (60, 2))
-    index = np.column_stack([np.arange(300)] * 2)
-    matches = Correspondences(index, POINTS, points2, np.zeros(300))
     relation = RadialHomography(np.eye(3), CAMERA, CAMERA, plane & RIGHT, distortion_std=0.01)
-    return PairRegistration(0, 1, StoredMatches.of(matches), relation)
+    return PairRegistration(0, 1, stored(POINTS, points2), relation)
 
 
 def test_the_other_flank_of_a_valley_belongs_to_the_ground() -> None:

@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +27,7 @@ from rdstitch.system.cache import NO_CACHE
 from rdstitch.verification.verdict import RefusedError
 from tests.alignment_scenes import grid, scene
 from tests.cli.running import flight
+from tests.registrations import registration
 from tests.sampled import sampled
 
 OPTIONS = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
@@ -58,10 +57,10 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
 def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def aligned(aligner: Aligner, pairs: object) -> Any:
+    def aligned(aligner: Aligner, pairs: object) -> AlignedPairs:
         asked.append(aligner.options.model)
-        found: Any = SimpleNamespace(poses=None if aligner.options.model == "auto" else "poses", on_sphere=False)
-        return AlignedPairs((), found)
+        metric = registration().alignment
+        return AlignedPairs((), replace(metric, poses=None) if aligner.options.model == "auto" else metric)
 
     monkeypatch.setattr(Aligner, "_drafted", aligned)
     monkeypatch.setattr("rdstitch.pipeline.aligner.over_rough_ground", lambda pairs, threshold: pairs)

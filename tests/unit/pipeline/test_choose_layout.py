@@ -2,20 +2,19 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from rdstitch.compositing import SeamBreak, SeamQuality, plan_canvas
-from rdstitch.geometry.camera import Camera
+from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.io import write_image
 from rdstitch.pipeline.choose_layout import _is_stretched
-from rdstitch.pipeline.compose import seam_messages
+from rdstitch.pipeline.compose import Layout, seam_messages
+from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recipes import mosaic, pano
 from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic.textures import ground
+from tests.registrations import CAMERA, source
 
 
 def test_where_a_part_of_the_scene_is_nearer_one_line_says_where_its_lines_break(tmp_path: Path) -> None:
@@ -47,18 +46,12 @@ def test_what_a_homography_stretches_is_laid_out_as_a_turn(shared_data: Callable
     assert result.registration.alignment.used.all()
 
 
-def _planned(third_row: tuple[float, float]) -> Any:
-    """Two images on a plane; the second is seen obliquely."""
-    camera = Camera((400, 300))
-    oblique = np.eye(3)
-    oblique[2, :2] = third_row
-    images = [SimpleNamespace(camera=camera, homography=matrix) for matrix in (np.eye(3), oblique)]
-    return SimpleNamespace(images=images, canvas=plan_canvas([camera] * 2, [np.eye(3), oblique]))
-
-
 @pytest.mark.parametrize(("tilt", "stretched"), [(0.0, False), (0.4, False), (0.9, True)])
 def test_a_plane_seen_from_the_side_is_stretched(tilt: float, stretched: bool) -> None:
-    assert _is_stretched(_planned((tilt, 0.0))) is stretched
+    oblique = np.eye(3)
+    oblique[2, 0] = tilt
+    placed = PlacedImages([source(), source()], [CAMERA] * 2, np.stack([np.eye(3), oblique]), 0)
+    assert _is_stretched(Layout.of(placed, CompositeOptions())) is stretched
 
 
 def _quality(*breaks: SeamBreak, alike: float = 0.9) -> SeamQuality:

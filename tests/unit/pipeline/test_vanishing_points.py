@@ -1,6 +1,5 @@
 """Vanishing points, rectangles, and how much straightening may cut away."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from rdstitch.pipeline import straighten
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.vanishing_points import Edges, Focal, nearest_axis, of_edges, of_rectangle, of_scene
 from rdstitch.synthetic.panorama import camera_rotations
+from tests.registrations import source
 
 FOCAL, PIXEL = 1.3, 1.0 / 600.0
 WALL = np.array([[-1.0, -0.7, 0.0], [1.0, -0.7, 0.0], [1.0, 0.7, 0.0], [-1.0, 0.7, 0.0]])
@@ -108,8 +108,7 @@ def test_straightening_that_cuts_the_picture_away_is_not_done(
     lens = Camera((400, 300), 0.0, focal=260.0)
     looks = np.stack([camera_rotations(yaw, 0.0, 0.0)[0] for yaw in (-0.3, 0.0, 0.3)])
     directions = np.swapaxes(looks, 1, 2) @ np.diag([1.0, 1.0, 260.0 / lens.scale])
-    sources: Any = [SimpleNamespace(name=f"{k}.jpg") for k in range(3)]
-    placed = PlacedImages(sources, [lens] * 3, directions, 1, turned=True)
+    placed = PlacedImages([source(f"{k}.jpg") for k in range(3)], [lens] * 3, directions, 1, turned=True)
     upwards = CompositeOptions(pitch=-50.0).view
     monkeypatch.setattr(straighten, "_upright", lambda placed, options: (upwards, []))
     options = CompositeOptions(straighten="auto", projection=projection)

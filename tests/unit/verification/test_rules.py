@@ -1,7 +1,7 @@
 """The rules of the verdict, and their thresholds."""
 
 from dataclasses import replace
-from types import SimpleNamespace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,8 @@ from rdstitch.alignment.result import LinkFit
 from rdstitch.choices import Purpose
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.inputs.source import Source
+from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.results.messages import Message
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import Evidence
@@ -21,31 +23,25 @@ from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.second_motion import SecondMotion
 from rdstitch.verification.self_similarity import Ambiguity
 from rdstitch.verification.verdict import _aloud
+from tests.registrations import CAMERA, evidence, registration, source
 
-CAMERA = Camera((400, 300))
-GOOD: Any = SimpleNamespace(alike=0.8, flat=True, purpose=Purpose.TRAJECTORY, alignment=None)
-SHAPED: Any = SimpleNamespace(
-    **{**vars(GOOD), "alignment": SimpleNamespace(shape=SimpleNamespace(shift=6.0, shift_std=8.0), cameras=[CAMERA])}
-)
+SHAPE = replace(registration().alignment.shape, doubtful=True, shift=6.0, shift_std=8.0)
+SHAPED = evidence(registration(shape=SHAPE), alike=0.8)
 
 
-def _with(found: Any, **changed: Any) -> Any:
-    return SimpleNamespace(**{**vars(found), **changed})
-
-
-def _said(*kinds: Kind, found: Any = SHAPED) -> list[Kind]:
+def _said(*kinds: Kind, found: Evidence = SHAPED) -> list[Kind]:
     findings = [Finding(kind, (0,), "warning") for kind in kinds]
     return [finding.kind for finding in _aloud(findings, found) if finding.severity == "warning"]
 
 
 def test_what_is_not_said_is_a_detail() -> None:
-    (note,) = _aloud([Finding(Kind.PARALLAX, (0, 1), "warning", {"size": 3.0})], GOOD)
+    (note,) = _aloud([Finding(Kind.PARALLAX, (0, 1), "warning", {"size": 3.0})], SHAPED)
     assert note == Finding(Kind.PARALLAX, (0, 1), "detail", {"size": 3.0})
 
 
-TURNED = _with(GOOD, flat=False)
-UNLIKE = _with(TURNED, alike=0.1)
-SMALL = _with(SHAPED, alignment=SimpleNamespace(shape=SimpleNamespace(shift=1e4, shift_std=8.0), cameras=[CAMERA]))
+TURNED = evidence(registration(model="rotation"), alike=0.8)
+UNLIKE = evidence(TURNED.registration, alike=0.1)
+SMALL = evidence(registration(shape=replace(SHAPE, shift=1e4)), alike=0.8)
 
 
 @pytest.mark.parametrize(
@@ -58,17 +54,21 @@ SMALL = _with(SHAPED, alignment=SimpleNamespace(shape=SimpleNamespace(shift=1e4,
         (SHAPED, [Kind.RELIEF], [Kind.RELIEF]),
         (SHAPED, [Kind.RELIEF, Kind.SHAPE_BENT], [Kind.SHAPE_BENT]),  # one line says that the plane may be none
         (SMALL, [Kind.SHAPE_BENT], []),  # by more than an image
-        (_with(UNLIKE, purpose=Purpose.MOSAIC), [Kind.RELIEF, Kind.ROUGH], []),  # its seams are looked at
+        (
+            evidence(TURNED.registration, Purpose.MOSAIC, alike=0.1),
+            [Kind.RELIEF, Kind.ROUGH],
+            [],
+        ),
         (SHAPED, [Kind.SECOND_MOTION], [Kind.SECOND_MOTION]),
     ],
 )
-def test_what_is_said_aloud(found: Any, kinds: list[Kind], said: list[Kind]) -> None:
+def test_what_is_said_aloud(found: Evidence, kinds: list[Kind], said: list[Kind]) -> None:
     assert _said(*kinds, found=found) == said
 
 
 def test_failures_stay() -> None:
     given = (Finding(Kind.ERRORS), Finding(Kind.IMAGE_MISFITS, (1,)))
-    assert _aloud(given, _with(GOOD, flat=False)) == given
+    assert _aloud(given, TURNED) == given
 
 
 def test_there_are_a_few_lines_of_a_run_the_gravest_first_and_one_of_a_kind() -> None:
@@ -77,27 +77,24 @@ def test_there_are_a_few_lines_of_a_run_the_gravest_first_and_one_of_a_kind() ->
     assert _said(others[0], others[0]) == others[:1]
 
 
-def test_every_kind_has_a_sentence_and_every_threshold_its_unit_and_source() -> None:
+def test_every_kind_has_a_sentence_and_every_threshold_its_unit_andsource() -> None:
     assert all(limit.unit and limit.source for limit in LIMITS.values())
 
 
 MOTION = SecondMotion((0, 1), 46, 54, (30.0, 40.0), 120.0)
 
 
-def _of_motions(motion: SecondMotion, **changed: Any) -> Any:
+def _of_motions(
+    motion: SecondMotion, purpose: Purpose = Purpose.TRAJECTORY, *, clear: bool = True, model: str = "rigid"
+) -> list[tuple[str, str]]:
     """Severity and words of what is said of a second motion."""
-    found = SimpleNamespace(
-        motions=[motion], clear=True, static=False, purpose=Purpose.TRAJECTORY, ambiguous={},
-        alignment=SimpleNamespace(cameras=[CAMERA] * 2, on_sphere=False),
-    )  # fmt: skip
-    registration: Any = SimpleNamespace(sources=[SimpleNamespace(path=f"folder/{name}.png") for name in "ab"])
-    said = messages_of(rules._second_motion(_with(found, **changed)), registration)
-    return [(message.severity, message.text) for message in said]
+    given = registration(cameras=(CAMERA,) * 3, model=model)
+    found = evidence(given, purpose, motions=[motion], ambiguous={}, clear=clear)
+    return [(message.severity, message.text) for message in messages_of(rules._second_motion(found), given)]
 
 
 def test_of_a_turn_a_second_motion_is_parallax() -> None:
-    turn = SimpleNamespace(cameras=[CAMERA] * 2, on_sphere=True)
-    ((severity, text),) = _of_motions(SecondMotion((0, 1), 51, 49, (8.0, 9.0), 40.0), alignment=turn)
+    ((severity, text),) = _of_motions(SecondMotion((0, 1), 51, 49, (8.0, 9.0), 40.0), model="rotation")
     assert severity == "warning"
     assert "(parallax)" in text
 
@@ -108,93 +105,80 @@ def test_of_a_turn_a_second_motion_is_parallax() -> None:
 def test_of_a_motion_with_an_area_the_pixels_decide(area: int, clear: bool, severity: str | None) -> None:
     said = _of_motions(replace(MOTION, area=area, plane_area=100 - area), clear=clear)
     assert [how for how, _ in said] == ([] if severity is None else [severity])
-    assert _of_motions(replace(MOTION, area=area, plane_area=100 - area), clear=clear, purpose=Purpose.MOSAIC) == []
+    assert _of_motions(replace(MOTION, area=area, plane_area=100 - area), purpose=Purpose.MOSAIC, clear=clear) == []
 
 
 def test_the_place_is_named_and_no_distance_is_larger_than_an_image() -> None:
     ((_, text),) = _of_motions(MOTION)
-    for part in ("46%", "(30, 40) of a.png", "b.png", "120 pixels", "a mask keeps it out"):
+    for part in ("46%", "(30, 40) of a.jpg", "b.jpg", "120 pixels", "a mask keeps it out"):
         assert part in text
     ((_, text),) = _of_motions(replace(MOTION, disagreement=np.inf))
     assert "by 500 pixels" in text
 
 
 def test_a_second_motion_does_not_spoil_the_lens() -> None:
-    ((how, _),) = _of_motions(MOTION, clear=False, purpose=Purpose.CALIBRATE)
+    ((how, _),) = _of_motions(MOTION, Purpose.CALIBRATE, clear=False)
     assert how == "warning"
 
 
-def _registration(count: int, *, agree: float = 0.2, keypoints: tuple[int, ...] = (900, 900, 900)) -> Any:
-    """Two images of which so many matches were given to the alignment, and a share agrees with it."""
+def _misfits(count: int, *, agree: float = 0.2, keypoints: tuple[int, ...] = (900, 900, 900)) -> list[Message]:
+    """What is said of two images with so many matches, of which a share agrees with the alignment."""
     fit = LinkFit(0, 1, count, int(agree * count), 0.5, True)
-    sources = [SimpleNamespace(path=f"folder/{name}.jpg", name=f"{name}.jpg") for name in "ab"]
-    return SimpleNamespace(alignment=SimpleNamespace(links=(fit,)), sources=sources, keypoints=keypoints)
-
-
-def _misfits(registration: Any) -> list[Message]:
-    found = Evidence(registration, 3.0)
-    return messages_of([*rules.disagreeing_pairs(found), *rules._misfitting_images(found)], registration)
+    given = registration(2, keypoints=keypoints, links=(fit,))
+    found = evidence(given)
+    return messages_of([*rules.disagreeing_pairs(found), *rules._misfitting_images(found)], given)
 
 
 @pytest.mark.parametrize(
-    ("registration", "reason"),
+    ("count", "keypoints", "reason"),
     [
-        (_registration(39), "too few to place it: little overlap, or none? stitch them on their own"),
-        (_registration(41), "another surface, or come from another camera or zoom? stitch them on their own"),
-        (_registration(41, keypoints=(900, 200, 900)), "b.jpg has less than a third of the features that others have"),
+        (39, 900, "too few to place it: little overlap, or none? stitch them on their own"),
+        (41, 900, "another surface, or come from another camera or zoom? stitch them on their own"),
+        (41, 200, "b.jpg has less than a third of the features that others have"),
     ],
 )
-def test_a_pair_whose_matches_agree_with_each_other_only_is_named(registration: Any, reason: str) -> None:
-    (message,) = _misfits(registration)
+def test_a_pair_whose_matches_agree_with_each_other_only_is_named(count: int, keypoints: int, reason: str) -> None:
+    (message,) = _misfits(count, keypoints=(900, keypoints, 900))
     assert message.images == ("folder/a.jpg", "folder/b.jpg")
     assert message.text.startswith("a.jpg and b.jpg: only ")
     assert reason in message.text
 
 
 def test_images_of_whose_matches_two_fifths_disagree_are_named() -> None:
-    first, second = _misfits(_registration(100, agree=0.55, keypoints=(900, 200, 900)))
+    first, second = _misfits(100, agree=0.55, keypoints=(900, 200, 900))
     assert "only 55 of 100 of its matches fit the place that was found for it; they fit each other" in first.text
     assert "b.jpg has less than a third of the features that others have (blurred?)" in second.text
     assert second.images == ("folder/b.jpg",)
-    assert _misfits(_registration(100, agree=0.65)) == []
+    assert _misfits(100, agree=0.65) == []
 
 
-def _source(
-    name: str, *, model: str = "", make: str = "", serial: str = "", focal: float | None = None, mask: Any = None
-) -> Any:
-    metadata = SimpleNamespace(make=make, model=model, serial=serial, focal_px=focal, size=(1000, 800))
-    return SimpleNamespace(path=f"folder/{name}", metadata=metadata, mask=mask)
-
-
-def _texts(*sources: Any) -> list[str]:
-    registration: Any = SimpleNamespace(sources=sources)
-    return [message.text for message in messages_of(rules._inputs(Evidence(registration, 3.0)), registration)]
+def _texts(*sources: Source) -> list[str]:
+    given = registration(sources)
+    return [message.text for message in messages_of(rules._inputs(evidence(given)), given)]
 
 
 def test_images_of_one_camera_are_fine() -> None:
-    assert _texts(*(_source(f"{k}.jpg", model="A", serial="1", focal=900.0) for k in range(3))) == []
-    assert _texts(_source("a"), _source("b")) == []
+    assert _texts(*(source(f"{k}.jpg", model="A", serial="1", focal_px=900.0) for k in range(3))) == []
+    assert _texts(source("a"), source("b")) == []
     assert _texts() == []
 
 
 @pytest.mark.parametrize("other", [{"model": "B"}, {"model": "A", "serial": "2"}, {"make": "X", "model": "A"}])
-def test_several_cameras_are_named_the_commonest_first(other: dict[str, str]) -> None:
-    (text,) = _texts(
-        _source("z.jpg", focal=None, mask=None, **other), *(_source(f"{k}.jpg", model="A") for k in range(2))
-    )
+def test_several_cameras_are_named_the_commonest_first(other: dict[str, Any]) -> None:
+    (text,) = _texts(source("z.jpg", **other), *(source(f"{k}.jpg", model="A") for k in range(2)))
     assert text.startswith("the images come from 2 cameras: A (2: 0.jpg, 1.jpg); ")
     assert "(1: z.jpg); stitch those of each on their own" in text
 
 
 def test_a_serial_number_is_enough_and_no_header_is_no_camera() -> None:
-    assert len(_texts(_source("a", serial="1"), _source("b", serial="2"))) == 1
-    assert _texts(_source("a", serial="1"), _source("b", make="X")) == []
+    assert len(_texts(source("a", serial="1"), source("b", serial="2"))) == 1
+    assert _texts(source("a", serial="1"), source("b", make="X")) == []
 
 
 @pytest.mark.parametrize(("focal", "zoomed"), [(925.0, False), (930.0, True), (870.0, True)])
 def test_a_lens_that_was_zoomed_is_noticed(focal: float, zoomed: bool) -> None:
     """By more than three per cent, of which one is rounding."""
-    found = _texts(_source("a.jpg", model="A", focal=900.0), _source("b.jpg", model="A", focal=focal))
+    found = _texts(source("a.jpg", model="A", focal_px=900.0), source("b.jpg", model="A", focal_px=focal))
     assert bool(found) is zoomed
     if zoomed:
         near, far = ("a.jpg", "b.jpg") if focal > 900 else ("b.jpg", "a.jpg")
@@ -203,10 +187,10 @@ def test_a_lens_that_was_zoomed_is_noticed(focal: float, zoomed: bool) -> None:
 
 
 def test_images_without_a_mask_among_others_are_named() -> None:
-    masked = [_source(f"{k}.png", mask="m") for k in range(3)]
+    masked = [source(f"{k}.png", mask=Path("m")) for k in range(3)]
     assert _texts(*masked) == []
-    assert _texts(*masked, _source("x.png")) == ["1 of 4 images have no mask: x.png"]
-    assert _texts(masked[0], _source("x.png"), _source("y.png")) == ["2 of 3 images have no mask: x.png, y.png"]
+    assert _texts(*masked, source("x.png")) == ["1 of 4 images have no mask: x.png"]
+    assert _texts(masked[0], source("x.png"), source("y.png")) == ["2 of 3 images have no mask: x.png, y.png"]
 
 
 def test_what_moves_by_no_more_than_tree_tops_rivals_no_plane() -> None:
@@ -214,13 +198,12 @@ def test_what_moves_by_no_more_than_tree_tops_rivals_no_plane() -> None:
     near, far = (SecondMotion((0, 1), 46, 54, (30.0, 40.0), off, relation) for off in (20.0, 30.0))
     assert [how for how, _ in _of_motions(far, clear=False)] == ["failure"]
     assert _of_motions(near, clear=False) == []
-    assert [how for how, _ in _of_motions(near, clear=False, purpose=Purpose.CALIBRATE)] == ["warning"]
+    assert [how for how, _ in _of_motions(near, Purpose.CALIBRATE, clear=False)] == ["warning"]
 
 
 @pytest.mark.parametrize(("doubtful", "severity"), [(True, "warning"), (False, "detail")])
 def test_free_homographies_are_doubted_where_their_errors_have_a_pattern(doubtful: bool, severity: str) -> None:
-    shape = SimpleNamespace(image=1, shift=6.0, shift_std=8.0, doubtful=doubtful)
-    found: Any = SimpleNamespace(alignment=SimpleNamespace(focal=None, shape=shape), purpose=Purpose.TRAJECTORY)
+    found = evidence(registration(focal=None, shape=replace(SHAPE, image=1, doubtful=doubtful)))
     assert [(own.kind, own.severity) for own in rules._shape(found)] == [(Kind.SHAPE_UNKNOWN, severity)]
 
 
@@ -250,9 +233,9 @@ def _kinds(findings: Any) -> list[Kind]:
     ],
 )
 def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kind: Kind | None) -> None:
-    ground = SimpleNamespace(found=relief is not None, size=relief or 0.0)
-    alignment = SimpleNamespace(rms=rms, relief=ground, cameras=[Camera((400, 300)), Camera((40, 30))])
-    found: Any = SimpleNamespace(alignment=alignment, threshold=3.0, alike=alike, purpose=Purpose.TRAJECTORY)
+    ground = replace(registration().alignment.relief, found=relief is not None, size=relief or 0.0)
+    cameras = (CAMERA, Camera((40, 30)), CAMERA)
+    found = evidence(registration(rms=rms, relief=ground, cameras=cameras), alike=alike)
     findings = list(rules._errors(found))
     assert _kinds(findings) == ([] if kind is None else [kind])
     for finding in findings:
@@ -260,20 +243,20 @@ def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kin
         assert finding.values == pytest.approx({"rms": rms, "threshold": 3.0}, nan_ok=True)
 
 
-def _checked(cells: int, share: float, pair: tuple[int, int] = (0, 1), *, unique: bool = False) -> Any:
-    link = CheckedLink(LinkFit(*pair, 9, 9, 0.5, True), Agreement(cells, round(cells * share)), Ambiguity(1, 0, 0))
-    return SimpleNamespace(agreement=link.agreement, pair=link.pair, unique=unique)
+def _checked(share: float, pair: tuple[int, int], *, unique: bool) -> CheckedLink:
+    agreement = Agreement(100, round(100 * share))
+    return CheckedLink(LinkFit(*pair, 9, 9, 0.5, True), agreement, Ambiguity(1, 0, 0), unique)
 
 
 def test_of_pairs_that_unique_places_decided_the_least_alike_is_named() -> None:
-    seen = [_checked(100, 0.5, unique=True), _checked(100, 0.3, (1, 2), unique=True), _checked(100, 0.1, (2, 3))]
-    (finding,) = rules._pattern(SimpleNamespace(ambiguous={}, checked=seen))  # type: ignore[arg-type]
+    seen = [_checked(share, (k, k + 1), unique=k < 2) for k, share in enumerate((0.5, 0.3, 0.1))]
+    (finding,) = rules._pattern(evidence(registration(4), ambiguous={}, checked=seen))
     assert (finding.kind, finding.images) == (Kind.SETTLED_PATTERN, (1, 2))
 
 
 @pytest.mark.parametrize("certain", [True, False])
 def test_images_of_two_lenses_that_were_not_separated(certain: bool) -> None:
-    mixed = SimpleNamespace(certain=certain, second=[False, True, False], distortion=(-0.1, -0.4))
-    findings = list(rules._mixed_lenses(SimpleNamespace(registration=SimpleNamespace(mixed=mixed))))  # type: ignore[arg-type]
+    mixed = TwoLenses(np.array([False, True, False]), (-0.1, -0.4), certain)
+    findings = list(rules._mixed_lenses(evidence(registration(mixed=mixed))))
     values = {"images2": [1], "images1": [0, 2], "lens2": -0.4, "lens1": -0.1}
     assert [finding.values for finding in findings] == ([] if certain else [values])

@@ -1,7 +1,7 @@
 """Which of two motions in the same images is the plane's, by what contradicts each."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.results.registration import Registration
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification.overlap_check import CheckedLink, ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey, overlap_agreement
@@ -25,6 +26,7 @@ from rdstitch.verification.second_motion import (
     share_of,
 )
 from rdstitch.verification.self_similarity import Ambiguity
+from tests.registrations import registration, stored
 
 SIZE = (400, 300)
 LENS = Camera(SIZE)
@@ -59,7 +61,9 @@ def _moving(pixels: float, inliers: Any = ()) -> RadialHomography:
     return RadialHomography(_shift(pixels), LENS, LENS, np.asarray(inliers, dtype=np.bool_))
 
 
-def _registration(monkeypatch: pytest.MonkeyPatch, images: list[Grey], places: list[float], pairs: Any = ()) -> Any:
+def _registered(
+    monkeypatch: pytest.MonkeyPatch, images: list[Grey], places: list[float], pairs: Sequence[PairRegistration] = ()
+) -> Registration:
     """Images put at these places along the plane, pixels."""
 
     def placed(_: object, k: int, camera: Camera, homography: FloatArray) -> ComparedImage:
@@ -67,14 +71,13 @@ def _registration(monkeypatch: pytest.MonkeyPatch, images: list[Grey], places: l
 
     monkeypatch.setattr(ComparedImages, "placed", placed)
     homographies = np.stack([_shift(-place) for place in places])
-    alignment = SimpleNamespace(cameras=[LENS] * len(places), homographies=homographies, on_sphere=False)
-    return SimpleNamespace(sources=range(len(images)), alignment=alignment, stretch=None, pairs=pairs)
+    return registration(len(images), pairs, cameras=(LENS,) * len(places), homographies=homographies)
 
 
-def _clear(registration: Any, motion: RadialHomography) -> bool:
+def _clear(given: Registration, motion: RadialHomography) -> bool:
     """Where two images were put, and something else moves."""
     second = [SecondMotion((0, 1), 20, 80, disagreement=120.0, relation=motion)]
-    read, alignment = ComparedImages(registration.sources, None), registration.alignment
+    read, alignment = ComparedImages(given.sources, None), given.alignment
     first, last = (read.placed(k, alignment.cameras[k], alignment.homographies[k]) for k in (0, 1))
     return is_clear(read, second, [replace(_link(0, 1), agreement=overlap_agreement(first, last))])
 
@@ -82,31 +85,15 @@ def _clear(registration: Any, motion: RadialHomography) -> bool:
 @pytest.mark.parametrize("covered", [0.2, 0.35])
 def test_what_fills_less_than_half_is_not_the_plane(monkeypatch: pytest.MonkeyPatch, covered: float) -> None:
     images = _images(covered)
-    assert _clear(_registration(monkeypatch, images, [0, STEP]), _moving(SWAY))
-    assert not _clear(_registration(monkeypatch, images, [0, SWAY]), _moving(STEP))
+    assert _clear(_registered(monkeypatch, images, [0, STEP]), _moving(SWAY))
+    assert not _clear(_registered(monkeypatch, images, [0, SWAY]), _moving(STEP))
 
 
 def test_what_covers_most_of_the_images_is_the_plane(monkeypatch: pytest.MonkeyPatch) -> None:
     """However little it moves; what it leaves free is an arm of the robot, say."""
     images = _images(0.6)
-    assert not _clear(_registration(monkeypatch, images, [0, STEP]), _moving(SWAY))
-    assert _clear(_registration(monkeypatch, images, [0, SWAY]), _moving(STEP))
-
-
-class _Matched:
-    """Matches; also as they lie on disk."""
-
-    def __init__(self, points1: FloatArray, points2: FloatArray) -> None:
-        self.points1, self.points2, self.ratio = points1, points2, np.full(len(points1), 0.5)
-
-    def __len__(self) -> int:
-        return len(self.points1)
-
-    def load(self) -> "_Matched":
-        return self
-
-    def take(self, chosen: Any) -> "_Matched":
-        return _Matched(self.points1[chosen], self.points2[chosen])
+    assert not _clear(_registered(monkeypatch, images, [0, STEP]), _moving(SWAY))
+    assert _clear(_registered(monkeypatch, images, [0, SWAY]), _moving(STEP))
 
 
 def _pair(first: int, second: int, on_plane: int, ahead: int) -> PairRegistration:
@@ -114,7 +101,7 @@ def _pair(first: int, second: int, on_plane: int, ahead: int) -> PairRegistratio
     rng = np.random.default_rng(first)
     plane = rng.uniform((STEP + 5, 5), (230, 295), (on_plane, 2))
     other = rng.uniform((290, 5), (395, 295), (ahead, 2))
-    matched: Any = _Matched(np.concatenate([plane, other]), np.concatenate([plane - (STEP, 0.0), other - (SWAY, 0.0)]))
+    matched = stored(np.concatenate([plane, other]), np.concatenate([plane - (STEP, 0.0), other - (SWAY, 0.0)]))
     by_plane = on_plane > ahead
     relation = _moving(STEP if by_plane else SWAY, (np.arange(on_plane + ahead) < on_plane) == by_plane)
     return PairRegistration(first, second, matched, relation)
@@ -123,7 +110,7 @@ def _pair(first: int, second: int, on_plane: int, ahead: int) -> PairRegistratio
 def test_every_pair_is_moved_as_its_plane_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """In one of them what drives ahead has most matches, in the other the plane has."""
     pairs = (_pair(0, 1, 40, 60), _pair(1, 2, 40, 25))
-    found = planes_of_pairs(_registration(monkeypatch, _images(0.35, 3), [0, 0, 0], pairs), 3.0)
+    found = planes_of_pairs(_registered(monkeypatch, _images(0.35, 3), [0, 0, 0], pairs), 3.0)
     assert found is not None
     for pair in found:
         assert pair.relation.inliers.tolist() == (np.arange(len(pair.matches)) < 40).tolist()
@@ -137,10 +124,10 @@ def test_what_drives_ahead_says_nothing_of_the_lens(monkeypatch: pytest.MonkeyPa
     pairs = []
     for first in range(2):
         pair = _pair(first, first + 1, 60, 90)
-        matched = pair.correspondences
+        matched = pair.correspondences  # which stay in memory
         matched.points2[:60] = lens.distort(lens.undistort(matched.points1[:60]) - (STEP, 0.0))
         pairs.append(pair)
-    found = planes_of_pairs(_registration(monkeypatch, _images(0.35, 3), [0, 0, 0], tuple(pairs)), 3.0)
+    found = planes_of_pairs(_registered(monkeypatch, _images(0.35, 3), [0, 0, 0], tuple(pairs)), 3.0)
     assert found is not None
     for pair in found:
         assert pair.relation.distortion == pytest.approx(-0.03, abs=0.005)
@@ -148,15 +135,15 @@ def test_what_drives_ahead_says_nothing_of_the_lens(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_pair_with_nothing_but_what_drives_ahead_is_no_pair(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = planes_of_pairs(_registration(monkeypatch, _images(0.35), [0, 0], (_pair(0, 1, 0, 60),)), 3.0)
+    found = planes_of_pairs(_registered(monkeypatch, _images(0.35), [0, 0], (_pair(0, 1, 0, 60),)), 3.0)
     assert not found[0].relation
     assert "less than half" in found[0].relation.reason
 
 
 def test_where_all_pairs_show_a_plane_there_is_nothing_to_choose(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs = (_pair(0, 1, 40, 0),)
-    assert planes_of_pairs(_registration(monkeypatch, _images(0.0), [0, STEP], pairs), 3.0) is None
-    assert planes_of_pairs(_registration(monkeypatch, _images(0.0), [0, STEP]), 3.0) is None
+    assert planes_of_pairs(_registered(monkeypatch, _images(0.0), [0, STEP], pairs), 3.0) is None
+    assert planes_of_pairs(_registered(monkeypatch, _images(0.0), [0, STEP]), 3.0) is None
 
 
 def test_what_is_not_seen_speaks_against_nothing() -> None:
@@ -173,9 +160,9 @@ def test_what_fits_where_something_smaller_moved_is_no_pattern(
     monkeypatch: pytest.MonkeyPatch, covered: float, moves: float, explained: bool
 ) -> None:
     """Within a twentieth of an image; a pattern fills all of it."""
-    registration = _registration(monkeypatch, _images(covered), [0, STEP])
+    given = _registered(monkeypatch, _images(covered), [0, STEP])
     motion = SecondMotion((0, 1), 40, 60, (30.0, 40.0), moves, _moving(SWAY))
-    assert explains(ComparedImages(registration.sources, None), motion, _link(0, 1, 0.45)) is explained
+    assert explains(ComparedImages(given.sources, None), motion, _link(0, 1, 0.45)) is explained
 
 
 WIDE = Camera((800, 600))
@@ -186,17 +173,14 @@ def _found(
     points: FloatArray, other: FloatArray, *, second: FloatArray | None = None, used: bool = True
 ) -> list[SecondMotion]:
     """Of two images whose plane moves by :data:`MOVED`; matches at ``other`` move by that and ``second``."""
-
-    def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
-        return np.asarray(points + MOVED)
-
     off = np.array([40.0, -30.0]) if second is None else second
     points1 = np.concatenate([points, other])
     points2 = np.concatenate([points + MOVED, other + MOVED + off])
-    alignment: Any = SimpleNamespace(cameras=[WIDE] * 2, used=np.array([True, used]), transfer=transfer)
-    matched: Any = _Matched(points1, points2)
-    pair = PairRegistration(0, 1, matched, _moving(0.0))
-    return find_second_motions(alignment, [pair], 3.0)
+    moved = np.eye(3)
+    moved[:2, 2] = -MOVED / WIDE.scale
+    given = registration(2, cameras=(WIDE,) * 2, used=np.array([True, used]), homographies=np.stack([np.eye(3), moved]))
+    pair = PairRegistration(0, 1, stored(points1, points2), _moving(0.0))
+    return find_second_motions(given.alignment, [pair], 3.0)
 
 
 def _grid(left: float, top: float, columns: int, rows: int, step: float = 50.0) -> FloatArray:

@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +28,7 @@ from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.second_motion import SecondMotion
 from rdstitch.verification.self_similarity import Ambiguity
 from tests.cli.running import flight
+from tests.registrations import registration
 
 THRESHOLD = 3.0
 
@@ -198,10 +197,8 @@ def test_only_pairs_without_which_the_images_fall_apart_decide() -> None:
 
 
 def test_of_doubtful_pairs_on_which_nothing_depends_the_images_are_named() -> None:
-    registration: Any = SimpleNamespace(sources=[SimpleNamespace(path=f"folder/{name}.jpg") for name in "abcd"])
-
     def said(*findings: Finding) -> list[Message]:
-        return messages_of(verdict._outvoted(findings), registration)
+        return messages_of(verdict._outvoted(findings), registration(4))
 
     (message,) = said(Finding(Kind.UNLIKE, (2, 3)), Finding(Kind.PAIR_MISFITS, (0, 2)))
     assert message.images == ("folder/a.jpg", "folder/c.jpg", "folder/d.jpg")

@@ -1,0 +1,65 @@
+"""Small real registrations: a row of images over a plane, aligned once, with what a test says of them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.arrays import FloatArray
+from rdstitch.choices import Purpose
+from rdstitch.features import Correspondences
+from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.source import Source
+from rdstitch.io.metadata import Metadata
+from rdstitch.matching.feature_store import StoredMatches
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.results.registration import Registration
+from rdstitch.verification.evidence import Evidence
+from tests.alignment_scenes import grid, scene
+
+CAMERA = Camera((400, 300))
+
+
+def source(name: str = "a.jpg", *, mask: Path | None = None, **metadata: Any) -> Source:
+    """An image in ``folder``, of which there is nothing but its name and what is said of it."""
+    return Source(Path("folder") / name, Metadata(CAMERA.image_size, **metadata), CAMERA, mask)
+
+
+def stored(points1: FloatArray, points2: FloatArray) -> StoredMatches:
+    """Matches of two images, the i-th features of each, as good as any other."""
+    indices = np.repeat(np.arange(len(points1))[:, None], 2, axis=1)
+    return StoredMatches.of(Correspondences(indices, points1, points2, np.full(len(points1), 0.5)))
+
+
+@cache
+def _aligned(count: int) -> Alignment:
+    rng = np.random.default_rng(0)
+    poses = grid(count, 1, (0.4, 0.3), 0.1, rng)
+    given = scene(poses, size=CAMERA.image_size, focal=380.0, per_link=60, outliers=0.0, rng=rng)
+    return align(given.cameras, given.links, AlignmentOptions(model="rigid", lens="division"))
+
+
+def registration(
+    images: int | Sequence[Source] = 3,
+    pairs: Sequence[PairRegistration] = (),
+    keypoints: Sequence[int] = (),
+    mixed: Any = None,
+    **alignment: Any,
+) -> Registration:
+    """Of so many images, called a.jpg and so on, or of these; what is said of the alignment replaces what was found."""
+    sources = [source(f"{name}.jpg") for name in "abcdef"[:images]] if isinstance(images, int) else images
+    found = replace(_aligned(max(2, len(sources))), **alignment)
+    return Registration(tuple(sources), tuple(keypoints), tuple(pairs), found, (), mixed=mixed)
+
+
+def evidence(
+    given: Registration, purpose: Purpose = Purpose.TRAJECTORY, threshold: float = 3.0, **known: Any
+) -> Evidence:
+    """Everything that rules look at; what is known is not computed."""
+    found = Evidence(given, threshold, purpose=purpose)
+    vars(found).update(known)
+    return found
