@@ -1,6 +1,6 @@
 """Which motion the images show: one posterior score for all hypotheses.
 
-The score is that of :mod:`rdstitch.robust.posterior`; a layout that no image could be drawn in has none.
+The score is that of :mod:`rdstitch.robust.posterior`; a layout that nobody would keep has none.
 
 A camera that stays where it is sees the same of a plane as of anything else: where a turn explains the images, models
 over a plane do so too, with more parameters, so that the turn is taken where it fits, and a plane where there is
@@ -32,9 +32,9 @@ _GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).resha
 _FRAMES = 12
 """Images that are tried as the frame of a plane without a metric."""
 
-_REFUSED = 100.0
-"""Ratio of areas from which on the compositor draws no image. A plane seen from above has up to 7, one seen under 35
-degrees 6 to 15, by the focal length; what is between a person judges by the seams."""
+_MAX_STRETCH = 10.0
+"""Ratio of areas from which on a layout is not believed. A plane seen from above has up to 7, one seen under 35 degrees
+6 to 15, by the focal length."""
 
 
 def stretch(fit: Fit) -> float:
@@ -96,8 +96,9 @@ class Hypothesis:
     """A fit with its posterior score."""
 
     fit: Fit
-    score: float  # -2 log of the posterior, up to a constant of the problem; inf where no image could be drawn so
+    score: float  # -2 log of the posterior, up to a constant of the problem; inf where nobody lays out images so
     field: float  # size of what the errors of neighbours share, pixels of a coordinate
+    errors: float = 0.0  # -2 log of the likelihood alone
 
 
 @dataclass(frozen=True)
@@ -130,14 +131,14 @@ class Posterior:
     def of(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
         errors = self.cost(fit.adjusted)
-        if self.purpose.picture and not stretch(fit) <= _REFUSED:
-            return Hypothesis(fit, math.inf, float(errors.field[0]))
+        if self.purpose.picture and not stretch(fit) <= _MAX_STRETCH:
+            return Hypothesis(fit, math.inf, float(errors.field[0]), float(errors.cost[0]))
         wide = 0.0
         if fit.tilt_spread > 0.0:
             wide = 4.0 * self.problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
         priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
         score = self.bound(fit.model, errors, fit.free_lens) + wide + priors
-        return Hypothesis(fit, score, float(errors.field[0]))
+        return Hypothesis(fit, score, float(errors.field[0]), float(errors.cost[0]))
 
     def bound(self, model: MotionModel, errors: ErrorCost, free_lens: BoolArray | None = None) -> float:
         """The score of a model that leaves such errors, of a camera that is as cameras are."""
@@ -195,7 +196,7 @@ def select_model(
 
 
 def best_of(problem: Problem, fits: Sequence[Fit], purpose: Purpose, *, requested: bool) -> ModelChoice | None:
-    """Take the best of some fits of the problem; None where no image could be drawn by any."""
+    """Take the best of some fits of the problem; None where nobody would keep the layout of any."""
     posterior = Posterior(problem, purpose)
     tried = [posterior.of(fit) for fit in fits]
     best = _best(posterior, tried)
@@ -208,7 +209,7 @@ def _with_wider_lenses(
     """Free more of the lens where that pays."""
     tried = list(tried)
     for lens in lenses:
-        order = sorted(range(len(tried)), key=lambda index: tried[index].score)[:2]
+        order = sorted(range(len(tried)), key=lambda index: _score(tried[index]))[:2]
         for index in sorted({0, *order}):
             fit = tried[index].fit
             wider = posterior.of(posterior.problem.extend(fit, lens | fit.free_lens))
@@ -222,8 +223,8 @@ def _with_wider_lenses(
 def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
     """The one with the best score; free homographies only of what one camera does not explain.
 
-    Where a plane explains the images that could not be drawn, free homographies are that plane again: a turn that seams
-    can hide the errors of is what a person would rather see.
+    Where a plane that nobody would lay out explains the images, free homographies are that plane again: a turn whose
+    errors seams can hide is what a person would rather see.
     """
     cameras = [one for one in tried if one.fit.model.one_camera] or tried
     best, evidence = min(cameras, key=_score), posterior.evidence
@@ -234,8 +235,8 @@ def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
     return min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
 
 
-def _score(one: Hypothesis) -> float:
-    return one.score
+def _score(one: Hypothesis) -> tuple[float, float]:
+    return one.score, one.errors
 
 
 def _is_beyond_one_camera(posterior: Posterior, best: Hypothesis, free: float) -> bool:

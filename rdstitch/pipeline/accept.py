@@ -55,8 +55,9 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
     current, findings = registration, checked(registration)
     first, first_findings = registration, findings
     if _fails(findings) and not options.force:
-        # What the matches hardly tell apart, the pixels do.
-        for other in chain([undamaged], _by_other_models(registration, aligner) if purpose.picture else ()):
+        # What the matches hardly tell apart, the pixels do; not the periods of a pattern.
+        unlike = purpose.picture and all(found.kind is Kind.UNLIKE for found in findings if found.fails)
+        for other in chain([undamaged], _by_other_models(registration, aligner) if unlike else ()):
             if other is not None and not _fails(judged := checked(other)):
                 current, findings = other, judged
                 break

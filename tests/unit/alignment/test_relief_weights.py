@@ -98,7 +98,7 @@ def test_the_displacements_go_with_their_observations() -> None:
 
 def test_nothing_is_the_best_of_layouts_that_nobody_would_keep() -> None:
     problem, fit = _fitted(_scene(0.0))
-    steep = replace(fit.adjusted.parameters, shared=SIMILARITY.shared_from_physical(np.array([1.45, 0.0, 0.3])))
+    steep = replace(fit.adjusted.parameters, shared=SIMILARITY.shared_from_physical(np.array([1.2, 0.0, 0.3])))
     leaning = replace(fit, adjusted=replace(fit.adjusted, parameters=steep))
     for fits, purpose, found in (
         ([leaning], Purpose.MOSAIC, False),
