@@ -117,6 +117,12 @@ class Kind(Enum):
         "",
         "{count} of {of} pairs fit as well elsewhere (a repeated pattern?)",
     )
+    LOOKED_AT = (
+        Scope.WHOLE,
+        "",
+        "of {of} overlaps {count} were compared in their pixels, {sampled} of them at random: at most {share:.1%} of "
+        "all are wrong, with a confidence of 95%",
+    )
     SETTLED_PATTERN = (
         Scope.WHOLE,
         "repeated-pattern",

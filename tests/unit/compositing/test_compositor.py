@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from examples.judging.comparison import sharpness
 from rdstitch.compositing import CompositeOptions, compose, compose_to_file, plan_canvas
-from rdstitch.compositing.composite_options import ExposureMethod
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.source_images import ImageLoader
 from rdstitch.compositing.survey import largest_rectangle
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import Metadata, read_image
+from rdstitch.options.composite_options import ExposureMethod
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import Scene, as_image, gradient, grey, inner, place_images, render
 from tests.sampled import sampled
