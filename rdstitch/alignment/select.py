@@ -96,9 +96,14 @@ class Hypothesis:
     """A fit with its posterior score."""
 
     fit: Fit
-    score: float  # -2 log of the posterior, up to a constant of the problem; inf where nobody lays out images so
+    score: float  # -2 log of the posterior, up to a constant of the problem
     field: float  # size of what the errors of neighbours share, pixels of a coordinate
-    errors: float = 0.0  # -2 log of the likelihood alone
+    stretch: float  # of its layout: the ratio of areas, inf where images are folded; 1 where it is not asked for
+
+    @property
+    def implausible(self) -> bool:
+        """Whether a turn is what a person would rather see."""
+        return not self.stretch <= _MAX_STRETCH
 
 
 @dataclass(frozen=True)
@@ -131,14 +136,13 @@ class Posterior:
     def of(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
         errors = self.cost(fit.adjusted)
-        if self.purpose.picture and not stretch(fit) <= _MAX_STRETCH:
-            return Hypothesis(fit, math.inf, float(errors.field[0]), float(errors.cost[0]))
+        layout = stretch(fit) if self.purpose.picture else 1.0
         wide = 0.0
         if fit.tilt_spread > 0.0:
             wide = 4.0 * self.problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
         priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
         score = self.bound(fit.model, errors, fit.free_lens) + wide + priors
-        return Hypothesis(fit, score, float(errors.field[0]), float(errors.cost[0]))
+        return Hypothesis(fit, score, float(errors.field[0]), layout)
 
     def bound(self, model: MotionModel, errors: ErrorCost, free_lens: BoolArray | None = None) -> float:
         """The score of a model that leaves such errors, of a camera that is as cameras are."""
@@ -150,7 +154,7 @@ class Posterior:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
         if not model.one_camera and not _is_beyond_one_camera(self, best, float(self.least.field[0])):
             return True
-        return best.score <= self.bound(model, self.least)
+        return not best.implausible and best.score <= self.bound(model, self.least)
 
 
 def select_model(
@@ -189,7 +193,8 @@ def select_model(
         planes = [one.fit for one in tried if not one.fit.model.on_sphere]
         tried.append(posterior.of(problem.fit(model, planes[-1:])))
     for bound, turn, shared in later:
-        if bound < min((one for one in tried if one.fit.model.one_camera), key=_score).score:
+        best = min((one for one in tried if one.fit.model.one_camera), key=_score)
+        if best.implausible or bound < best.score:
             tried.insert(0, posterior.of(problem.fit(turn, shared=shared)))
     tried = _with_wider_lenses(posterior, tried, lenses)
     return _choice(tried, _best(posterior, tried), requested=len(names) == 1)
@@ -199,8 +204,8 @@ def best_of(problem: Problem, fits: Sequence[Fit], purpose: Purpose, *, requeste
     """Take the best of some fits of the problem; None where nobody would keep the layout of any."""
     posterior = Posterior(problem, purpose)
     tried = [posterior.of(fit) for fit in fits]
-    best = _best(posterior, tried)
-    return _choice(tried, best, requested=requested) if math.isfinite(best.score) else None
+    tried = [one for one in tried if not one.implausible]
+    return _choice(tried, _best(posterior, tried), requested=requested) if tried else None
 
 
 def _with_wider_lenses(
@@ -209,7 +214,7 @@ def _with_wider_lenses(
     """Free more of the lens where that pays."""
     tried = list(tried)
     for lens in lenses:
-        order = sorted(range(len(tried)), key=lambda index: _score(tried[index]))[:2]
+        order = sorted(range(len(tried)), key=lambda index: tried[index].score)[:2]
         for index in sorted({0, *order}):
             fit = tried[index].fit
             wider = posterior.of(posterior.problem.extend(fit, lens | fit.free_lens))
@@ -223,25 +228,28 @@ def _with_wider_lenses(
 def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
     """The one with the best score; free homographies only of what one camera does not explain.
 
-    Where a plane that nobody would lay out explains the images, free homographies are that plane again: a turn whose
-    errors seams can hide is what a person would rather see.
+    Where a plane that nobody would lay out explains the images, so do free homographies: a turn whose errors seams can
+    hide is taken instead.
     """
     cameras = [one for one in tried if one.fit.model.one_camera] or tried
     best, evidence = min(cameras, key=_score), posterior.evidence
-    tolerable = math.hypot(_TOLERABLE * float(evidence.farthest[0]), float(evidence.noise[0]))
-    if best.fit.model.on_sphere and best.field < tolerable and any(math.isinf(one.score) for one in cameras):
-        return best
+    if best.implausible:
+        tolerable = math.hypot(_TOLERABLE * float(evidence.farthest[0]), float(evidence.noise[0]))
+        kept = [one for one in tried if one.field < tolerable and not one.implausible]
+        kept = [one for one in kept if one.fit.model.on_sphere] or (kept if math.isinf(best.stretch) else [])
+        if kept:
+            return min(kept, key=_score)
     free = [one for one in tried if not one.fit.model.one_camera]
     return min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
 
 
-def _score(one: Hypothesis) -> tuple[float, float]:
-    return one.score, one.errors
+def _score(one: Hypothesis) -> float:
+    return one.score
 
 
 def _is_beyond_one_camera(posterior: Posterior, best: Hypothesis, free: float) -> bool:
     """Whether free homographies with such a field compete; two images need no more than one."""
-    return posterior.problem.count == 2 or math.isinf(best.score) or best.field > _MIN_RATIO * free
+    return posterior.problem.count == 2 or best.implausible or best.field > _MIN_RATIO * free
 
 
 def parameter_count(problem: Problem, model: MotionModel, free_lens: BoolArray) -> int:
@@ -255,7 +263,7 @@ def _choice(tried: Sequence[Hypothesis], best: Hypothesis, *, requested: bool) -
         return ModelChoice(best.fit, "; as requested")
     listed = [
         f"{one.fit.model.name} {one.fit.adjusted.sigma:.2f} pixels"
-        + (", an impossible layout" if math.isinf(one.score) else f", {one.score - best.score:+.0f}")
+        + (", an impossible layout" if one.implausible else f", {one.score - best.score:+.0f}")
         for one in tried
         if one is not best
     ]

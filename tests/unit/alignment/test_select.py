@@ -126,15 +126,16 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
 
 
 @pytest.mark.parametrize(
-    ("plane", "turn", "chosen"),
+    ("stretch", "turn", "chosen"),
     [
-        (math.inf, 1.1, "rotation"),  # what seams hide
+        (20.0, 1.1, "rotation"),  # what seams hide
+        (20.0, 1.5, "homography"),
         (math.inf, 1.5, "homography"),
-        (40.0, 1.1, "homography"),
+        (7.0, 1.1, "homography"),
     ],
 )
-def test_instead_of_an_impossible_plane_a_turn_may_leave_what_seams_hide_and_the_noise(
-    plane: float, turn: float, chosen: str
+def test_instead_of_an_implausible_plane_a_turn_may_leave_what_seams_hide_and_the_noise(
+    stretch: float, turn: float, chosen: str
 ) -> None:
     problem: Any = SimpleNamespace(count=3)
     posterior = Posterior(problem)
@@ -143,9 +144,9 @@ def test_instead_of_an_impossible_plane_a_turn_may_leave_what_seams_hide_and_the
 
     def hypothesis(model: MotionModel, score: float, field: float) -> Hypothesis:
         fit: Any = SimpleNamespace(model=model)
-        return Hypothesis(fit, score, field)
+        return Hypothesis(fit, score, field, stretch if model is RIGID else 1.0)
 
-    tried = [hypothesis(ROTATION, 60.0, turn), hypothesis(RIGID, plane, 0.9), hypothesis(HOMOGRAPHY, 0.0, 0.2)]
+    tried = [hypothesis(ROTATION, 60.0, turn), hypothesis(RIGID, 0.0, 0.9), hypothesis(HOMOGRAPHY, -30.0, 0.2)]
     assert _best(posterior, tried).fit.model.name == chosen
 
 
