@@ -37,12 +37,7 @@ Offenders = Mapping[tuple[int, ...], Message]
 def accept(registration: Registration, options: StitchOptions, purpose: Purpose = Purpose.MOSAIC) -> Registration:
     """The registration of what passes all checks, with everything that the user should know of it.
 
-    Parameters
-    ----------
-    registration : Registration
-        In pixels of the working size, as the result.
-    purpose : str
-        As for :func:`rdstitch.pipeline.register.register`.
+    The registration comes and goes in pixels of the working size.
     """
     aligner = aligner_of(registration, options, purpose)
     undamaged = None if options.force else _without_damage(registration, aligner)
@@ -201,7 +196,7 @@ def _worst(registration: Registration, findings: Iterable[Finding]) -> Offenders
 
 
 def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
-    """Share of the matches of each image that agree with the whole, shape (N,); 1 without any."""
+    """Share of the matches of each image that agree with the alignment of all, shape (N,); 1 without any."""
     given, kept = np.zeros(count), np.zeros(count)
     for fit in links:
         given[[fit.image1, fit.image2]] += fit.count

@@ -58,8 +58,10 @@ class BandLens:
     @property
     def message(self) -> Message:
         """What the user should know of it."""
-        text = f"{self.shift:.1f} pixels from what was registered in the median: the lens of this band was registered"
-        return Message(f"{text}, to {self.error:.1f} pixels", severity="note", code="band-lens")
+        text = (
+            f"{self.shift:.1f} pixels (median) from the registered band, {self.error:.1f} with its lens registered too"
+        )
+        return Message(text, severity="note", code="band-lens")
 
 
 def band_lens(
@@ -67,12 +69,8 @@ def band_lens(
 ) -> tuple[BandLens | None, list[Message]]:
     """The lens of a band from registered images and those that take their place, by numbers; None where it is the same.
 
-    Where the images show nothing in common, as masks do, nothing is known, and nothing changed.
-
-    Raises
-    ------
-    InputError
-        When images were evidently not taken from the same places.
+    Where the images show nothing in common, as masks do, nothing is known, and nothing changed. Raises InputError where
+    images were evidently not taken from the same places.
     """
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_IMAGES)).astype(np.intp)).tolist()
     compared = [list(pairs.values())[k] for k in chosen]

@@ -27,12 +27,7 @@ _LEVEL = 1e-9  # rounding of what a turn within the plane leaves as it is
 def write_map(result: StitchResult, folder: str | Path, height: float, *, overwrite: bool = False) -> list[Path]:
     """Write ``map.yaml`` and ``map.png`` of a mosaic that was written, in metres by the height of the first image.
 
-    Raises
-    ------
-    ArgumentError
-        When the images have no metric poses.
-    OutputError
-        When a file exists, unless ``overwrite``, or cannot be written.
+    Raises ArgumentError where the images have no metric poses.
     """
     files = map_files(Path(folder), overwrite=overwrite)
     to_metres = _pixel_to_metres(result, height)

@@ -48,13 +48,6 @@ def register(
     Once there are poses, images that these put beside each other are tried too (loop closures), and every pair of an
     image that found no place. Where the images come from two lenses, those of one are aligned. All pixels in the
     result are those of the size that features are detected at, see :mod:`rdstitch.pipeline.working_size`.
-
-    Parameters
-    ----------
-    executor : concurrent.futures.Executor
-        Where features are detected and pairs are registered; see :func:`rdstitch.executors.open_executor`.
-    purpose : str
-        See :data:`rdstitch.choices.Purpose`.
     """
     options = options.for_images(len(sources))
     cache = Cache.at(options.cache)
@@ -116,13 +109,8 @@ def register(
 def with_frontal_reference(registration: Registration, options: StitchOptions, *, always: bool) -> Registration:
     """The same registration with an undistorted image as its plane; directions of a turn on the spot stay.
 
-    That is the reference image, unless another one crosses its horizon and nobody named it: then one that, if
-    possible, no image crosses the horizon of.
-
-    Parameters
-    ----------
-    always : bool
-        Whether a rectified plane, that of one camera's poses, gives way too.
+    That is the reference image, unless another one crosses its horizon and nobody named it: then one that, if possible,
+    no image crosses the horizon of. With ``always`` a rectified plane, that of one camera's poses, gives way too.
     """
     alignment = registration.alignment
     if alignment.on_sphere or (not always and alignment.poses is not None):

@@ -120,14 +120,9 @@ _LEVEL = 1e-9  # rounding of what a turn within the plane leaves as it is
 def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float = 1.0) -> str:
     """The table that ``rdstitch trajectory`` writes, of a mosaic; with covariances where ``options`` asked for them.
 
-    Parameters
-    ----------
-    frame : str
-        "enu", "ros" or "camera", see :mod:`rdstitch.export.trajectory_files`; "map": easting, northing and the height
-        above the ground in metres, with yaw zero where the top of an image is north. The
-        covariances are then relative to the reference image; how well that is placed, the georeference says.
-    height : float
-        Of the first image, in the unit that positions shall have; not for "map".
+    ``height`` is that of the first image, in the unit that positions shall have. In the frame "map" they are
+    easting, northing and the height above the ground in metres, with yaw zero where the top of an image is north,
+    and covariances relative to the reference image; how well that is placed, the georeference says.
     """
     registration = result.registration
     path = Trajectory.from_alignment(registration.alignment, height)
