@@ -95,7 +95,7 @@ class Aligner:
         sources: Sequence[Source],
         options: StitchOptions,
         cache: Cache,
-        purpose: Purpose = "mosaic",
+        purpose: Purpose = Purpose.MOSAIC,
     ) -> Self:
         """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`."""
         paths = tuple(str(source.path) for source in sources)

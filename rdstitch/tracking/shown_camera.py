@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.alignment.priors import WRONG_GIVEN_FOCAL
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.inputs.sensor_streams import DELAY_STD, at_delay, smooth
+from rdstitch.robust.posterior import WRONG_GIVEN_FOCAL
 
 _POINTS = 32  # of a pair
 _TILT_STARTS = (0.0, 0.0), (0.35, 0.0), (-0.35, 0.0), (0.0, 0.35), (0.0, -0.35)

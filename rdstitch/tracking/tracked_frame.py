@@ -13,6 +13,7 @@ from rdstitch.features.corner_flow import corners_of
 from rdstitch.features.prepared_image import PreparedImage
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane
+from rdstitch.inputs.sensor_streams import BodyPose
 from rdstitch.tracking.placement import CameraPose, Placement
 
 MIN_INLIERS = 15
@@ -39,6 +40,9 @@ class Tracked:
     # what all lengths share. None where there is no metric pose
     covariance: FloatArray | None = field(default=None, repr=False, compare=False)
     length_std: float = math.nan  # relative standard deviation that all lengths share
+    # unit, unit_std: the height of the first keyframe by odometry, and its relative standard deviation
+    unit: float = math.nan
+    unit_std: float = math.nan
     reason: str = ""  # why there is no place; empty where there is one
 
     @property
@@ -56,6 +60,7 @@ class TrackedFrame:
     image: PreparedImage
     detect: Callable[[PreparedImage], Features]
     attitude: FloatArray | None = None  # (S, 2): (ψ, θ) as measured at DELAYS, radians
+    body: BodyPose | None = None  # by odometry
     place: Placement | None = None  # relative to the other keyframes, from the first one on
     aligned: bool = False  # whether that is on the plane of the map
     covariance: FloatArray | None = None
@@ -73,6 +78,12 @@ class TrackedFrame:
         """Features, by which it is matched where one does not."""
         features = self.detect(self.image)
         return features.take(np.flatnonzero(~self.static(features.points)))
+
+    @property
+    def seen_from(self) -> tuple[complex, float, BodyPose | None] | None:
+        """Place of the camera on the map, x to the right and y to the top, and its yaw, with the body's pose."""
+        pose = self.place.pose if self.aligned and self.place is not None else None
+        return None if pose is None else (complex(pose.x, -pose.y), pose.yaw, self.body)
 
     @property
     def textured(self) -> bool:

@@ -1,5 +1,6 @@
 """The tracker: a frame comes in, its place on the plane comes out."""
 
+import cmath
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -12,13 +13,14 @@ from importlib import import_module
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.alignment.odometry import OdometryFit, motions_of
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Features, Matcher
 from rdstitch.features.corner_flow import CornerFlow, matched_corners
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.sensor_streams import DELAY_STD, at_delay, change_with_delay
+from rdstitch.inputs.sensor_streams import DELAY_STD, BodyPose, at_delay, change_with_delay, motion_between
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
@@ -54,6 +56,7 @@ _MAX_LOST_FRAMES = 10  # frames in a row without a place, after which a new map 
 _SAME_LENGTHS = 0.1  # of their standard deviation: change of all lengths that leaves the places of earlier frames
 _REVISED = 500  # frames between keyframes, whose places are revised with those of the keyframes
 _MATCHES = 80  # of a link, that the alignment uses
+_MOUNTED = 60  # keyframes by which it is found how the camera is mounted on the body whose odometry is known
 _NO_IMAGE = prepare(View(np.zeros((1, 1), np.uint8)), None)  # of frames that are not looked at again
 _ROUGH = 0.02  # sides: how far a corner may be off from frame to frame, or while the lens is not known
 
@@ -106,6 +109,7 @@ class Tracker:
                 import_module(name)
         self._count, self._map_number, self._lost = 0, 0, 0
         self._flow = CornerFlow()
+        self._mounted: OdometryFit | None = None  # how the camera is on the body, in units of the map
         self._model = options.alignment.model
         self._distortion = options.pair.distortion
         self._std = 0.0 if self.distortion_known else math.inf
@@ -134,7 +138,13 @@ class Tracker:
         """Numbers of the frames that may still find their place, or another one."""
         return {frame.number for frame, *_ in self._between} | set(self._map.by_number)
 
-    def add(self, image: PreparedImage, camera: Camera, attitude: FloatArray | None = None) -> list[Tracked]:
+    def add(
+        self,
+        image: PreparedImage,
+        camera: Camera,
+        attitude: FloatArray | None = None,
+        body: BodyPose | None = None,
+    ) -> list[Tracked]:
         """Register the next frame; it comes last, after those before it whose place is new.
 
         Parameters
@@ -144,13 +154,17 @@ class Tracker:
             Of the size of ``image``.
         attitude : ndarray of shape (S, 2), optional
             (ψ, θ), radians, as it was measured at :data:`rdstitch.inputs.sensor_streams.DELAYS`.
+        body : BodyPose, optional
+            By odometry.
         """
         number, self._count = self._count, self._count + 1
-        frame = TrackedFrame(number, camera, image, self._detect, attitude, static=self._flow.is_static)
+        frame = TrackedFrame(number, camera, image, self._detect, attitude, body, static=self._flow.is_static)
         if not self._map.keyframes:
             return [self._first(frame)]
         revised = [] if self._options.patient else self._take_over(_PATIENCE if self.waits else 0.0)
         results = [*revised, *self._registered_frame(frame)]
+        if results[-1].pose is not None and body is not None:
+            self._last = frame
         if not results[-1].keyframe:
             frame.image = _NO_IMAGE
         return results
@@ -169,6 +183,8 @@ class Tracker:
             self._lost = 0
             return [*self._confirmed(frame), self._tracked(frame, keyframe=False, inliers=inliers)]
         links = self._links(frame)
+        if not links and self._placed_by_odometry(frame):
+            return self._registered_by_odometry(frame)
         if not links:
             return [self._without_place(frame)]
         self._lost = 0
@@ -194,6 +210,7 @@ class Tracker:
         self._alignment: tuple[list[TrackedFrame], Future[Alignment], bool] | None = None
         self._taken_over_at = 0  # keyframes seen from which on it is
         self._mapped = False  # whether there is a plane that keyframes lie on
+        self._last: TrackedFrame | None = None  # that had a place and odometry
 
     def _first(self, frame: TrackedFrame) -> Tracked:
         """The first keyframe of a map."""
@@ -297,6 +314,34 @@ class Tracker:
             frame.covariance = chained(other.covariance, step, (at.x - was.x, at.y - was.y), was.height)
         return inliers
 
+    def _placed_by_odometry(self, frame: TrackedFrame) -> bool:
+        """Place a frame that shows no keyframe by what the wheels say of the way from the last one that had a place."""
+        last, fit = self._last, self._mounted
+        if last is None or fit is None or frame.body is None or last.body is None or self._plane is None:
+            return False
+        was = last.place.pose if last.place is not None and last.aligned else None
+        if was is None or last.place is None or last.covariance is None:
+            return False
+        step = motion_between(last.body, frame.body)
+        moved = cmath.exp(1j * was.yaw) * fit.camera_motion(step.moved, step.turn)
+        place, yaw = complex(was.x, was.y) + moved.conjugate(), was.yaw + step.turn
+        below = self._plane.below(last.place.camera, self._attitude(frame))
+        frame.place = PlaneSimilarity(was.height * cmath.exp(-1j * yaw), place).applied(below)
+        spread = fit.noise**2 * np.array([step.variance / abs(fit.scale) ** 2] * 2 + [0.0, step.turn_variance])
+        offset = moved.real, -moved.imag
+        frame.covariance, frame.aligned = chained(last.covariance, np.diag(spread), offset, was.height), True
+        frame.quality = 0.0
+        return True
+
+    def _registered_by_odometry(self, frame: TrackedFrame) -> list[Tracked]:
+        """Such a frame as the next keyframe, where it shows anything new."""
+        keyframe, revised = frame.textured and self._shown_by_last(frame) < _KEYFRAME_OVERLAP, list[Tracked]()
+        if keyframe:
+            self._lost = 0
+            self._flow.begin(frame.image, frame.corners)
+            revised = self._add_keyframe(frame, [])
+        return [*revised, self._tracked(frame, keyframe=keyframe, inliers=0)]
+
     def _without_place(self, frame: TrackedFrame) -> Tracked:
         """A frame that no keyframe shows; after many of them, a new map begins with the last."""
         self._lost += 1
@@ -351,6 +396,10 @@ class Tracker:
             consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
             self._distortion, self._std = consensus.distortion, consensus.std
         revised = self._check_camera(frame)
+        if frame.body is not None:
+            keyframes = sorted(self._map.by_number.values(), key=lambda keyframe: keyframe.number)[-_MOUNTED:]
+            known = [seen for keyframe in keyframes if (seen := keyframe.seen_from) is not None]
+            self._mounted = OdometryFit.of(motions_of(known)) or self._mounted
         if self._options.patient and seen >= self._taken_over_at:
             revised += self._take_over(None)
         if seen + 1 >= self._next_alignment and self._alignment is None:
@@ -613,6 +662,8 @@ class Tracker:
             quality=frame.quality,
             covariance=None if placement is None or placement.pose is None else self._covariance(frame, placement.pose),
             length_std=self._length_std,
+            unit=math.nan if self._mounted is None else abs(self._mounted.scale),
+            unit_std=math.nan if self._mounted is None else self._mounted.relative_std,
             reason=reason,
         )
 
