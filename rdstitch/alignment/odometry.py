@@ -121,22 +121,14 @@ def bridged(path: Trajectory, bodies: Mapping[int, BodyPose], fit: OdometryFit) 
     rows = {n: (places[k], path.yaw[k], path.height[k], covariances[k]) for n, k in known.items()}
     seen = sorted(known.keys() & bodies.keys())
     for number in bodies.keys() - known.keys():
-        ends = [
-            n
-            for n in (
-                max((n for n in seen if n < number), default=None),
-                min((n for n in seen if n > number), default=None),
-            )
-            if n is not None
-        ]
+        ends = [*[n for n in seen if n < number][-1:], *[n for n in seen if n > number][:1]]
         guesses = []
         for end in ends:
             k, step = known[end], motion_between(bodies[end], bodies[number])
             place = places[k] + cmath.exp(1j * path.yaw[k]) * fit.camera_motion(step.moved, step.turn)
-            spread = fit.noise**2 * (step.variance + step.turn_variance * abs(step.moved) ** 2)
-            guesses.append(
-                (place, path.yaw[k] + step.turn, path.height[k], spread, fit.noise**2 * step.turn_variance, k)
-            )
+            turned = fit.noise**2 * step.turn_variance
+            spread = fit.noise**2 * step.variance + turned * abs(step.moved) ** 2
+            guesses.append((place, path.yaw[k] + step.turn, path.height[k], spread, turned, k))
         if not guesses:
             continue
         weights = np.array([1.0 / max(guess[3], 1e-12) for guess in guesses])

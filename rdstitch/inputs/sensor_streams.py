@@ -40,7 +40,7 @@ _TIME = "timestamp time stamp"
 _TILT_COLUMNS = {"name": _NAMES, "timestamp": _TIME} | {name: name for name in ("psi", "theta", "qx", "qy", "qz", "qw")}
 _TIME_COLUMNS = {"name": _NAMES, "timestamp": _TIME}
 _ODOMETRY_COLUMNS = {"timestamp": _TIME} | {
-    name: name
+    name: name.replace("_", "")
     for name in ("x", "y", "yaw", "yaw_deg", "qx", "qy", "qz", "qw", "cov_x_x", "cov_y_y", "cov_yaw_deg_yaw_deg")
 }
 _SLIP, _STANDING = (

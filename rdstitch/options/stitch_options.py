@@ -100,8 +100,8 @@ class StitchOptions:
     odometry: Annotated[
         "Odometry | str | Path | None",
         Option(
-            "Wheel odometry, by time: TUM's lines, CSV timestamp,x,y,yaw_deg, or a topic of the bag. It gives the unit of "
-            "positions, and poses of frames without texture.",
+            "Wheel odometry, by time: TUM's lines, CSV timestamp,x,y,yaw_deg, or a topic of the bag. It gives the unit "
+            "of positions, and poses of frames without texture.",
             "FILE|TOPIC",
             entered=str | None,
         ),

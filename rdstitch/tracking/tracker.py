@@ -109,6 +109,7 @@ class Tracker:
                 import_module(name)
         self._count, self._map_number, self._lost = 0, 0, 0
         self._flow = CornerFlow()
+        self._latest_placed: TrackedFrame | None = None  # of those with odometry
         self._mounted: OdometryFit | None = None  # how the camera is on the body, in units of the map
         self._model = options.alignment.model
         self._distortion = options.pair.distortion
@@ -164,7 +165,7 @@ class Tracker:
         revised = [] if self._options.patient else self._take_over(_PATIENCE if self.waits else 0.0)
         results = [*revised, *self._registered_frame(frame)]
         if results[-1].pose is not None and body is not None:
-            self._last = frame
+            self._latest_placed = frame
         if not results[-1].keyframe:
             frame.image = _NO_IMAGE
         return results
@@ -210,7 +211,7 @@ class Tracker:
         self._alignment: tuple[list[TrackedFrame], Future[Alignment], bool] | None = None
         self._taken_over_at = 0  # keyframes seen from which on it is
         self._mapped = False  # whether there is a plane that keyframes lie on
-        self._last: TrackedFrame | None = None  # that had a place and odometry
+        self._latest_placed = None
 
     def _first(self, frame: TrackedFrame) -> Tracked:
         """The first keyframe of a map."""
@@ -316,7 +317,7 @@ class Tracker:
 
     def _placed_by_odometry(self, frame: TrackedFrame) -> bool:
         """Place a frame that shows no keyframe by what the wheels say of the way from the last one that had a place."""
-        last, fit = self._last, self._mounted
+        last, fit = self._latest_placed, self._mounted
         if last is None or fit is None or frame.body is None or last.body is None or self._plane is None:
             return False
         was = last.place.pose if last.place is not None and last.aligned else None
@@ -398,7 +399,7 @@ class Tracker:
         revised = self._check_camera(frame)
         if frame.body is not None:
             keyframes = sorted(self._map.by_number.values(), key=lambda keyframe: keyframe.number)[-_MOUNTED:]
-            known = [seen for keyframe in keyframes if (seen := keyframe.seen_from) is not None]
+            known = [at for keyframe in keyframes if (at := keyframe.seen_from) is not None]
             self._mounted = OdometryFit.of(motions_of(known)) or self._mounted
         if self._options.patient and seen >= self._taken_over_at:
             revised += self._take_over(None)
