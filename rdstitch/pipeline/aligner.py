@@ -95,7 +95,7 @@ class Aligner:
         sources: Sequence[Source],
         options: StitchOptions,
         cache: Cache,
-        purpose: Purpose = "mosaic",
+        purpose: Purpose = Purpose.MOSAIC,
     ) -> Self:
         """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`."""
         paths = tuple(str(source.path) for source in sources)
@@ -245,17 +245,8 @@ def reselect_inliers(
 ) -> dict[int, PairRegistration]:
     """Select the inliers of the pairs again, by what an alignment expects of their putative matches.
 
-    Parameters
-    ----------
-    alignment : Alignment
-        Of these pairs.
-    threshold : float
-        Distance up to which a match can be an inlier, pixels; it is less where the inliers scatter less.
-
-    Returns
-    -------
-    dict of int to PairRegistration
-        The pairs that the alignment uses and fits, with their inliers, by their position in ``pairs``.
+    An inlier is within ``threshold``, pixels, or less where the inliers scatter less. Given are the pairs that the
+    alignment uses and fits, by their position in ``pairs``.
     """
     errors = {k: pair.errors(alignment.transfer) for k, pair in enumerate(pairs) if pair.images in alignment.support}
     known = [errors[k][pairs[k].relation.inliers] for k in errors]

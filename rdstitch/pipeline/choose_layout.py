@@ -87,12 +87,7 @@ def lay_out(registration: Registration, local: LocalAlignment, options: Composit
 def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner, *, pano: bool) -> LaidOut:
     """The layout whose seams hold, or break the least.
 
-    Parameters
-    ----------
-    registration : Registration
-        In pixels of the working size.
-    pano : bool
-        Whether the output is always in the frame of an image.
+    Pixels are those of the working size; with ``pano`` the output is always in the frame of an image.
     """
 
     def laid(candidate: Registration, local: LocalAlignment | None = None) -> LaidOut:

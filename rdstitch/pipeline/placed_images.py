@@ -35,12 +35,7 @@ _COMPARED, _COMPARED_SIDE = 8, 400
 def align_registration_locally(registration: Registration, choice: LocalAlignmentMode) -> LocalAlignment:
     """Displacement fields of the images that are used, in their order, from the matches of all their pairs.
 
-    Parameters
-    ----------
-    registration : Registration
-        In pixels of the images.
-    choice : "auto", "off" or int
-        See :func:`rdstitch.local_alignment.align_locally`.
+    The registration is in pixels of the images.
     """
     if choice == "off":
         return no_local_alignment("switched off")
