@@ -26,7 +26,7 @@ from rdstitch.report.page import seam_dots
 from rdstitch.report.pairs import matched
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.verification.findings import Finding
+from rdstitch.verification.findings import Finding, Kind
 from tests.cli.running import CACHED, OPTIONS, Run
 
 _VOID = {"meta", "img"}
@@ -149,7 +149,7 @@ def test_what_is_refused_is_shown(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, output: str
 ) -> None:
     said = [Message("the images <disagree>", severity="failure"), Message("look at that seam")]
-    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: (Finding("errors"),))
+    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: (Finding(Kind.ERRORS),))
     monkeypatch.setattr(accept, "messages_of", lambda *arguments: said)
     report = tmp_path / "report.html"
     arguments = (command, *frames[:2], "-o", tmp_path / output, "--report", report, *CACHED)
