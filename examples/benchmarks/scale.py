@@ -116,7 +116,7 @@ def aligned_by_drawn(
     frames = [Frame(Path(f"frame_{k:05d}.jpg"), load=_no_pixels, metadata=metadata) for k in range(count)]
     sources = read_sources(frames, skip_bad=False)[0]
     options = options.for_images(count)
-    aligner = Aligner.of(sources, options, Cache(), "mosaic")
+    aligner = Aligner.of(sources, options, Cache())
     aligned = aligner.draft(pairs)
     note("draft", 1, 1)
     aligned = close_loops(aligner, cast(Pairing, matches), aligned, matches.pairs)
