@@ -28,7 +28,7 @@ from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
 from rdstitch.alignment.uncertainty import covariances, weigh_lens
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import LENS_STD, Camera
 from rdstitch.geometry.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
 from rdstitch.geometry.radial_homography import RadialHomography
@@ -95,7 +95,7 @@ class AlignmentTask:
     @cached_property
     def result(self) -> Alignment:
         """Adjusted to all matches."""
-        return build_alignment(_checked_focal(_adjusted(self._chosen)))
+        return build_alignment(_checked_focal(_adjusted(self._chosen), self.options))
 
     @cached_property
     def _chosen(self) -> AdjustedImages:
@@ -214,21 +214,23 @@ def from_another_start(problem: Problem, fit: Fit) -> Fit:
     return min((fit, problem.fit(fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
 
 
-def _checked_focal(told: AdjustedImages) -> AdjustedImages:
+def _checked_focal(told: AdjustedImages, given: AlignmentOptions) -> AdjustedImages:
     """Without the focal length that was given, where it gave way and the images by themselves show another one."""
     if told.covariance is None or not is_strained(told.whole.camera_priors, told.choice.fit):
         return told
     cameras = [replace(camera, focal=None, focal_std=None, focal_source=None).with_focal() for camera in told.cameras]
     # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
     options = told.options if told.options.attitudes is not None else replace(told.options, tilt=None)
-    shown = _adjusted(_chosen(cameras, told.links, options))
-    camera = told.cameras[shown.images[0]]
-    doubt = check_focal(camera, shown.choice.fit, shown.covariance)
-    if doubt is None:
-        return told
-    if options != told.options:
-        shown = _adjusted(_chosen(cameras, told.links, told.options))
-    return replace(shown, messages=(*told.messages, *shown.messages, doubt))
+    try:
+        shown = _adjusted(_chosen(cameras, told.links, options))
+        doubt = check_focal(told.cameras[shown.images[0]], shown.choice.fit, shown.covariance)
+        if doubt is None:
+            return told
+        if options != given:  # what seemed to be wrong may have been so with the wrong focal length only
+            shown = _adjusted(_chosen(cameras, told.links, given))
+    except (RegistrationError, ImpossibleCameraError, np.linalg.LinAlgError):
+        return told  # by themselves the images determine nothing
+    return replace(shown, messages=(*shown.messages, doubt))
 
 
 def most_matches_read(links: int, options: AlignmentOptions) -> int | None:

@@ -15,14 +15,29 @@ from rdstitch.export.trajectory_files import (
     positions_in_frame,
     ros_covariance,
 )
+from rdstitch.system.outputs import TemporaryFolder, naming
 
 
-def check_bag(file: str | Path) -> None:
-    """Refuse a bag before long work where the package that writes it is missing."""
+def check_bag(file: Path, *, overwrite: bool) -> None:
+    """Refuse a bag before long work where what writes it is missing, or a folder is there that is no bag."""
     try:
         import rosbags.rosbag1  # noqa: F401
     except ImportError:
         raise OutputError(f'{file}: writing ROS bags needs the extra ros: pip install "rdstitch[ros]"') from None
+    if file.is_dir() and overwrite:
+        others = [item.name for item in file.iterdir() if item.suffix not in (".mcap", ".db3", ".yaml")]
+        if others or not (file / "metadata.yaml").is_file():
+            raise OutputError(f"{file}: is a folder that is no ROS bag; choose another name")
+
+
+def write_bag_folder(path: Trajectory, folder: Path, frame: TrajectoryFrame) -> None:
+    """Write the bag of ROS 2, whole or not at all, in the place of an older one."""
+    with naming(folder), TemporaryFolder(folder.parent, ".rdstitch-") as aside:
+        (aside / "new").mkdir()
+        write_bag(path, aside / "new" / folder.name, frame)
+        if folder.exists():
+            folder.rename(aside / "old")
+        (aside / "new" / folder.name).rename(folder)
 
 
 def write_bag(path: Trajectory, file: Path, frame: TrajectoryFrame) -> None:

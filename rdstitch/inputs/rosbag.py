@@ -96,17 +96,16 @@ def images_in_bag(path: Path, folder: Path, every: int, topic: str | None = None
 def camera_in_bag(path: Path, topic: str | None = None) -> "tuple[CameraFile, str] | None":
     """The calibration that the bag has for a topic of images, and its own topic; None where it has none.
 
-    That is the one beside the images, ``/camera/camera_info`` for ``/camera/image_raw``, or else the only one. Of
-    images that are rectified already (``image_rect``) it is that of the rectified camera.
+    That is the one beside the images, ``/camera/camera_info`` for ``/camera/image_raw``. Of images that are rectified
+    already (``image_rect``) it is that of the rectified camera.
     """
     from rdstitch.camera_files import camera_of_content
 
     with opened_bag(path) as reader:
-        connections = [c for c in reader.connections if c.msgtype == _CAMERA_INFO]
         images = _chosen_topic(path, _image_topics(reader), topic)
-        beside = f"{images.rpartition('/image')[0]}/camera_info"
-        chosen = [c for c in connections if c.topic == beside] or connections
-        for connection, _, data in reader.messages(connections=chosen) if len(chosen) == 1 else ():
+        beside = f"{images.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+        chosen = [c for c in reader.connections if c.msgtype == _CAMERA_INFO and c.topic == beside]
+        for connection, _, data in reader.messages(connections=chosen) if chosen else ():
             message = reader.deserialize(data, connection.msgtype)
             values = {name: getattr(message, name, getattr(message, name.upper(), None)) for name in "dkp"}
             k, d, p = (np.asarray(values[name], dtype=np.float64).ravel() for name in "kdp")

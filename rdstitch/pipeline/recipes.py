@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from rdstitch.alignment.frames import stored, turned_alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import Purpose
 from rdstitch.errors import OutputError, RdstitchError, RegistrationError
-from rdstitch.export.odometry_bag import check_bag, write_bag
+from rdstitch.export.odometry_bag import check_bag, write_bag, write_bag_folder
 from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
 from rdstitch.geometry.exif_orientation import quarter_turn
 from rdstitch.inputs.find import FoundImages, found_images
@@ -34,7 +34,7 @@ from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.write import sidecar
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import Outputs, TemporaryFolder, check_outputs, json_bytes, text_bytes
+from rdstitch.system.outputs import Outputs, TemporaryFolder, check_not_read, check_outputs, json_bytes, text_bytes
 from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.verdict import RefusedError
 
@@ -367,13 +367,16 @@ def trajectory(
     """
     options = replace(options or StitchOptions(), pose_covariance=True)
     options = options if timestamps is None else replace(options, timestamps=timestamps)
+    replaced: list[Path] = []  # a bag that is a folder
     if layout == "bag" and output is not None:
-        check_bag(output)
+        check_bag(Path(output), overwrite=options.overwrite)
+        replaced = [Path(output)] if Path(output).is_dir() and options.overwrite else []
     given = as_inputs(inputs, options.channel_order)
     options, notes = with_camera_in_bag(given, options)
     with found_images(given, every=every, topic=options.topic) as listed:
         files = [Path(file) for file in (output, plot) if file is not None]
-        check_outputs(files, options.overwrite, [*listed.files, *options.files])
+        check_outputs([f for f in files if f not in replaced], options.overwrite, [*listed.files, *options.files])
+        check_not_read(replaced, [Path(name) for name in given if not isinstance(name, Frame)])
         # Numbered as they were named: what is left out leaves a gap.
         frames = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
         sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
@@ -391,10 +394,11 @@ def trajectory(
         registration = registration.with_messages([_NO_TIMES])
     with Outputs(options.overwrite) as outputs:
         if output is not None:
-            if layout == "bag":
-                bag = Path(output)
-                with outputs.writing(bag) if bag.suffix.lower() == ".bag" else nullcontext(bag) as staged:
+            if layout == "bag" and Path(output).suffix.lower() == ".bag":
+                with outputs.writing(output) as staged:
                     write_bag(path, staged, frame or frame_of(layout))
+            elif layout == "bag":
+                write_bag_folder(path, Path(output), frame or frame_of(layout))
             else:
                 outputs.write(output, text_bytes(WRITERS[layout](path, frame or frame_of(layout))))
         if plot is not None:

@@ -42,7 +42,9 @@ def test_map_poses_and_odometry_lie_in_one_frame(rdstitch: Run, frames: list[Pat
     assert content["resolution"] == pytest.approx(0.42 / 380.0, rel=0.2)
 
     highlevel = pytest.importorskip("rosbags.highlevel")
-    rdstitch("trajectory", *frames, "-o", tmp_path / "odom", "--format", "bag", *known)
+    as_bag = ("-o", tmp_path / "odom", "--format", "bag")
+    rdstitch("trajectory", *frames[:2], *as_bag, *known)
+    rdstitch("trajectory", *frames, *as_bag, *known, "--overwrite")
     with highlevel.AnyReader([tmp_path / "odom"]) as reader:
         messages = [reader.deserialize(data, connection.msgtype) for connection, _, data in reader.messages()]
     for message, (x, y, yaw) in zip(messages, poses, strict=True):
@@ -60,6 +62,16 @@ def test_of_several_bands_the_first_one_is_the_map(rdstitch: Run, frames: list[P
     assert not (tmp_path / "f.png").exists()
     tiled = ("mosaic", *frames, "-o", tmp_path / "f.dzi", "--map-server", tmp_path / "maps")
     rdstitch(*tiled, status=2, told="instead of .dzi")
+
+
+def test_a_folder_that_is_no_bag_is_not_replaced(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "metadata.yaml").write_text("mine", encoding="utf-8")
+    (tmp_path / "notes" / "thesis.txt").write_text("mine", encoding="utf-8")
+    wanted = ("-o", tmp_path / "notes", "--format", "bag", "--overwrite", *CACHED)
+    rdstitch("trajectory", *frames, *wanted, status=6, told="is no ROS bag")
+    assert len(list((tmp_path / "notes").iterdir())) == 2
 
 
 def test_a_bag_replaces_another_one_whole_and_needs_rosbags_before_the_work(

@@ -118,8 +118,10 @@ def test_two_videos_of_one_name_are_two(rdstitch: Run, frames: list[Path], tmp_p
     assert [row["name"] for row in _rows(tmp_path / "path.csv")] == names
 
 
-def _write_bag(folder: Path, frames: list[Path], version: int, kind: str, focal: float = 0.0) -> Path:
-    """A bag with the frames on /camera at 2 Hz from 1000 s on; with the camera's calibration if it has a focal length.
+def _write_bag(
+    folder: Path, frames: list[Path], version: int, kind: str, focal: float = 0.0, calibrated: str = "/camera_info"
+) -> Path:
+    """A bag with the frames on /camera at 2 Hz from 1000 s on; with a camera's calibration if it has a focal length.
 
     That has the division model's lens as ROS's rational polynomial.
     """
@@ -149,7 +151,7 @@ def _write_bag(folder: Path, frames: list[Path], version: int, kind: str, focal:
             writer.write(connection, 10**12 + number, data)
         if focal:
             message = _camera_info(store, header, Camera((400, 300), DISTORTION, focal=focal))
-            connection = writer.add_connection("/camera_info", message.__msgtype__, typestore=store)
+            connection = writer.add_connection(calibrated, message.__msgtype__, typestore=store)
             writer.write(connection, 10**12, store.serialize_cdr(message, message.__msgtype__))
     return path
 
@@ -204,6 +206,12 @@ def test_the_calibration_in_a_bag_is_used(rdstitch: Run, frames: list[Path], tmp
     assert "(given)" in done.made
     same = rdstitch("trajectory", *frames, "--camera", bag, "-o", tmp_path / "files.csv", *CACHED)
     assert same.out == done.out
+
+
+def test_the_calibration_of_another_camera_is_not_used(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    bag = _write_bag(tmp_path, frames, 2, "bgr8", focal=90.0, calibrated="/depth/camera_info")
+    assert "depth" not in rdstitch("trajectory", bag, "-o", tmp_path / "path.csv", "--focal", "380", *CACHED).err
+    rdstitch("trajectory", *frames, "--camera", bag, "-o", tmp_path / "f.csv", status=3, told="no calibration")
 
 
 def test_what_is_no_bag_is_named(rdstitch: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

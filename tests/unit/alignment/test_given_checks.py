@@ -104,3 +104,15 @@ def test_a_focal_length_that_the_images_contradict_is_not_used(factor: float, ri
     assert abs(math.log(alignment.cameras[0].focal / true)) < 4.0 * alignment.length_std
     if tilt_given or right:
         assert alignment.length_std < 0.012
+
+
+def test_attitudes_are_not_dropped_for_what_a_wrong_focal_length_makes_of_them() -> None:
+    rng = np.random.default_rng(2)
+    poses = jittered(grid(4, 3, (0.4, 0.3), 0.25, rng), 0.1, math.radians(6.0), rng)
+    given = scene(poses, focal_source="exif", rng=rng, per_link=80)
+    true = given.cameras[0].with_focal().focal
+    told = [camera.with_focal(1.2 * true, "option") for camera in given.cameras]
+    options = AlignmentOptions(lens="division", attitudes=poses[:, [PSI, THETA]], attitudes_std=math.radians(0.1))
+    found = align(told, given.links, options)
+    assert [message.code for message in found.messages] == ["focal-contradicted"]
+    assert abs(math.log(found.cameras[0].focal / true)) < 4.0 * found.length_std
