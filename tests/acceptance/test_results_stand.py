@@ -1,6 +1,6 @@
 """Results of a few real and rendered sets, to the fourth digit of λ: what a refactoring must leave as it is.
 
-README's example is compared in tests/cli/test_documents.py. A change that is meant to move them changes this table, and says why.
+README's example is compared in tests/cli/test_documents.py. A change that is meant to move these says why.
 """
 
 from collections.abc import Callable

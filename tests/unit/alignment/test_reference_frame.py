@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.frames import frontal_reference, in_frame_of
 from rdstitch.alignment.motion_models import POSE, PSI, X
-from tests.alignment_scenes import scene
+from tests.alignment_scenes import aligned, scene
 
 
 def test_an_oblique_reference_gives_way_to_one_whose_horizon_no_image_crosses() -> None:
@@ -15,7 +14,7 @@ def test_an_oblique_reference_gives_way_to_one_whose_horizon_no_image_crosses() 
     poses = np.zeros((3, 6))
     poses[:, X] = (0.0, 0.3, 0.6)
     given = scene(poses, rng=rng)
-    found = align(given.cameras, given.links, AlignmentOptions(model="homography", reference=0))
+    found = aligned(given, model="homography", reference=0)
     poses[0, PSI] = 1.1
     to_images = POSE.matrices(poses, POSE.shared_from_physical(np.array([0.0, 0.0, 0.26]))).matrices
     tilted = replace(found, homographies=np.asarray(np.linalg.inv(to_images), dtype=np.float64))
