@@ -14,8 +14,8 @@ import numpy as np
 from rdstitch.compositing import CompositeOptions
 from rdstitch.features.prepared_image import PixelArray
 from rdstitch.io import write_image
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.results.stitch_options import StitchOptions
 
 CHOICES = ("none", "gain", "blocks", "balanced")
 GAP = 6  # pixels between two results

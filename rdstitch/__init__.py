@@ -15,11 +15,14 @@ if TYPE_CHECKING:
     from rdstitch.alignment.trajectory import Trajectory as Trajectory
     from rdstitch.camera_files import load_camera as load_camera
     from rdstitch.camera_files import save_camera as save_camera
-    from rdstitch.compositing import CompositeOptions as CompositeOptions
     from rdstitch.errors import RdstitchError as RdstitchError
-    from rdstitch.features import FeatureOptions as FeatureOptions
     from rdstitch.geometry.camera import Camera as Camera
     from rdstitch.geometry.radial_homography import RadialHomography as RadialHomography
+    from rdstitch.options.composite_options import CompositeOptions as CompositeOptions
+    from rdstitch.options.feature_options import FeatureOptions as FeatureOptions
+    from rdstitch.options.files_beside import FilesBeside as FilesBeside
+    from rdstitch.options.stitch_options import StitchOptions as StitchOptions
+    from rdstitch.options.tile_options import TileOptions as TileOptions
     from rdstitch.pipeline.apply_sidecar import Recomposition as Recomposition
     from rdstitch.pipeline.apply_sidecar import apply as apply
     from rdstitch.pipeline.composer import Composer as Composer
@@ -28,7 +31,6 @@ if TYPE_CHECKING:
     from rdstitch.pipeline.follow import FollowedPoses as FollowedPoses
     from rdstitch.pipeline.follow import Pose as Pose
     from rdstitch.pipeline.follow import Tracker as Tracker
-    from rdstitch.pipeline.output_plan import FilesBeside as FilesBeside
     from rdstitch.pipeline.recipes import calibrate as calibrate
     from rdstitch.pipeline.recipes import mosaic as mosaic
     from rdstitch.pipeline.recipes import mosaic_blocks as mosaic_blocks
@@ -41,10 +43,8 @@ if TYPE_CHECKING:
     from rdstitch.report import write_report as write_report
     from rdstitch.results.messages import Message as Message
     from rdstitch.results.registration import Registration as Registration
-    from rdstitch.results.stitch_options import StitchOptions as StitchOptions
     from rdstitch.results.stitch_result import StitchResult as StitchResult
     from rdstitch.robust import estimate_radial_homography as estimate_radial_homography
-    from rdstitch.stage import TileOptions as TileOptions
 
     __version__: str
 
@@ -56,16 +56,16 @@ _HOMES = {
         "rdstitch.alignment.trajectory": "Trajectory",
         "rdstitch.geometry.camera": "Camera",
         "rdstitch.camera_files": "load_camera save_camera",
-        "rdstitch.compositing": "CompositeOptions",
+        "rdstitch.options.composite_options": "CompositeOptions",
         "rdstitch.pipeline.doctor": "Examination examine",
         "rdstitch.errors": "RdstitchError",
-        "rdstitch.features": "FeatureOptions",
+        "rdstitch.options.feature_options": "FeatureOptions",
         "rdstitch.results.messages": "Message",
-        "rdstitch.results.stitch_options": "StitchOptions",
+        "rdstitch.options.stitch_options": "StitchOptions",
         "rdstitch.pipeline.apply_sidecar": "Recomposition apply",
         "rdstitch.pipeline.composer": "Composer",
         "rdstitch.pipeline.follow": "FollowedPoses Pose Tracker",
-        "rdstitch.pipeline.output_plan": "FilesBeside",
+        "rdstitch.options.files_beside": "FilesBeside",
         "rdstitch.pipeline.result_files": "write_layers",
         "rdstitch.pipeline.recipes": "calibrate mosaic mosaic_blocks pano trajectory",
         "rdstitch.pipeline.stage_tiles": "place_tiles tiles",
@@ -74,7 +74,7 @@ _HOMES = {
         "rdstitch.results.registration": "Registration",
         "rdstitch.report": "write_report",
         "rdstitch.robust": "estimate_radial_homography",
-        "rdstitch.stage": "TileOptions",
+        "rdstitch.options.tile_options": "TileOptions",
         "rdstitch.results.stitch_result": "StitchResult",
     }.items()
     for name in names.split()

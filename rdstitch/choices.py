@@ -20,8 +20,18 @@ CameraFormat = Literal[
     "lensfun",
 ]
 ProjectionName = Literal["auto", "plane", "cylinder", "sphere", "mercator", "panini", "stereographic"]
+ChannelOrder = Literal["bgr", "rgb"]  # of arrays that come in or go out; OpenCV has the first
+ScanOrder = Literal["rows", "columns", "snake-rows", "snake-columns"]
+Origin = Literal["top-left", "top-right", "bottom-left", "bottom-right"]
+ZPlane = int | Literal["max"]
+LocalAlignmentMode = Literal["auto", "off"] | int  # the number of cells along an image's longer side
+PosesFrame = Literal["enu", "ros", "camera", "map"]
+TrajectoryFormat = Literal["csv", "tum", "kitti", "bag"]
+TrajectoryFrame = Literal["enu", "camera", "ros"]
+MatchBy = Literal["auto", "name", "order"]
+Framing = Literal["same", "all", "valid"]
+ImageFormat = Literal["jpg", "png", "tif", "webp"]
 
-FEATURES: tuple[str, ...] = get_args(FeatureName)
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 
 Purpose = Literal["pano", "mosaic", "calibrate", "trajectory"]

@@ -14,9 +14,9 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import RdstitchError
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import (
     BrownLens,
     Lens,

@@ -8,7 +8,6 @@ from typing import Any
 import click
 
 from rdstitch.errors import InputError
-from rdstitch_cli.option_texts import option
 
 COMMON = "common"  # the table that holds for every command
 CONFIG_FILE = "rdstitch_cli.config"  # key of the file in the context's meta
@@ -81,15 +80,17 @@ def _apply(context: click.Context, option: click.Parameter, path: Path | None) -
     group = context.find_root().command
     if path is None or context.resilient_parsing or not isinstance(group, click.Group):
         return
+    commands = {name: command for name in group.list_commands(context) if (command := group.get_command(context, name))}
     context.meta[CONFIG_FILE] = path
-    context.default_map = read_config(path, group.commands, str(context.command.name))
+    context.default_map = read_config(path, commands, str(context.command.name))
 
 
-config = option(
-    "--config",
-    click.Path(path_type=Path, readable=False),
-    is_eager=True,
+config = click.Option(
+    ["--config"],
+    type=click.Path(path_type=Path, readable=False),
+    metavar="FILE",
+    is_eager=True,  # it sets defaults before any other option is looked at
     expose_value=False,
     callback=_apply,
+    help="Read options from this TOML file; the command line takes precedence.",
 )
-"""The option ``--config``, which sets defaults before any other option is looked at."""

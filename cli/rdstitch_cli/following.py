@@ -5,25 +5,53 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import click
 
+from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.option import Option
+from rdstitch.options.stitch_options import StitchOptions
+from rdstitch_cli.flags import flags
 from rdstitch_cli.stitching import warn_of
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
     from rdstitch.pipeline.follow import FollowedPoses
-    from rdstitch.pipeline.output_plan import FilesBeside
     from rdstitch.results.registration import Registration
-    from rdstitch.results.stitch_options import StitchOptions
+
+FOLLOWING = flags(
+    following=(
+        Annotated[
+            bool,
+            Option(
+                "Register frames as they arrive, and print a line of JSON for each: INPUT is a folder that grows, - "
+                "for names on standard input, a video, the index of a camera, or a stream. All are registered "
+                "together at the end: of the video or the names, after --idle, or with Ctrl-C.",
+                flag="--follow",
+            ),
+        ],
+        False,
+    ),
+    idle=(
+        Annotated[
+            float | None,
+            Option(
+                "With --follow: end after so long without a frame; otherwise a folder is followed until Ctrl-C.",
+                "SECONDS",
+                above=0.0,
+            ),
+        ],
+        None,
+    ),
+)
 
 
 @contextmanager
 def followed(
     inputs: Sequence[Path],
-    stitch: "StitchOptions",
+    stitch: StitchOptions,
     reporter: Reporter,
     *,
     output: Path,
@@ -32,7 +60,7 @@ def followed(
     refresh: float | None = None,
     plot: Path | None = None,
     poses: "FollowedPoses | None" = None,
-    beside: "FilesBeside | None" = None,
+    beside: FilesBeside = NOTHING_BESIDE,
 ) -> Iterator[list["Named"]]:
     """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe.
 
@@ -43,7 +71,7 @@ def followed(
     from rdstitch.inputs.arrivals import Arrivals
     from rdstitch.pipeline.compose import image_files
     from rdstitch.pipeline.follow import follow as follow_frames
-    from rdstitch.pipeline.output_plan import NOTHING_BESIDE
+    from rdstitch.pipeline.output_plan import files_beside
     from rdstitch.system.file_access import file_state
     from rdstitch.system.outputs import TemporaryFolder, check_outputs, check_suffix
 
@@ -59,7 +87,7 @@ def followed(
         format_of(stitch.save_camera, stitch.camera_format)
         planned.append(stitch.save_camera)
     planned += [file for file in (preview, plot) if file is not None]
-    check_outputs([*planned, *(beside or NOTHING_BESIDE).files([])], stitch.overwrite, [source])
+    check_outputs([*planned, *files_beside(beside, [])], stitch.overwrite, [source])
     before = file_state(preview) if preview else None
     with TemporaryFolder() as folder:
         arrivals = Arrivals(

@@ -1,15 +1,33 @@
 """Help pages: options in groups, those that matter first on top; ``rdstitch help``."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import click
 
-from rdstitch_cli.config import config
-from rdstitch_cli.option_texts import PLACES, option
+# Options in their order, those of the first page with a star.
+_PAGE = """
+Options that matter first: *output *overwrite *images *preview *reference *camera *focal *mask *scale *report format
+    frame *height *view *quiet
+Places: *grid columns order origin *overlap *positions positions-offset position-accuracy gcp check-points
+    *positions-only *pixel-size *search
+Tiles: *channel *z time *flat-field *save-flat-field
+Input: *follow idle refresh *every *exclude include-only match topic timestamps
+Camera: *lambda lens tilt attitude attitude-std save-camera camera-format
+Features and registration: features aliked-model lightglue-model max-features work-megapixels solver model threshold
+Output: *gsd crs like extent georeference north-up rotate straighten rectangle level yaw pitch roll *crop projection
+    max-stretch *max-size local-alignment *exposure seam blend interpolation background quality layers whole-layers
+    bands all-blocks poses hugin-project map-server plot json
+Control: strict force dry-run *cache max-memory *workers scheduler seed verbose *config *help *help-all
+"""
+_PLACES = {
+    f"--{name.lstrip('*')}": (group, rank, name.startswith("*"))
+    for group, _, names in (line.partition(": ") for line in _PAGE.strip().replace("\n    ", " ").splitlines())
+    for rank, name in enumerate(names.split())
+}
 
 EXIT_STATUSES = """\b
 Exit status:
@@ -46,19 +64,20 @@ class GroupedCommand(click.Command):
     def __init__(self, *arguments: Any, **given: Any) -> None:
         super().__init__(*arguments, **given)
         if len(self.params) > _FEW:
-            option("--help-all", bool, is_eager=True, expose_value=False, callback=_show_all)(self)
+            how: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False, "callback": _show_all}
+            self.params.append(click.Option(["--help-all"], **how, help="Show all options."))
 
     def format_options(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the groups in their order, each with the options that this command has of it."""
-        rows: dict[str, dict[int, tuple[str, str]]] = {entry.group: {} for entry in PLACES.values()}
+        rows: dict[str, dict[int, tuple[str, str]]] = {group: {} for group, _, _ in _PLACES.values()}
         brief = any(parameter.name == "help_all" for parameter in self.params) and not context.meta.get(_ALL)
         left = 0
         for parameter in self.get_params(context):
             record = parameter.get_help_record(context)
             if record is not None and isinstance(parameter, click.Option):
-                entry = PLACES[max(parameter.opts, key=len)]
-                if entry.first or not brief:
-                    rows[entry.group][entry.rank] = record
+                group, rank, first = _PLACES[max(parameter.opts, key=len)]
+                if first or not brief:
+                    rows[group][rank] = record
                 else:
                     left += 1
         for group, records in rows.items():
@@ -70,21 +89,8 @@ class GroupedCommand(click.Command):
             formatter.write_text(f"{left} more options: {context.command_path} --help-all")
 
 
-def command(short_help: str, examples: str) -> Callable[[Callable[..., Any]], click.Command]:
-    """A command with a text for the list of commands, and lines of examples; and with what all commands have."""
-
-    def make(function: Callable[..., Any]) -> click.Command:
-        epilog = f"\b\nExamples:{examples}\n\n{EXIT_STATUSES}"
-        made = click.command(cls=GroupedCommand, short_help=short_help, epilog=epilog)(function)
-        config(made)
-        return made
-
-    return make
-
-
 @click.command(
     "help",
-    short_help="Help on a command, or on the code of a message.",
     epilog="\b\nExamples:\n  rdstitch help\n  rdstitch help pano\n  rdstitch help no-overlap\n",
 )
 @click.argument("topics", nargs=-1, metavar="[COMMAND|CODE]")

@@ -10,6 +10,7 @@ import sys
 import traceback
 import warnings
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Never
 
@@ -18,14 +19,6 @@ from click.shell_completion import shell_complete
 
 from rdstitch.errors import OutputError, RdstitchError
 from rdstitch.system.process_memory import take_over_memory
-from rdstitch_cli.commands.apply import apply
-from rdstitch_cli.commands.calibrate import calibrate
-from rdstitch_cli.commands.doctor import doctor
-from rdstitch_cli.commands.mosaic import mosaic
-from rdstitch_cli.commands.pano import pano
-from rdstitch_cli.commands.tiles import tiles
-from rdstitch_cli.commands.trajectory import trajectory
-from rdstitch_cli.commands.undistort import undistort
 from rdstitch_cli.help_pages import EXIT_STATUSES, help_command
 from rdstitch_cli.terminal import one_line, write_whatever_the_encoding
 
@@ -45,15 +38,49 @@ _DECODERS = ("PIL", "imagecodecs", "tifffile")
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-class _Commands(click.Group):
-    """The commands; whoever gives files or options without one is told to name one first."""
+_COMMANDS = {
+    "pano": "One image of a few that overlap.",
+    "mosaic": "One rectified image of a whole folder or video.",
+    "tiles": "One image of tiles taken on a microscope's stage.",
+    "apply": "Compose again by a saved sidecar, without estimating.",
+    "calibrate": "The lens, from images of a plane.",
+    "trajectory": "The path of the camera over the plane, for robots.",
+    "undistort": "Images with straight lines straight, by a known lens.",
+    "doctor": "What to expect of a run, and what to change before it.",
+    "help": "Help on a command, or on the code of a message.",
+}
+
+
+class Commands(click.Group):
+    """The commands, each imported when it is used; whoever gives files or options without one is told to name one."""
+
+    def list_commands(self, ctx: click.Context | None = None) -> list[str]:
+        """Their names, those that matter first."""
+        return [*_COMMANDS]
+
+    def get_command(self, ctx: click.Context | None, cmd_name: str) -> click.Command | None:
+        """A command by its name."""
+        if cmd_name in _COMMANDS and cmd_name not in self.commands:
+            self.add_command(getattr(import_module(f"rdstitch_cli.commands.{cmd_name}"), cmd_name))
+        return self.commands.get(cmd_name)
+
+    def load_all(self) -> dict[str, click.Command]:
+        """All commands by their names."""
+        return {name: command for name in _COMMANDS if (command := self.get_command(None, name))}
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write their names and what each is for, without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([*_COMMANDS.items()])
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         given = list(args)
         try:
             return super().parse_args(ctx, args)
         except click.NoSuchOption as error:
-            if any(error.option_name in option.opts for command in self.commands.values() for option in command.params):
+            if any(
+                error.option_name in option.opts for command in self.load_all().values() for option in command.params
+            ):
                 ctx.fail(f"{error.option_name} belongs to a command: rdstitch pano {shlex.join(given)}")
             raise
 
@@ -66,7 +93,7 @@ class _Commands(click.Group):
 
 
 @click.group(
-    cls=_Commands,
+    cls=Commands,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog=f"{_EXAMPLES}\n\n{EXIT_STATUSES}",
 )
@@ -78,8 +105,7 @@ def cli(context: click.Context, debug: bool) -> None:
     context.obj = debug
 
 
-for command in (pano, mosaic, tiles, apply, calibrate, trajectory, undistort, doctor, help_command):
-    cli.add_command(command)
+cli.add_command(help_command)
 
 
 def main() -> None:

@@ -1,29 +1,52 @@
 """What the stitching commands share: from flags to options, from a result to lines."""
 
 import math
+import os
 import shlex
 import sys
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
+from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.options.feature_options import FeatureOptions
+from rdstitch.options.files_beside import FilesBeside
+from rdstitch.options.option import Option
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import bytes_in_words, seconds_in_words
+from rdstitch.system.progress import StageTimer
 from rdstitch_cli.config import CONFIG_FILE
-from rdstitch_cli.options import is_given
+from rdstitch_cli.flags import flags, flags_of, is_given, taken
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
-    from rdstitch.choices import SolverName
     from rdstitch.compositing import CompositePlan
     from rdstitch.geometry.camera import Camera
     from rdstitch.pipeline.apply_sidecar import Recomposition
-    from rdstitch.pipeline.output_plan import FilesBeside
     from rdstitch.results.registration import Registration
-    from rdstitch.results.stitch_options import StitchOptions
     from rdstitch.results.stitch_result import StitchResult
+
+STITCHING = [
+    *flags_of(StitchOptions),
+    *flags_of(FeatureOptions),
+    *flags_of(CompositeOptions),
+    *flags(
+        preview=(
+            Annotated[
+                bool,
+                Option(
+                    "A quick draft of at most 1200 pixels: few features of reduced images, straight seams; options "
+                    "given take precedence."
+                ),
+            ],
+            False,
+        )
+    ),
+]
+"""The options of every command that composes the images that it registers."""
 
 
 def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
@@ -61,50 +84,28 @@ def _size_of_images(file: Path) -> tuple[int, int]:
     return turned_size(metadata.size, inverse(metadata.orientation))
 
 
-def stitch_options(
-    reporter: Reporter,
-    *,
-    camera: Path | None,
-    features: str,
-    aliked_model: Path | None,
-    max_features: int | None,
-    work_megapixels: float | None,
-    solver: str,
-    preview: bool = False,
-    **given: Any,
-) -> "StitchOptions":
+def resolve(inputs: tuple[Path, ...]) -> list[Path]:
+    """The inputs, with - replaced by the names on standard input, one a line or separated by NUL."""
+    from rdstitch.inputs.find import names_in
+
+    named: list[Path] = []
+    for item in inputs:
+        listed = names_in(os.fsdecode(sys.stdin.buffer.read())) if str(item) == "-" else [item]
+        named.extend(map(Path, listed))
+    return named
+
+
+def stitch_options(reporter: Reporter, given: dict[str, Any], **more: Any) -> StitchOptions:
     """The library's options from a command's flags."""
-    from rdstitch.compositing import CompositeOptions
-    from rdstitch.features import FeatureOptions
-    from rdstitch.results.stitch_options import StitchOptions
-
+    camera = given.pop("camera")
     _check_written([camera])
-    if preview:
-        quick = {"max_size": 1200, "seam": "voronoi"}
+    if given.pop("preview", False):
+        quick = {"max_size": 1200, "seam": "voronoi", "max_features": 1500, "work_megapixels": 0.5}
         given |= {name: value for name, value in quick.items() if not is_given(name)}
-        max_features = max_features if is_given("max_features") else 1500
-        work_megapixels = work_megapixels if is_given("work_megapixels") else 0.5
-    composite = composite_fields(given)
-    return StitchOptions(
-        camera=read_lens(camera, reporter),
-        features=FeatureOptions(
-            features,
-            max_features,
-            work_megapixels="auto" if work_megapixels is None else work_megapixels or None,
-            aliked_model=aliked_model,
-        ),
-        composite=CompositeOptions(**composite),
-        solver=cast("SolverName", solver.replace("-", "_")),
-        **given,
-    )
-
-
-def composite_fields(given: dict[str, Any]) -> dict[str, Any]:
-    """Take what is an option of compositing out of a command's flags; workers are those of the whole run."""
-    from rdstitch.compositing import CompositeOptions
-
-    fields = CompositeOptions.__dataclass_fields__.keys() - {"workers"}
-    return {name: given.pop(name) for name in list(given) if name in fields}
+    features = FeatureOptions(**taken(FeatureOptions, given))
+    composite = CompositeOptions(**taken(CompositeOptions, given))
+    more |= {"camera": read_lens(camera, reporter), "features": features, "composite": composite}
+    return StitchOptions(**taken(StitchOptions, given), **more)
 
 
 def _check_written(read: Iterable[Path | None]) -> None:
@@ -118,14 +119,11 @@ def _check_written(read: Iterable[Path | None]) -> None:
             check_not_read([context.params[name]], files)
 
 
-def files_beside(reporter: Reporter, given: dict[str, Any]) -> "FilesBeside":
+def files_beside(reporter: Reporter, given: dict[str, Any]) -> FilesBeside:
     """Take the options of what is written beside a result out of a command's flags."""
-    from rdstitch.pipeline.output_plan import FilesBeside
-    from rdstitch.system.progress import StageTimer
-
-    fields = FilesBeside.__dataclass_fields__.keys() & given.keys()
-    wanted: dict[str, Any] = {name: given.pop(name) for name in fields}
-    return FilesBeside(**wanted, command=shlex.join(["rdstitch", *sys.argv[1:]]), timer=StageTimer(reporter))
+    return FilesBeside(
+        **taken(FilesBeside, given), command=shlex.join(["rdstitch", *sys.argv[1:]]), timer=StageTimer(reporter)
+    )
 
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:

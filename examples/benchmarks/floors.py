@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 import rdstitch
 from examples.benchmarks.driver import images_of, run, timed
-from rdstitch.features.feature_options import FeatureOptions
 from rdstitch.features.opencv import SIFT_CONTRAST
 from rdstitch.geometry.radial_homography import transfer_jacobian
+from rdstitch.options.feature_options import FeatureOptions
 
 # What is first imported while functions are timed would keep the timers of the first folder.
 from rdstitch.pipeline.recipes import mosaic

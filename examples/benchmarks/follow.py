@@ -21,8 +21,8 @@ from examples.judging.trajectories import compare_trajectories
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.inputs.arrivals import Arrivals
 from rdstitch.io.write import write_image
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.follow import Pose, follow
-from rdstitch.results.stitch_options import StitchOptions
 from tests.floor_drives import DISTORTION, floor_drive, true_path
 
 

@@ -23,8 +23,8 @@ from rdstitch.errors import RdstitchError
 from rdstitch.executors import open_executor
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import read_sources
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.register import register
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import BrownLens, FisheyeLens, Sequence, grid_poses, ground, sequence_over
 from rdstitch.synthetic.lenses import Lens
 

@@ -19,8 +19,8 @@ from examples.benchmarks.driver import run
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import pano
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import Photometry, TurningSequence, panorama_rotations, turning_sequence
 
 Pixels = NDArray[np.uint8]

@@ -13,8 +13,8 @@ import numpy as np
 from examples.benchmarks.driver import run
 from rdstitch.errors import RdstitchError
 from rdstitch.geometry.camera import Camera
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import (
     Photometry,
     Sequence,

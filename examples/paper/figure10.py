@@ -20,8 +20,8 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import project
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
 
 _CENTRE = np.array([0.0, 0.0, 1.0])

@@ -7,7 +7,7 @@ from examples.paper.common.stitched import stitch_files, stitch_rendered
 from rdstitch.camera_files.lens_models import fit_lens
 from rdstitch.errors import RegistrationError
 from rdstitch.geometry.camera import Camera
-from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.synthetic import FisheyeLens
 from rdstitch.synthetic.lenses import Lens
 

@@ -233,7 +233,8 @@ class Problem:
         overdispersion: float | None = None,
     ) -> BundleAdjuster:
         """Of one model, with the priors on it; those of tilts as they show with the ``shared`` parameters."""
-        freedom = FreeParameters.fixing(model, self.count, [self.reference], self.free_lens)
+        references = [self.reference] if self.camera_priors.fix_frame else []
+        freedom = FreeParameters.fixing(model, self.count, references, self.free_lens)
         log_focal = None if shared is None or not len(shared) else float(shared[-1])
         priors = self.camera_priors.priors(model, self.count, tilt_spread, log_focal)
         overdispersion = overdispersion or self.overdispersion

@@ -19,9 +19,9 @@ from rdstitch.alignment.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjus
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
+from rdstitch.alignment.map_priors import hold_on_map
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, noise_of_links
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.position_priors import hold_positions
 from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
@@ -193,7 +193,8 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
     fit = from_another_start(problem, fit)
     if len(options.lenses) > 1:
         problem, fit = with_third_coefficient(problem, fit)
-    problem, fit, disagreement = hold_positions(problem, fit)
+    held = hold_on_map(problem, fit)
+    problem, fit = held.problem, held.fit
     covariance, of_lens = covariances(problem, fit)
     fit = weigh_lens(problem, fit, covariance) if chosen.observable else fit
     return replace(
@@ -201,7 +202,8 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         problem=problem,
         choice=replace(choice, fit=fit),
         lens=chosen.lens.refined(fit.free_lens),
-        positions_disagree=disagreement,
+        positions_disagree=held.disagreement,
+        leverage=held.leverage_of(chosen.images),
         covariance=covariance,
         lens_covariance=of_lens,
     )

@@ -2,71 +2,45 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
+from rdstitch.alignment.plane_marks import ControlPoints, Sighting
 from rdstitch.alignment.priors import CameraPriors, known_focal
-from rdstitch.choices import Purpose
+from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 
 
 @dataclass(frozen=True)
 class AlignmentOptions:
-    """What the caller decides, and what is given of the camera.
+    """What the caller decides, and what is given of the camera."""
 
-    Attributes
-    ----------
-    reference : int, optional
-        The image that defines the plane's frame; the centre of the match graph if not given.
-    model : str
-        "rigid", "similarity", "tilting", "pose", "homography", or "auto": the least free one that the data allow.
-    lens_known : bool
-        Whether the lens is that of the cameras; estimated otherwise.
-    tilt : (float, float), optional
-        (ψ, θ), radians, where it is known.
-    attitudes : ndarray of shape (N, 2), optional
-        (ψ, θ) of each image, radians, where an IMU or a gimbal has measured them; ``tilt`` is then how the camera
-        is mounted on that.
-    attitudes_std : float
-        Their standard deviation, radians; 0 for exact ones.
-    gravity : ndarray of shape (N, 3), optional
-        Direction down in the axes of each camera (right, down, ahead), where it is known; NaN elsewhere. It levels
-        panoramas.
-    positions : ndarray of shape (N, 2), optional
-        Metres east and north where each image was taken; NaN where that is not known. A weak prior.
-    lens : str
-        One of :data:`rdstitch.alignment.lens_selection.LENSES`, or "auto": the simplest that the data allow.
-    purpose : str
-        The recipe that the alignment is for, see :data:`rdstitch.choices.Purpose`.
-    pose_covariance : bool
-        Compute covariances of the poses, in time that grows with the square of the number of images.
-    most : int
-        Correspondences used of each link at most; fewer where there are thousands of links.
-    """
-
-    reference: int | None = None
-    model: str = "auto"
-    lens_known: bool = False
-    tilt: tuple[float, float] | None = None
+    reference: int | None = None  # image that defines the plane's frame; None: the centre of the match graph
+    model: str = "auto"  # one of :data:`rdstitch.choices.ModelName`; "auto": the least free one that the data allow
+    lens_known: bool = False  # whether the lens is that of the cameras
+    tilt: tuple[float, float] | None = None  # (ψ, θ), radians
+    # (ψ, θ) of each image (N, 2), radians, by an IMU or a gimbal; ``tilt`` is then how the camera is mounted on that
     attitudes: ArrayLike | None = None
-    attitudes_std: float = 0.0
+    attitudes_std: float = 0.0  # radians; 0: exact
+    # direction down (N, 3) in the axes of each camera (right, down, ahead); NaN where unknown; it levels panoramas
     gravity: ArrayLike | None = None
-    positions: ArrayLike | None = None
-    lens: str = "auto"
+    positions: ArrayLike | None = None  # metres east and north (N, 2); NaN where unknown; a prior
+    positions_std: ArrayLike | None = None  # standard deviation (N,) of one coordinate of these, m; NaN where unknown
+    control: tuple[Sighting, ...] = ()  # ground control points in the images; a prior where there are three or more
+    lens: str = "auto"  # one of :data:`rdstitch.choices.LensName`; "auto": the simplest that the data allow
     purpose: Purpose = "mosaic"
-    pose_covariance: bool = False
-    most: int = 250
+    pose_covariance: bool = False  # its time grows with the square of the number of images
+    most: int = 250  # correspondences used of each link; fewer where there are thousands of links
 
     def __post_init__(self) -> None:
-        """Check the values."""
-        if self.model != "auto" and self.model not in MODELS:
-            raise ArgumentError(f"model must be auto, {', '.join(MODELS)}, not {self.model}")
-        if self.lens != "auto" and self.lens not in LENSES:
-            raise ArgumentError(f"lens must be auto, {', '.join(LENSES)}, not {self.lens}")
+        for name, choices in (("model", get_args(ModelName)), ("lens", get_args(LensName))):
+            if getattr(self, name) not in choices:
+                raise ArgumentError(f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}")
         if self.attitudes_std < 0:
             raise ArgumentError("a standard deviation cannot be negative")
 
@@ -95,6 +69,8 @@ class AlignmentOptions:
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
             positions=positions,
+            positions_std=np.full(count, np.nan) if self.positions_std is None else np.asarray(self.positions_std),
+            control=ControlPoints.of(self.control, cameras),
         )
 
     @property

@@ -1,8 +1,8 @@
 """From the adjusted parameters to the :class:`Alignment`: frames, poses, uncertainties, and what was left out."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -72,6 +72,7 @@ class AdjustedImages:
     depth: bool  # whether that is because what few images show has depth
     options: AlignmentOptions
     positions_disagree: str = ""  # why the positions were not used; empty where they were, or where there are none
+    leverage: Mapping[int | str, float] = field(default_factory=dict)  # see Alignment
     messages: tuple[Message, ...] = ()  # on what was given
     # covariance, lens_covariance: of what was estimated, and of all parameters of a lens; none of a draft
     covariance: FloatArray | None = None
@@ -147,6 +148,7 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
         links=_link_fits(adjustment, squared, agreeing),
         relief=relief,
         shape=_shape(adjustment),
+        leverage=adjustment.leverage,
         messages=(*_warnings(adjustment, reference_camera, considered), *adjustment.messages),
     )
 

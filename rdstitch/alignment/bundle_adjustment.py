@@ -20,7 +20,7 @@ from rdstitch.alignment.link_equations import (
     whitened_errors,
 )
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel
-from rdstitch.alignment.normal_equations import PoseBlocks, SparseNormalEquations, chain
+from rdstitch.alignment.normal_equations import ImageEquations, PoseBlocks, SparseNormalEquations, chain
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors, costs, curvatures, slopes
 from rdstitch.arrays import BoolArray, FloatArray
@@ -289,7 +289,11 @@ class BundleAdjuster:
 
     def _prior_cost(self, parameters: Parameters) -> float:
         offsets = self.model.prior_coordinates(parameters.poses) - self.priors.poses
-        return self.camera_prior_cost(parameters) + float((self.priors.poses_precision * offsets**2).sum())
+        known = self.camera_prior_cost(parameters) + float((self.priors.poses_precision * offsets**2).sum())
+        if (marks := self.priors.marks) is None:
+            return known
+        matrices = self.model.matrices(parameters.poses, parameters.shared).matrices
+        return known + marks.cost(matrices, parameters.lens, float(np.exp(parameters.shared[-1])))
 
     def _normal_equations(self, state: _State, sigma: float) -> SparseNormalEquations:
         """Of the data at ``state``, and of the priors."""
@@ -300,6 +304,7 @@ class BundleAdjuster:
             state.homographies,
             self._blocks,
             self.weight(sigma),
+            self._of_marks(state),
         )
         p, free, lens = self.priors, self.free.poses, self.free.lens
         physical, derivative = self.named_parameters(state.parameters.shared)
@@ -314,6 +319,13 @@ class BundleAdjuster:
             derivative.T @ (precision[:, None] * derivative),
             derivative.T @ slope,
         )
+
+    def _of_marks(self, state: _State) -> ImageEquations | None:
+        if (marks := self.priors.marks) is None:
+            return None
+        focal = float(np.exp(state.parameters.shared[-1]))
+        errors, derivative = marks.equations(state.matrices, state.parameters.lens, self.free.lens, focal)
+        return ImageEquations(marks.image, derivative, errors, marks.precision)
 
     def named_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The named parameters (S,), and their derivatives by the shared ones and by the lens (S', S')."""

@@ -13,12 +13,14 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import are_homographies, inverses, transfer_jacobian
 from rdstitch.matching.links import spread_choice
-from rdstitch.system.late_imports import sparse
 
 _PROBES = 6
 """Points of a link that are transferred round each triangle."""
 
-_MAX_TRIANGLES = 20_000
+_MAX_TRIANGLES, _TRIANGLES_PER_LINK = 20_000, 2
+"""Of all links together that are looked at: six of each link, in the mean, where there are many."""
+
+_TRIANGLES_AT_ONCE = 4096
 
 _MIN_ERROR = 0.02
 """Half diagonals: a link that is off by less is no wrong pair."""
@@ -27,24 +29,25 @@ _MIN_ERROR = 0.02
 def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:
     """Links (T, 3) of all triangles i < j < k of the graph, in the order ij, jk, ik.
 
-    Of very many, an evenly spaced part, and one of each link that has any.
+    Of very many, a random part, and one of each link that has any.
     """
     low, high = np.minimum(image1, image2), np.maximum(image1, image2)
-    number = sparse.coo_array((np.arange(1, len(low) + 1), (low, high)), shape=(count, count)).tocsr()
-    number.sort_indices()
-    triples = []
-    for link in range(len(low)):
-        i, j = int(low[link]), int(high[link])
-        partners = number.indices[number.indptr[i] : number.indptr[i + 1]]
-        other = number.indices[number.indptr[j] : number.indptr[j + 1]]
-        third = np.intersect1d(partners, other)
-        if len(third):
-            jk = number.data[number.indptr[j] : number.indptr[j + 1]][np.searchsorted(other, third)] - 1
-            ik = number.data[number.indptr[i] : number.indptr[i + 1]][np.searchsorted(partners, third)] - 1
-            triples.append(np.column_stack([np.full(len(third), link), jk, ik]))
-    result = np.concatenate(triples).astype(np.intp) if triples else np.empty((0, 3), dtype=np.intp)
+    key = low * count + high
+    order = np.argsort(key)
+    # Each link to j with the links to k that follow it among those from the same image i.
+    last = np.searchsorted(low[order], np.arange(count), side="right")[low[order]]
+    following = last - np.arange(len(order)) - 1
+    ij = np.repeat(np.arange(len(order)), following)
+    ik = np.arange(len(ij)) - np.repeat(np.cumsum(following) - following, following) + ij + 1
+    wanted = high[order[ij]] * count + high[order[ik]]
+    jk = np.searchsorted(key, wanted, sorter=order).clip(max=max(len(order) - 1, 0))
+    closed = key[order[jk]] == wanted
+    result = np.stack([order[place[closed]] for place in (ij, jk, ik)], axis=1)
+    most = max(_MAX_TRIANGLES, _TRIANGLES_PER_LINK * len(low))
+    if len(result) <= most:
+        return result
     kept = np.zeros(len(result), dtype=np.bool_)
-    kept[:: max(-(-len(result) // _MAX_TRIANGLES), 1)] = True
+    kept[np.random.default_rng(0).choice(len(result), most, replace=False)] = True
     links, first = np.unique(result, return_index=True)
     kept[first[~np.isin(links, result[kept])] // 3] = True
     return result[kept]
@@ -82,36 +85,39 @@ def _open_triangles(apart: BundleAdjustmentResult, observations: Observations, c
     backward = observations.image1 > observations.image2
     homographies, covariance = _oriented(apart, backward)
     distortion, higher, center = split_lens(apart.parameters.lens)
-    probes = [
-        _probes(observations, link, bool(backward[link])) for link in range(len(observations))
-    ]  # in the image of lower index
-    points = np.stack([probes[link] for link in corners[:, 0]]).reshape(-1, 2) - center
-    ij, jk, ik = (np.repeat(corner, _PROBES) for corner in corners.T)
-    first = transfer_jacobian(homographies[ij], distortion, points, higher)
-    second = transfer_jacobian(homographies[jk], distortion, first.points, higher)
-    direct = transfer_jacobian(homographies[ik], distortion, points, higher)
-    error = second.points - direct.points
+    # In the image of lower index.
+    probes = np.stack([_probes(observations, link, bool(backward[link])) for link in range(len(observations))])
 
     def spread(by: FloatArray, links: IntArray) -> FloatArray:
         return by @ covariance[links] @ np.swapaxes(by, -1, -2)
 
-    total = (
-        second.by_point @ spread(first.by_homography, ij) @ np.swapaxes(second.by_point, -1, -2)
-        + spread(second.by_homography, jk)
-        + spread(direct.by_homography, ik)
-    )
-    size = np.linalg.norm(error, axis=1).reshape(-1, _PROBES)
-    deviation = np.sqrt(np.einsum("...ii->...", total) / 2.0).reshape(-1, _PROBES) + 1e-9
-    visible = np.isfinite(size) & (np.abs(second.points).max(axis=1).reshape(-1, _PROBES) < 1.5)
-    normalized = np.where(visible, size / deviation, np.nan)
-    seen = visible.sum(axis=1) >= 2
+    def misclosures(corners: IntArray) -> tuple[FloatArray, FloatArray]:
+        """How far each probe of some triangles is off, in standard deviations and half diagonals; NaN outside."""
+        points = probes[corners[:, 0]].reshape(-1, 2) - center
+        ij, jk, ik = (np.repeat(corner, _PROBES) for corner in corners.T)
+        first = transfer_jacobian(homographies[ij], distortion, points, higher)
+        second = transfer_jacobian(homographies[jk], distortion, first.points, higher)
+        direct = transfer_jacobian(homographies[ik], distortion, points, higher)
+        total = (
+            second.by_point @ spread(first.by_homography, ij) @ np.swapaxes(second.by_point, -1, -2)
+            + spread(second.by_homography, jk)
+            + spread(direct.by_homography, ik)
+        )
+        size = np.linalg.norm(second.points - direct.points, axis=1)
+        deviation = np.sqrt(np.einsum("...ii->...", total) / 2.0) + 1e-9
+        visible = np.isfinite(size) & (np.abs(second.points).max(axis=1) < 1.5)
+        normalized, absolute = (np.where(visible, each, np.nan) for each in (size / deviation, size))
+        return normalized.reshape(-1, _PROBES), absolute.reshape(-1, _PROBES)
+
+    parts = np.split(corners, np.arange(_TRIANGLES_AT_ONCE, len(corners), _TRIANGLES_AT_ONCE))
+    normalized, absolute = (np.concatenate(each) for each in zip(*map(misclosures, parts), strict=True))
+    seen = np.isfinite(normalized).sum(axis=1) >= 2
     result = np.full(len(corners), np.nan)
     if not seen.any():
         return result
     middle = np.nanmedian(normalized[seen], axis=1)
-    absolute = np.nanmedian(np.where(visible, size, np.nan)[seen], axis=1)
     usual = max(1.0, _usual_misclosure(middle, corners[seen], observations))
-    result[seen] = (middle > 8.0 * usual) & (absolute > _MIN_ERROR)
+    result[seen] = (middle > 8.0 * usual) & (np.nanmedian(absolute[seen], axis=1) > _MIN_ERROR)
     return result
 
 

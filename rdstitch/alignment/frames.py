@@ -13,7 +13,7 @@ import numpy as np
 
 from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.alignment.select import MAX_STRETCH
-from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.exif_orientation import inverse, turning_matrix
 from rdstitch.geometry.planar_motion import rigid_in_plane, rotation_from_tilt, tilt_from_normal
@@ -122,6 +122,7 @@ def stored(orientations: Sequence[int]) -> tuple[int, ...]:
 
 
 _POINTS_PER_SIDE = 8
+_REFERENCES_AT_ONCE = 32
 
 
 def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
@@ -136,23 +137,32 @@ def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
 def frontal_reference(alignment: Alignment) -> int:
     """The reference image, or, where another one is absurdly stretched by its frame, the one that stretches least."""
     used = np.flatnonzero(alignment.used)
-    nearness = np.array([_nearest_to_horizon(alignment, used, int(k)) for k in used])
-    present = int(np.flatnonzero(used == alignment.reference)[0])
-    if nearness[present].min() > MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
+    borders = np.stack([_border_on_plane(alignment, int(k)) for k in used])
+    present = _nearest_to_horizon(borders, alignment.homographies[[alignment.reference]])
+    if present.min() > MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
         return alignment.reference
-    crossing, least = (nearness <= 0.0).sum(axis=1), nearness.min(axis=1)
+    crossing, least = np.empty(len(used)), np.empty(len(used))
+    for start in range(0, len(used), _REFERENCES_AT_ONCE):
+        part = slice(start, start + _REFERENCES_AT_ONCE)
+        nearness = _nearest_to_horizon(borders, alignment.homographies[used[part]])
+        crossing[part], least[part] = (nearness <= 0.0).sum(axis=0), nearness.min(axis=0)
     return int(used[np.lexsort((-least, crossing))[0]])
 
 
-def _nearest_to_horizon(alignment: Alignment, used: IntArray, reference: int) -> FloatArray:
-    """Smallest third coordinate of each image's border in the frame of ``reference``, in units of the largest."""
-    values = []
-    for index in used:
-        camera, relation = alignment.cameras[index], alignment.relation(int(index), reference)
-        flat = camera.normalize(camera.undistort(camera.outline(_POINTS_PER_SIDE)))
-        third = flat @ relation[2, :2] + relation[2, 2]
-        values.append(float(third.min() / np.abs(third).max()))
-    return np.array(values)
+def _border_on_plane(alignment: Alignment, image: int) -> FloatArray:
+    """The border of an image on the plane, homogeneous (P, 3)."""
+    camera = alignment.cameras[image]
+    flat = camera.normalize(camera.undistort(camera.outline(_POINTS_PER_SIDE)))
+    return np.asarray(np.column_stack([flat, np.ones(len(flat))]) @ alignment.homographies[image].T)
+
+
+def _nearest_to_horizon(borders: FloatArray, references: FloatArray) -> FloatArray:
+    """Smallest third coordinate of the borders (N, P, 3), in units of the largest, in frames of references (R, 3, 3).
+
+    Shape (N, R).
+    """
+    third = borders @ np.linalg.inv(references)[:, 2].T
+    return np.asarray(third.min(axis=1) / np.abs(third).max(axis=1))
 
 
 _FULL_CIRCLE = np.pi / 2

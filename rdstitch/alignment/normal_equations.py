@@ -160,6 +160,28 @@ def _solve_scaled(matrix: FloatArray, right: FloatArray) -> FloatArray:
     return solution.T
 
 
+@dataclass(frozen=True, eq=False)
+class ImageEquations:
+    """Errors of single images, whatever the others are."""
+
+    image: IntArray  # (M,)
+    derivative: FloatArray  # (M, 2, D + S + K): by the image's pose, the shared parameters, and the lens
+    errors: FloatArray  # (M, 2)
+    precision: FloatArray  # (M,): inverse variance
+
+    def add_to(self, local: FloatArray, gradient: FloatArray, observations: Observations) -> None:
+        """Add them to those (L, P, P) and (L, P) of links, each to one of its image, by 2 D poses and S + K others."""
+        images, row = np.unique(np.concatenate([observations.image1, observations.image2]), return_index=True)
+        second, link = np.divmod(row[np.searchsorted(images, self.image)], len(observations))
+        size = local.shape[1] - self.derivative.shape[2]
+        poses, others = np.arange(size), np.arange(2 * size, local.shape[1])
+        column = np.concatenate([second[:, None] * size + poses, np.tile(others, (len(second), 1))], axis=1)
+        weighted = self.derivative * self.precision[:, None, None]
+        products = np.swapaxes(weighted, 1, 2) @ self.derivative
+        np.add.at(local, (link[:, None, None], column[:, :, None], column[:, None]), products)
+        np.add.at(gradient, (link[:, None], column), np.einsum("mip,mi->mp", weighted, self.errors))
+
+
 def chain(
     equations: LinkEquations,
     observations: Observations,
@@ -167,15 +189,19 @@ def chain(
     homographies: FloatArray,
     blocks: PoseBlocks,
     weight: float,
+    known: ImageEquations | None = None,
 ) -> SparseNormalEquations:
     """Chain the equations of the links with the derivatives of the model, whose shared parameters the lens follows.
 
-    The homographies are those of the links (L, 3, 3), the weight is one over the variance of the errors.
+    The homographies are those of the links (L, 3, 3), the weight is one over the variance of the errors; what is
+    ``known`` of single images comes besides.
     """
     derivative = link_derivatives(observations, model, homographies, equations.gram.shape[1] - 9)
     size = model.by_pose.shape[1]
     local = np.swapaxes(derivative, 1, 2) @ equations.gram @ derivative * weight
     gradient = np.einsum("lpk,lp->lk", derivative, equations.gradient) * weight
+    if known is not None:
+        known.add_to(local, gradient, observations)
 
     pair = 2 * size
     return SparseNormalEquations(

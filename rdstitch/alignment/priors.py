@@ -29,6 +29,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
+from rdstitch.alignment.plane_marks import ControlPoints, PlaneMarks
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD, Camera
 
@@ -124,6 +125,7 @@ class Priors:
     lens: tuple[Prior, ...]  # of LENS_PARAMETERS
     poses: FloatArray  # poses, poses_precision: (N, D): means and inverse variances; 0 where there is no prior
     poses_precision: FloatArray
+    marks: PlaneMarks | None = None
 
     @classmethod
     def none(cls, model: MotionModel, count: int) -> Self:
@@ -145,10 +147,14 @@ class CameraPriors:
     attitudes: FloatArray
     attitudes_std: float | None  # standard deviation of these, 0 for exact ones; None where they are not known
     positions: FloatArray  # (N, 2): metres east and north where each image was taken; NaN where that is not known
-    # places, places_precision: (N, 2) and (N,): what those say of the poses, and its inverse variance; see
-    # position_priors
+    positions_std: FloatArray  # (N,): of one coordinate of these, m; NaN where that is not known
+    control: ControlPoints
+    # places, places_precision, marks: (N, 2) and (N,): what positions say of the poses, and its inverse variance, and
+    # what control points say; see map_priors
     places: FloatArray | None = None
     places_precision: FloatArray | None = None
+    marks: PlaneMarks | None = None
+    fix_frame: bool = True  # the frame is the reference image's, not that of places and marks
 
     def priors(self, model: MotionModel, count: int, tilt_spread: float, log_focal: float | None = None) -> Priors:
         """For ``count`` images whose tilts scatter by ``tilt_spread`` where nothing else is known of them.
@@ -173,11 +179,17 @@ class CameraPriors:
         if self.places is not None and self.places_precision is not None:
             columns = [free.index(column) for column in (X, Y)]
             poses[:, columns], precision[:, columns] = self.places, self.places_precision[:, None]
-        return replace(known, poses=poses, poses_precision=precision)
+        return replace(known, poses=poses, poses_precision=precision, marks=self.marks)
 
     def of(self, images: IntArray) -> "CameraPriors":
         """Of some of the images only."""
-        return replace(self, attitudes=self.attitudes[images], positions=self.positions[images])
+        return replace(
+            self,
+            attitudes=self.attitudes[images],
+            positions=self.positions[images],
+            positions_std=self.positions_std[images],
+            control=self.control.within(images),
+        )
 
 
 def known_focal(cameras: Sequence[Camera]) -> tuple[float, float, str]:

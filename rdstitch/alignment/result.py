@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Self
 
@@ -44,6 +44,11 @@ class LinkFit:
     rms: float
     used: bool
     reason: str = ""
+
+    @property
+    def images(self) -> tuple[int, int]:
+        """Indices of both images."""
+        return self.image1, self.image2
 
 
 @dataclass(frozen=True)
@@ -192,6 +197,9 @@ class Alignment:
     relief : ReliefTest
     shape : ShapeTest or None
         None for a turn on the spot, and where λ is not observable.
+    leverage : mapping
+        How far (0 to 1) what is known of the map puts itself where the alignment has it: positions by the index of
+        their image, control points by name.
     messages : tuple of Message
         What the user should know of the whole: λ not observable, two cameras, ….
     """
@@ -218,6 +226,7 @@ class Alignment:
     links: tuple[LinkFit, ...]
     relief: ReliefTest
     shape: ShapeTest | None = None
+    leverage: Mapping[int | str, float] = field(default_factory=dict)
     messages: tuple[Message, ...] = ()
 
     def __repr__(self) -> str:
@@ -239,7 +248,7 @@ class Alignment:
         origin[list(placed)] = list(placed.values())
         poses = self.poses
         if poses is not None:
-            given = {field.name: getattr(poses, field.name) for field in fields(poses)}
+            given = {each.name: getattr(poses, each.name) for each in fields(poses)}
             poses = replace(poses, **{name: part[origin] for name, part in given.items() if part is not None})
         fits = [replace(fit, image1=i, image2=j) for fit, (i, j) in zip(self.links, pairs, strict=True)]
         groups = (tuple(k for k in group if k not in copies) for group in self.components)
@@ -284,3 +293,12 @@ class Alignment:
             return from_plane(self.cameras[image2], np.eye(3), seen)
         plane = to_plane(self.cameras[image1], self.homographies[image1], points)
         return from_plane(self.cameras[image2], self.homographies[image2], plane)
+
+
+def links_by_image(links: Iterable[LinkFit]) -> dict[int, list[LinkFit]]:
+    """The links of each image that has any."""
+    of_image: dict[int, list[LinkFit]] = {}
+    for fit in links:
+        for image in fit.images:
+            of_image.setdefault(image, []).append(fit)
+    return of_image

@@ -168,6 +168,8 @@ UNLIKELY_FOCAL = 4.0
 _SIDE = 6
 """Points along a side of each image whose places are compared."""
 
+_IMAGES_AT_ONCE = 256
+
 _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 8
 """Correspondences in all, and of each link at least, that say what the shape is."""
 
@@ -182,18 +184,17 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
     stds = np.array([effect.std for effect in answers.effects])
     usual_stds, extreme_stds = stds[: len(effects)], np.array([effect.largest or effect.std for effect in effects])
     probed = (answers.gain(stds) - answers.gain(usual_stds)) / len(probes)
-    moved, images = _displacements(answers, fit, len(effects), cameras)
+    moved = _displacements(answers, fit, len(effects), cameras)
 
-    def per_image(squared: FloatArray) -> FloatArray:
-        """Root mean square (N,) of the points of each image, from the squares of all."""
-        points = np.maximum(np.bincount(images, minlength=len(cameras)), 1)
-        return np.sqrt(np.maximum(np.bincount(images, squared, len(cameras)), 0.0) / points)
+    def per_image(products: FloatArray) -> FloatArray:
+        """Root mean square (N,) over each image, from the products (C, C) of what moves it."""
+        return np.asarray(np.sqrt(np.maximum(np.einsum("nst,st->n", moved, products), 0.0)))
 
     def predict(stds: FloatArray) -> _Prediction:
         sizes, covariance = answers.estimate(stds)
-        gain, spread = answers.gain(stds), max(1.0, probed) * np.einsum("pas,st,pat->p", moved, covariance, moved)
-        shifts = per_image(((moved @ sizes) ** 2).sum(axis=1))
-        return _Prediction(gain, gain / len(stds), shifts, per_image(spread), _cause(effects, sizes, covariance))
+        gain, spread = answers.gain(stds), per_image(max(1.0, probed) * covariance)
+        shifts = per_image(np.outer(sizes, sizes))
+        return _Prediction(gain, gain / len(stds), shifts, spread, _cause(effects, sizes, covariance))
 
     large = _LARGE * np.array([2.0 * camera.scale for camera in cameras])
     judged = usual = predict(usual_stds)
@@ -209,7 +210,7 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
     if not doubtful and abs(beside) > UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
         by_focal = np.delete(answers.shared[len(fit.adjusted.parameters.shared) - 1], np.s_[len(effects) : len(stds)])
         follow = answers.estimate(usual_stds)[1] @ by_focal  # all that moves with the focal length
-        shifts = per_image(((moved @ follow * (beside / (by_focal @ follow))) ** 2).sum(axis=1))
+        shifts = per_image(np.outer(follow, follow) * (beside / (by_focal @ follow)) ** 2)
         if (shifts > large).any():
             doubtful, off = True, shifts
             judged = _Prediction(usual.gain, 0.0, shifts, np.zeros_like(shifts), USUAL_FOCAL)
@@ -328,47 +329,69 @@ def _inliers(adjuster: BundleAdjuster, fit: Fit) -> Observations:
     )
 
 
-def _displacements(answers: _Answers, fit: Fit, count: int, cameras: Sequence[Camera]) -> tuple[FloatArray, IntArray]:
-    """How far points all over the images move in them (P, 2, K + S), pixels, and the image of each (P,).
+def _displacements(answers: _Answers, fit: Fit, count: int, cameras: Sequence[Camera]) -> FloatArray:
+    """How far points all over each image move in it, pixels, as mean products (N, K + S, K + S) of what moves them.
 
-    With the first K effects, of unit size, and with the shared parameters; up to one homography of the whole.
+    These are the first K effects, of unit size, and the shared parameters; up to one homography of the whole.
     """
     grid = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, _SIDE)] * 2), axis=-1).reshape(-1, 2)
-    points = np.concatenate([camera.normalize(grid * (np.array(camera.image_size) - 1.0)) for camera in cameras])
-    images = np.repeat(np.arange(len(cameras)), len(grid))
     free, parameters = answers.adjuster.free, fit.adjusted.parameters
 
-    def ground(measured: FloatArray, parameters: Parameters = parameters) -> FloatArray:
-        """Where measured points lie on the plane; NaN beyond the horizon."""
-        matrices = fit.model.matrices(parameters.poses, parameters.shared).matrices
-        return mapped(inverses(matrices)[images], undistorted(measured, parameters.lens))
+    def ground(measured: FloatArray, images: IntArray, at: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """Where measured points lie on the plane, by the images' matrices and the lens; NaN beyond the horizon."""
+        return mapped(at[0][images], undistorted(measured, at[1]))
 
-    here, columns = ground(points), []
+    def state(parameters: Parameters) -> tuple[FloatArray, FloatArray]:
+        return inverses(fit.model.matrices(parameters.poses, parameters.shared).matrices), parameters.lens
+
     of_shared = np.sqrt(np.maximum(np.diag(answers.covariance), 1e-300))
-    steps = [(points + _STEP * effect.displacement(points, images), _STEP) for effect in answers.effects[:count]]
-    steps += [(points, _STEP * std) for std in of_shared.tolist()]
-    for index, (measured, size) in enumerate(steps):
-        column = index if index < count else index - count - len(of_shared)
+    sizes = [_STEP] * count + (_STEP * of_shared).tolist()
+    columns = [*range(count), *range(len(answers.effects), answers.poses.shape[1])]
+    moved = []
+    for size, column in zip(sizes, columns, strict=True):
         poses = np.zeros(free.poses.shape)
         poses[free.poses] = answers.poses[:, column] * size
-        moved = parameters.retract(fit.model, poses, answers.shared[:, column] * size, free.lens)
-        columns.append((ground(measured, moved) - here) / size)
-    flat = (here - np.nanmean(here, axis=0)) / max(float(np.nanstd(here)), 1e-12)
-    frame = [
-        np.outer(axis_values, unit).reshape(-1, 2)
-        for axis_values in (np.ones(len(flat)), *flat.T)
-        for unit in np.eye(2)
-    ]
-    frame += [flat * flat[:, [axis]] for axis in (0, 1)]
-    by_point = [(ground(points + step) - ground(points - step)) / (2.0 * _STEP) for step in _STEP * np.eye(2)]
-    on_plane = np.stack([*columns, *frame], axis=2)
-    seen = np.isfinite(on_plane).all(axis=(1, 2)) & np.isfinite(by_point).all(axis=(0, 2))
-    images = images[seen]
-    scale = np.array([camera.scale for camera in cameras])[images, None, None]
-    in_image = np.linalg.solve(np.stack(by_point, axis=2)[seen], on_plane[seen]) * scale
-    changes, by_frame = np.split(in_image, [len(columns)], axis=2)
-    known = np.linalg.lstsq(by_frame.reshape(-1, len(frame)), changes.reshape(-1, len(columns)), rcond=None)[0]
-    return changes - by_frame @ known, images
+        moved.append(state(parameters.retract(fit.model, poses, answers.shared[:, column] * size, free.lens)))
+    here = state(parameters)
+
+    def measured(images: IntArray, places: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Places (P, 2) of these images, as shares of each, in half diagonals; and the image of each."""
+        points = [cameras[k].normalize(places * (np.array(cameras[k].image_size) - 1.0)) for k in images]
+        return np.concatenate(points), np.repeat(images, len(places))
+
+    every = np.arange(len(cameras))
+    corners = ground(*measured(every, grid[[0, _SIDE - 1, -_SIDE, -1]]), here)
+    middle, spread = np.nanmean(corners, axis=0), max(float(np.nanstd(corners)), 1e-12)
+    products, points = [], []
+    for images in np.split(every, np.arange(_IMAGES_AT_ONCE, len(every), _IMAGES_AT_ONCE)):
+        at, of = measured(images, grid)
+        on_ground, on_plane = ground(at, of, here), []
+        for index, (size, now) in enumerate(zip(sizes, moved, strict=True)):
+            step = size * answers.effects[index].displacement(at, of) if index < count else 0.0
+            on_plane.append((ground(at + step, of, now) - on_ground) / size)
+        flat = (on_ground - middle) / spread
+        on_plane += [
+            np.outer(values, unit).reshape(-1, 2) for values in (np.ones(len(flat)), *flat.T) for unit in np.eye(2)
+        ]
+        on_plane += [flat * flat[:, [axis]] for axis in (0, 1)]
+        by_point = np.stack(
+            [(ground(at + step, of, here) - ground(at - step, of, here)) / (2.0 * _STEP) for step in _STEP * np.eye(2)],
+            axis=2,
+        )
+        changes = np.stack(on_plane, axis=2)
+        seen = np.isfinite(changes).all(axis=(1, 2)) & np.isfinite(by_point).all(axis=(1, 2))
+        changes[~seen], by_point[~seen] = 0.0, np.eye(2)
+        scale = np.array([cameras[k].scale for k in images])[:, None, None]
+        in_image = np.linalg.solve(by_point, changes).reshape(len(images), -1, changes.shape[2]) * scale
+        products.append(np.swapaxes(in_image, 1, 2) @ in_image)
+        points.append(seen.reshape(len(images), -1).sum(axis=1))
+    every_product = np.concatenate(products)
+    total, first = every_product.sum(axis=0), len(sizes)
+    known = np.linalg.lstsq(total[first:, first:], total[first:, :first], rcond=None)[0]
+    without_frame = np.concatenate([np.eye(first), -known])
+    return np.asarray(
+        without_frame.T @ every_product @ without_frame / np.maximum(np.concatenate(points), 1)[:, None, None]
+    )
 
 
 def _cause(effects: Sequence[Effect], sizes: FloatArray, covariance: FloatArray) -> str:

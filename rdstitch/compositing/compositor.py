@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.panorama_canvas import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.preparation import Decisions, prepare_composite
@@ -21,6 +20,7 @@ from rdstitch.io.encoding import Layout
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, check_memory, write_strips
+from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.results.messages import Message
 from rdstitch.system.outputs import Fingerprint, Outputs
 from rdstitch.system.progress import ShareProgress, unheard

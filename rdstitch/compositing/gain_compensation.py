@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.compositing.boxes import Float32Array, cut
-from rdstitch.compositing.composite_options import ExposureMethod
 from rdstitch.compositing.photometric import KNEE, Exposure, bilinear_weights, full_scale, no_exposure, squared_radius
 from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.survey import Survey, SurveyTile
 from rdstitch.geometry.camera import Camera
+from rdstitch.options.composite_options import ExposureMethod
 from rdstitch.system.late_imports import sparse
 
 # Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.

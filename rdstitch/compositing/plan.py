@@ -7,10 +7,10 @@ import numpy as np
 
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.source_images import OPACITY_BYTES
 from rdstitch.errors import LimitError
 from rdstitch.geometry.camera import Camera
+from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.system.machine import available_memory, processor_count
 
 _SHARE, _LEAST = 0.25, 400 * 2**20  # of the memory that is available, and bytes that are taken in any case

@@ -9,7 +9,6 @@ from typing import Self
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.photometric import Exposure, no_exposure
@@ -23,6 +22,7 @@ from rdstitch.compositing.survey import covered_pixels, crop_box, crop_rows, sur
 from rdstitch.compositing.tiles import BlockRunner, OutputStrip, TiledOutput, strips_of_blocks
 from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError
+from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.results.messages import Message
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.system.progress import ShareProgress, unheard

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.blender import MultibandBlender, margin, per_channel, rounding_constant
 from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, grown, intersection, without
-from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
 from rdstitch.compositing.warp import Geometry, Warp, border_weight, locate, sample, sample_opacity
+from rdstitch.options.composite_options import CompositeOptions
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array, cut
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.photometric import DEPTHS, full_scale
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.render import Layer
 from rdstitch.compositing.source_images import LoadedImage, PlacedImage, smoothed
 from rdstitch.compositing.warp import INTERPOLATION, remap, sample_places
 from rdstitch.errors import ArgumentError
+from rdstitch.options.composite_options import CompositeOptions
 
 
 @dataclass(frozen=True, eq=False)

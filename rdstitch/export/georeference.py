@@ -5,8 +5,8 @@ The output is a plane seen straight from above, so that a similarity takes its p
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -212,6 +212,8 @@ class Located:
     nadirs: Sequence[tuple[float, float, float] | None] = ()  # straight down by each camera's attitude, where known
     control: Sequence[Sequence[GroundControl]] = ()
     relief: float = 0.0  # pixels of the images that neighbours are off together: hills on what is mapped as a plane
+    # how far positions, by the number of their image, and control points, by name, put themselves where the images are
+    leverage: Mapping[int | str, float] = field(default_factory=dict)
 
 
 def georeference(located: Located, epsg: int | None = None, *, force: bool = False) -> tuple[Georeference | None, str]:
@@ -236,9 +238,9 @@ def _by_positions(located: Located, epsg: int | None, force: bool) -> tuple[Geor
     views = views_of(located.cameras, located.to_output, located.nadirs).of(known)
     std = np.array([(np.nan, np.nan) if place.std is None else place.std for place in places])
     names = [name for name, is_known in zip(located.names, known.tolist(), strict=True) if is_known]
-    return _placed(
-        located, views, [(p.latitude, p.longitude) for p in places], _altitudes(places), std, names, epsg, force, GPS
-    )
+    leverage = [located.leverage.get(k, 0.0) for k in np.flatnonzero(known).tolist()]
+    degrees = [(p.latitude, p.longitude) for p in places]
+    return _placed(located, views, degrees, _altitudes(places), std, leverage, names, epsg, force, GPS)
 
 
 def _altitudes(places: Sequence[GpsPosition]) -> FloatArray:
@@ -264,7 +266,9 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
     std = np.array([[np.nan if point.std is None else point.std] * 2 for point, _ in control])
     degrees = [(point.place.latitude, point.place.longitude) for point, _ in control]
     names = [point.name for point, _ in control]
-    place, reason = _placed(located, views, degrees, np.full(len(names), np.nan), std, names, epsg, force, CONTROL)
+    leverage = [located.leverage.get(name, 0.0) for name in names]
+    none = np.full(len(names), np.nan)
+    place, reason = _placed(located, views, degrees, none, std, leverage, names, epsg, force, CONTROL)
     if place is None or not checks:
         return place, reason
     latitude, longitude = np.array([(p.place.latitude, p.place.longitude) for p, _ in checks]).T
@@ -282,6 +286,7 @@ def _placed(
     degrees: Sequence[tuple[float, float]],
     altitude: FloatArray,
     accuracy: FloatArray,
+    leverage: Sequence[float],
     names: Sequence[str],
     epsg: int | None,
     force: bool,
@@ -295,7 +300,8 @@ def _placed(
     usable: BoolArray = np.isfinite(places) & views.usable
     if usable.sum() < MIN_POSITIONS:
         return None, f"{crs.name} does not reach the {source}"
-    fit = fit_map(views.of(usable), places[usable], altitude[usable], accuracy[usable], map_scale)
+    own = np.array(leverage)[usable]
+    fit = fit_map(views.of(usable), places[usable], altitude[usable], accuracy[usable], map_scale, own)
     used = np.zeros(len(names), dtype=bool)
     used[usable] = fit.used
     off = np.full(len(names), complex(np.inf))

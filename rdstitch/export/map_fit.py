@@ -148,7 +148,12 @@ class MapFit:
 
 
 def fit_map(
-    views: Views, places: ComplexArray, altitude: FloatArray, std: FloatArray, map_scale: float = 1.0
+    views: Views,
+    places: ComplexArray,
+    altitude: FloatArray,
+    std: FloatArray,
+    map_scale: float = 1.0,
+    leverage: FloatArray | float = 0.0,
 ) -> MapFit:
     """Fit positions of cameras or points.
 
@@ -165,13 +170,16 @@ def fit_map(
         residuals are larger, these count.
     map_scale : float
         Metres of the map per metre on the ground.
+    leverage : ndarray of shape (N,)
+        How far the place has put itself already where the views have it, 0 to 1.
     """
+    leverage = np.broadcast_to(leverage, len(places))
     declared = bool(np.isfinite(std).any())
     std = np.where(np.isfinite(std), std, POSITION_STD if declared else 1.0)
-    level = _fitted(views, places, altitude, std, map_scale, declared, 0.0)
+    level = _fitted(views, places, altitude, std, map_scale, declared, leverage, 0.0)
     if level is None or not _has_altitudes(views, altitude).any():
         return level or _no_fit(len(places))
-    sloping = _fitted(views, places, altitude, std, map_scale, declared, SLOPE_STD)
+    sloping = _fitted(views, places, altitude, std, map_scale, declared, leverage, SLOPE_STD)
     return sloping if sloping is not None and sloping.slope_squared > _SHOWN**2 else level
 
 
@@ -186,6 +194,7 @@ def _fitted(
     std: FloatArray,
     map_scale: float,
     declared: bool,
+    leverage: FloatArray,
     slope_std: float,
 ) -> MapFit | None:
     """The fit of ground that slopes by so many radians."""
@@ -215,11 +224,13 @@ def _fitted(
         weights = 1.0 / (1.0 + (away / width) ** 2) ** 2
         used = away <= width
         own = np.stack([hat[:, 0, 0] + hat[:, 1, 1], hat[:, 2, 2]], axis=1).sum(axis=0)
-        squares, counts = (weights * away**2).sum(axis=0), (weights * (2.0, 1.0)).sum(axis=0)
+        taken = (1.0 - leverage) / np.maximum(1.0 - (hat[:, 0, 0] + hat[:, 1, 1]) / 2.0, 1.0 - leverage)
+        squares = (weights * away**2 / np.stack([taken, np.ones_like(taken)], axis=1)).sum(axis=0)
+        counts = (weights * (2.0, 1.0)).sum(axis=0)
         noise = np.maximum(np.sqrt(squares / np.maximum(counts - own, 0.25 * counts)), least)
         if not declared:  # no receiver measures heights better than places
             noise[1] = max(noise)
-    left_out = np.linalg.solve(np.eye(3) - hat, residual[..., None])[..., 0]
+    left_out = np.linalg.solve(np.eye(3) - hat, residual[..., None])[..., 0] / taken[:, None]
     ground = scale * (views.ground - middle)
     turned = np.stack([np.stack([ground.real, -ground.imag]), np.stack([ground.imag, ground.real])], axis=-1)
     moved = np.concatenate([turned, np.tile(np.eye(2)[:, None], (1, len(places), 1))], axis=-1)

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.choices import TrajectoryFrame
 from rdstitch.errors import OutputError
 from rdstitch.export.trajectory_files import (
     NOT_MEASURED,
-    TrajectoryFrame,
     has_times,
     heading,
     positions_in_frame,

@@ -17,14 +17,12 @@ where it points down.
 import csv
 import io
 from collections.abc import Callable
-from typing import Literal
 
 import numpy as np
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
-
-TrajectoryFrame = Literal["enu", "camera", "ros"]
+from rdstitch.choices import TrajectoryFrame
 
 AXES: dict[TrajectoryFrame, FloatArray] = {
     "enu": np.array([[1.0, 0.0], [0.0, -1.0]]),

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features.feature_options import CLOSER, FeatureOptions
 from rdstitch.features.keypoints import Features
 from rdstitch.features.learned import AlikedDetection
 from rdstitch.features.opencv import LARGE, OpenCVDetection, SiftTilesDetection
 from rdstitch.features.prepared_image import CLIP_LIMIT, Mask, PixelArray, PreparedImage, View, prepare
 from rdstitch.features.surf.descriptor import SurfDetection
+from rdstitch.options.feature_options import CLOSER, FeatureOptions
 
 _MIN_KEYPOINT_SHARE = 0.5  # of the keypoints wanted: where a reduced image shows fewer, a larger one is used
 _SPREAD_CELL = 0.05  # side of a cell over which keypoints are spread, diagonals of the image

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.features.feature_options import FeatureOptions
 from rdstitch.features.keypoints import Correspondences, Features
+from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.system.opencv_state import silent_opencv
 
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.features.feature_options import FeatureOptions
 from rdstitch.features.keypoints import Descriptors, Features
+from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.system.process_memory import scratch_memory
 
 Grey = NDArray[np.uint8]

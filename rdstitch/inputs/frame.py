@@ -4,19 +4,19 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import cv2
 import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
+from rdstitch.choices import ChannelOrder
 from rdstitch.errors import ArgumentError
 from rdstitch.io.metadata import Metadata, metadata_of
 from rdstitch.io.read import DecodedImage, as_image, from_pillow
 from rdstitch.system.file_access import canonical_name
 
-ChannelOrder = Literal["bgr", "rgb"]
 """Order of the colour channels of arrays that come in and go out: OpenCV's, or everybody else's."""
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
+from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import tilt_from_normal, turned_tilt
 from rdstitch.inputs.frame import Frame
@@ -26,7 +27,6 @@ _NAMES = "name filename file image imagename"
 _TIME = "timestamp time stamp"
 _TILT_COLUMNS = {"name": _NAMES, "timestamp": _TIME} | {name: name for name in ("psi", "theta", "qx", "qy", "qz", "qw")}
 _MAX_TILT = math.radians(80.0)  # beyond, hardly an image shows ground, and more likely angles mean something else
-_EARTH = 6_371_000.0  # m
 _TIME_COLUMNS = {"name": _NAMES, "timestamp": _TIME}
 
 
@@ -142,18 +142,16 @@ def positions_of(sources: Sequence[Source]) -> FloatArray:
 
 
 def metres_around_median(known: Sequence[GpsPosition | None]) -> FloatArray:
-    """Metres east and north (N, 2) of the median of positions; NaN where unknown."""
+    """Metres east and north (N, 2) of the median of positions, on a conformal map; NaN where unknown."""
     degrees = [(np.nan, np.nan) if gps is None else (gps.latitude, gps.longitude) for gps in known]
-    latitude, longitude = np.radians(np.array(degrees, dtype=np.float64).reshape(-1, 2)).T
-    if np.isnan(latitude).all():
+    latitude, longitude = np.array(degrees, dtype=np.float64).reshape(-1, 2).T
+    if not (places := np.isfinite(latitude)).any():
         return np.full((len(known), 2), np.nan)
-    up = np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
-    x, y, z = np.nanmedian(up, axis=1)
-    level = max(float(np.hypot(x, y)), 1e-12)
-    east = np.array([-y, x, 0.0]) / level
-    north = np.array([-x * z / level, -y * z / level, level])
-    metres: FloatArray = _EARTH * (np.stack([east, north / np.linalg.norm(north)]) @ up).T
-    return metres
+    metres = np.full((len(known), 2), np.nan)
+    metres[places] = Crs.nearest(latitude[places], longitude[places]).project(latitude[places], longitude[places])
+    metres[~np.isfinite(metres).all(axis=1)] = np.nan
+    around: FloatArray = metres - np.nanmedian(metres, axis=0)
+    return around
 
 
 def timestamps_of(sources: Sequence[Source]) -> FloatArray:

@@ -13,7 +13,7 @@ a coordinate system, then lines   OpenDroneMap's ``geo.txt``: NAME X Y [Z … HO
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,6 +41,20 @@ _COLUMNS = {
     "east_std": "rtkstdlon eaststd",
     "up_std": "rtkstdhgt upstd verticalaccuracy vaccuracy vacc",
 }
+_ACCURACIES = {name: aliases for name, aliases in _COLUMNS.items() if name.endswith("std")}
+_CONTROL = {
+    "name": "image imagename filename file photo",
+    "point": "name gcpname gcp point label marker",
+    "latitude": _COLUMNS["latitude"],
+    "longitude": _COLUMNS["longitude"],
+    "x": "x easting east geox xeasting",
+    "y": "y northing north geoy ynorthing",
+    "px": "px imx pixelx column u",
+    "py": "py imy pixely row v",
+    **_ACCURACIES,
+}
+_CONTROL_WANTED = ("x,y,px,py,name", "longitude,latitude,px,py,name")
+_CONTROL_LISTED = ("x", "y", "z", "px", "py", "name")
 _SIDES = (("latitude", "south"), ("longitude", "west"))
 _LISTED = ("name", "x", "y", "altitude", "yaw", "pitch", "roll", "north_std", "up_std")  # in geo.txt
 _WANTED = ("name,latitude,longitude", "name,x,y")
@@ -49,11 +63,28 @@ _RECORDS = "a list of objects with SourceFile, GPSLatitude and GPSLongitude"
 
 
 def with_positions(
-    sources: Sequence[Source], file: str | Path | None, epsg: int | None = None, offset: float = 0.0
+    sources: Sequence[Source],
+    file: str | Path | None,
+    epsg: int | None = None,
+    offset: float = 0.0,
+    accuracy: float | None = None,
 ) -> list[Source]:
-    """The sources with the positions of a file, if there is one, instead of those of EXIF."""
-    if file is None:
-        return list(sources)
+    """The sources with the positions of a file, if there is one, instead of those of EXIF.
+
+    ``accuracy`` is the standard deviation of a horizontal coordinate, m, where they have none of their own; heights are
+    half as accurate.
+    """
+    places = [source.metadata.gps for source in sources] if file is None else _places(sources, file, epsg, offset)
+    if accuracy is not None:
+        std = (accuracy, 2.0 * accuracy)
+        places = [place and (replace(place, std=std) if place.std is None else place) for place in places]
+    return [
+        source if place is source.metadata.gps else replace(source, metadata=replace(source.metadata, gps=place))
+        for source, place in zip(sources, places, strict=True)
+    ]
+
+
+def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offset: float) -> list[GpsPosition | None]:
     text, name = read_text(file), str(file)
     system = None if epsg is None else NamedSystem(f"EPSG:{epsg}", epsg)
     lines = text.split("\n", 1)
@@ -75,10 +106,7 @@ def with_positions(
         places = [table.get(called[source.name]) for source in sources]
         if not any(places):
             raise InputError(f"{file}: has no position of {sources[0].name}, nor of any other of the images")
-    return [
-        replace(source, metadata=replace(source.metadata, gps=place))
-        for source, place in zip(sources, places, strict=True)
-    ]
+    return places
 
 
 def _table(rows: Iterable[Row], file: str, system: NamedSystem | None) -> dict[str, GpsPosition]:
@@ -155,45 +183,67 @@ def _same_names(sources: Sequence[Source], listed: Iterable[str]) -> dict[str, s
     return found
 
 
-def with_ground_control(sources: Sequence[Source], file: str | Path | None, *, check: bool = False) -> list[Source]:
-    """The sources with the ground control points that they show by OpenDroneMap's ``gcp_list.txt``, if there is one.
+def with_ground_control(
+    sources: Sequence[Source], file: str | Path | None, epsg: int | None = None, *, check: bool = False
+) -> list[Source]:
+    """The sources with the ground control points that they show by a list, if there is one.
 
-    Its first line names the coordinate system, each other one is ``X Y Z PX PY IMAGE [NAME]``: pixels of the upright
-    image, the centre of the top-left one at (0, 0). Points to ``check`` come besides those that the sources have.
+    Its first line names the coordinate system, else it is ``epsg``; then lines as OpenDroneMap's, ``X Y Z PX PY IMAGE
+    [NAME]``, or CSV with a header: pixels of the upright image, the centre of the top-left one at (0, 0). Points to
+    ``check`` come besides those that the sources have.
     """
     if file is None:
         return list(sources)
-    first, *lines = read_text(file).splitlines() or [""]
+    text = read_text(file)
+    first, _, rest = text.partition("\n")
     system = NamedSystem.named_by(first)
+    header = next((line for line in (rest if system else text).splitlines() if line.strip()), "")
+    if re.match(r"\W*[A-Za-z_ ./()]+[,;\t]", header):
+        rows = csv_rows(f"\n{rest}" if system else text, str(file), _CONTROL, _CONTROL_WANTED, _UNITS)
+        rows = [replace(row, values={**row.values, "name": row.image}) for row in rows]
+        geographic = any("latitude" in row.values for row in rows)
+        code = WGS84 if geographic else epsg
+        system = system or (None if code is None else NamedSystem(f"EPSG:{code}", code))
+    else:
+        rows = list(_opendronemap(text, str(file)))
     if system is None:
-        raise InputError(f"{file}: line 1: expected a coordinate system like EPSG:32632 or WGS84 UTM 32N")
+        raise InputError(
+            f"{file}: line 1: expected a coordinate system like EPSG:32632 or WGS84 UTM 32N; or give --crs"
+        )
     sizes = {source.name: source.metadata.size for source in sources}
-    shown: list[tuple[str, str, FloatArray]] = []
-    for number, line in enumerate(lines, start=2):
+    shown: list[tuple[str, str, tuple[float, float], tuple[float, float], float | None]] = []
+    for row in rows:
+        image, point = _image_and_point(" ".join(filter(None, map(row.values.get, ("name", "point")))), sizes)
+        if image is None:
+            continue
+        x, y = (row.needed(names[names[0] not in row.values]) for names in (("longitude", "x"), ("latitude", "y")))
+        pixel = row.needed("px"), row.needed("py")
+        if not all(-0.5 <= at < side - 0.5 for at, side in zip(pixel, sizes[image], strict=True)):
+            raise InputError(f"{row.where}: is not within the {'{} x {}'.format(*sizes[image])} pixels of {image}")
+        accuracy = _accuracy(row)
+        shown.append((image, point or f"{x:.12g} {y:.12g}", (x, y), pixel, accuracy and accuracy[0]))
+    if not shown:
+        raise InputError(f"{file}: has no ground control point in any of the images")
+    places = _geographic(system, np.array([place for _, _, place, _, _ in shown]), str(file))
+    on_map = system.epsg is not None and system.epsg != WGS84 and Crs.in_metres(system.epsg) is not None
+    code = system.epsg if on_map and system.epsg is not None else WGS84
+    control: dict[str, list[GroundControl]] = {}
+    for (image, name, _, pixel, std), degrees in zip(shown, places, strict=True):
+        one = GroundControl(name, GpsPosition(*degrees), code, pixel, std, check=check)
+        control.setdefault(image, []).append(one)
+    return [replace(source, control=(*source.control, *control.get(source.name, ()))) for source in sources]
+
+
+def _opendronemap(text: str, file: str) -> Iterator[Row]:
+    """The lines of a ``gcp_list.txt`` after its first; what follows the numbers is an image and a point."""
+    for number, line in enumerate(text.splitlines()[1:], start=2):
         fields = line.split(maxsplit=5)
         if not fields or fields[0].startswith("#"):
             continue
-        try:
-            values, rest = np.array([float(field) for field in fields[:5]]), canonical_text(fields[5].strip())
-        except (ValueError, IndexError):
-            raise InputError(f"{file}: line {number}: expected X Y Z PX PY IMAGE [NAME]") from None
-        image, point = _image_and_point(rest, sizes)
-        if image is None:
-            continue
-        if not ((values[3:] >= -0.5) & (values[3:] < np.array(sizes[image]) - 0.5)).all():
-            size = "{} x {}".format(*sizes[image])
-            raise InputError(f"{file}: line {number}: is not within the {size} pixels of {image}")
-        shown.append((image, point or " ".join(fields[:2]), values))
-    if not shown:
-        raise InputError(f"{file}: has no ground control point in any of the images")
-    places = _geographic(system, np.array([values[:2] for _, _, values in shown]), str(file))
-    on_map = system.epsg is not None and system.epsg != WGS84 and Crs.in_metres(system.epsg) is not None
-    epsg = system.epsg if on_map and system.epsg is not None else WGS84
-    control: dict[str, list[GroundControl]] = {}
-    for (image, name, values), place in zip(shown, places, strict=True):
-        pixel = (float(values[3]), float(values[4]))
-        control.setdefault(image, []).append(GroundControl(name, GpsPosition(*place), epsg, pixel, check=check))
-    return [replace(source, control=(*source.control, *control.get(source.name, ()))) for source in sources]
+        row = Row(f"{file}: line {number}", dict(zip(_CONTROL_LISTED, fields, strict=False)), ".")
+        if len(fields) < 6:
+            raise InputError(f"{row.where}: expected X Y Z PX PY IMAGE [NAME]")
+        yield replace(row, values={**row.values, "name": canonical_text(fields[5].strip())})
 
 
 def _image_and_point(text: str, names: Iterable[str]) -> tuple[str | None, str]:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
-from rdstitch.features.feature_options import WORK_MEGAPIXELS
 from rdstitch.features.prepared_image import View, halving
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse, turned_size
@@ -24,6 +23,7 @@ from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import GroundControl, Metadata, read_metadata
 from rdstitch.io.read import DecodedImage, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
+from rdstitch.options.feature_options import WORK_MEGAPIXELS
 from rdstitch.results.messages import Message, left_out
 from rdstitch.system.cache import Cache
 from rdstitch.system.file_access import held_in_memory, is_url

@@ -10,20 +10,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.choices import ZPlane
 from rdstitch.errors import InputError
 from rdstitch.io.metadata import MICROMETRES, ome_pixel_size, ome_tree
 from rdstitch.io.opening import TIFF_MAGIC, decoding
 from rdstitch.io.read_tiff import read_page
 from rdstitch.system.file_access import canonical_name, canonical_text, open_regular
 from rdstitch.system.late_imports import tifffile
-
-ZPlane = int | Literal["max"]
 
 _FOLDER_METADATA = "metadata.txt"
 _COUNTED = "CZT"

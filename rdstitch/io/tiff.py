@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
+from xml.sax.saxutils import escape
 
 import deflate
 import numpy as np
@@ -32,7 +33,7 @@ _MIN_OVERVIEW = 256
 _BUFFER = 2**24
 _LEVEL = 1  # of 1 to 12: 2 takes 1.7 times as long and makes files 2 % smaller
 _BIGTIFF_FROM = 2**32 - 2**27
-_XMP = 700
+_XMP, _GDAL_METADATA = 700, 42112
 _OFFSETS = (324, 273)  # of tiles and strips
 _ENTRY = "HH"  # of a directory, before count and value
 _DPI = 150  # offsets of cropped files are counted in inches; any resolution will do
@@ -52,7 +53,7 @@ def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: 
     with tifffile.TiffWriter(path, bigtiff=total > _BIGTIFF_FROM) as tiff:
         for size, passing in pyramid(sizes, joined, path.parent, transparent=layout.transparent):
             kind = 0 if size == layout.size else _REDUCED
-            tags = [] if kind else [*_copied_tags(layout.metadata), *extra_tags]
+            tags = [] if kind else [*_copied_tags(layout.metadata), *_band_names(layout), *extra_tags]
             shown = passing if mask is None else _without_alpha(passing, mask)
             _write_page(tiff, layout, size, shown, tags, kind)
             if mask is not None:
@@ -60,6 +61,39 @@ def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: 
                 mask.clear()
     if len(sizes) > 1:
         _put_in_order(path)
+
+
+def written_strips(path: Path) -> Iterator[Strip]:
+    """The strips of a file that :func:`write_tiff` has made of grey images, or of others, with or without alpha."""
+    with tifffile.TiffFile(path) as tiff:
+        page, *others = tiff.pages
+        assert isinstance(page, tifffile.TiffPage)
+        mask = next((each for each in (other.aspage() for other in others) if each.subfiletype == _MASK), None)
+        width, height = page.imagewidth, page.imagelength
+        across, last_is_alpha = -(-width // _TILE), any(page.extrasamples[-1:])
+        for top in range(0, height, _TILE):
+            first = top // _TILE * across
+            rows = [
+                np.concatenate([_tile(tiff, each, first + k) for k in range(across)], axis=1)[: height - top, :width]
+                for each in (page, mask)
+                if each is not None
+            ]
+            if mask is not None:
+                yield rows[0], np.where(rows[1][..., 0] > 0, 255, 0).astype(np.uint8)
+            elif last_is_alpha:
+                full = np.iinfo(rows[0].dtype).max if rows[0].dtype.kind == "u" else 1.0
+                yield rows[0][..., :-1], np.rint(rows[0][..., -1] * (255.0 / full)).astype(np.uint8)
+            else:
+                yield rows[0], None
+
+
+def _tile(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage", index: int) -> NDArray[Any]:
+    """A tile (h, w, C), completed."""
+    tiff.filehandle.seek(page.dataoffsets[index])
+    samples, _, _ = page.decode(tiff.filehandle.read(page.databytecounts[index]), index)
+    assert samples is not None
+    tile = samples[0]
+    return np.pad(tile, [(0, _TILE - tile.shape[0]), (0, _TILE - tile.shape[1]), (0, 0)])
 
 
 def _has_mask(layout: Layout) -> bool:
@@ -79,7 +113,7 @@ def _write_page(
     width, height = size
     transparent = layout.transparent and not _has_mask(layout)
     samples = layout.channels + transparent
-    colour = 3 if layout.channels == 3 else 1
+    colour = 3 if layout.channels == 3 and not layout.metadata.planes else 1
     extra = ["unspecified"] * (layout.channels - colour) + ["unassalpha"] * transparent
     dpi = None if kind else layout.metadata.dpi
     tiff.write(
@@ -153,6 +187,16 @@ def _encoded_tile(tile: NDArray[Any]) -> bytes:
 def _deflated(stored: NDArray[Any]) -> bytes:
     """Compressed by libdeflate, which is fast, and makes the same bytes of the same samples every time."""
     return bytes(deflate.zlib_compress(stored, _LEVEL))
+
+
+def _band_names(layout: Layout) -> Iterator[ExtraTag]:
+    """Names of bands, as GDAL has them."""
+    if layout.metadata.planes and len(layout.metadata.channel_names) == layout.channels:
+        items = "".join(
+            f'<Item name="DESCRIPTION" sample="{number}" role="description">{escape(name)}</Item>'
+            for number, name in enumerate(layout.metadata.channel_names)
+        )
+        yield _GDAL_METADATA, 2, 0, f"<GDALMetadata>{items}</GDALMetadata>".encode(), True
 
 
 def _copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:

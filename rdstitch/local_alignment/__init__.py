@@ -1,10 +1,8 @@
 """Local alignment: a smooth residual warp per image, where the scene has depth that no plane and no turn explains."""
 
 from rdstitch.local_alignment.estimate import (
-    MAX_CELLS,
     HeldOut,
     LocalAlignment,
-    LocalAlignmentMode,
     align_locally,
     no_local_alignment,
 )
@@ -12,11 +10,9 @@ from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.matches import Match
 
 __all__ = [
-    "MAX_CELLS",
     "DisplacementField",
     "HeldOut",
     "LocalAlignment",
-    "LocalAlignmentMode",
     "Match",
     "align_locally",
     "no_local_alignment",

@@ -13,12 +13,10 @@ from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
 
-LocalAlignmentMode = Literal["auto", "off"] | int
-
-MAX_CELLS = 100
-_CELLS = 12
-# Of the grids of all images together: of more than some 800 images the cells are larger, to bound memory.
-_MAX_NODES = 120_000
+# Of a grid that finds what is far from the plane, and of the one that is used; and how many nodes the grids of all
+# images together may have: of more than some 70 images the finer one is coarser, of more than 800 both, to bound time
+# and memory.
+_COARSE, _FINE = (12, 120_000), (24, 40_000)
 _SLOPES = (0.2, 0.06, 0.02)
 _HELD_OUT = 5  # every fifth match
 # Share by which what a person sees must get less for local alignment to be worth while.
@@ -106,14 +104,17 @@ def align_locally(
         return no_local_alignment("there are too few matches")
     if choice == "auto" and (agreement := _agreement_of_neighbours(placed)) < _MIN_AGREEMENT:
         return no_local_alignment(f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only")
-    cells = max(2, min(_CELLS, math.isqrt(_MAX_NODES // len(cameras)))) if choice == "auto" else choice
+    coarse, fine = (max(2, min(cells, math.isqrt(nodes // len(cameras)))) for cells, nodes in (_COARSE, _FINE))
+    cells = max(coarse, fine) if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
     fitted, tested = placed.take(~held_out), placed.take(held_out)
     before, off = HeldOut.of(tested.residual), _seen(tested.residual)
-    # The freest finds what is far from the plane; the stiffer ones start from there.
+    # The freest on a coarse grid finds what is far from the plane; the others start from there.
     tried: list[tuple[float, PlacedFields, FloatArray]] = []
+    fields = fit_fields(fitted, images, Stiffness(min(coarse, cells), _SLOPES[0]))
     for slope in _SLOPES:
-        fields = fit_fields(fitted, images, Stiffness(cells, slope), tried[-1][1] if tried else None)
+        if fields.stiffness != Stiffness(cells, slope):
+            fields = fit_fields(fitted, images, Stiffness(cells, slope), fields)
         left = fields.explain(tested)[0]
         tried.append((_seen(left), fields, left))
     enough = (1.0 - _WORTHWHILE) * off if choice == "auto" else math.inf

@@ -13,7 +13,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.nearest_points import nearest_points
-from rdstitch.geometry.radial_homography import from_plane, to_plane
+from rdstitch.geometry.radial_homography import project
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.retrieval import Similarity, similarity
 from rdstitch.system.late_imports import sparse
@@ -32,6 +32,8 @@ _MIN_OVERLAP = 0.15  # share of the image of which more is seen in the other
 _PLACES_PER_SIDE = 10  # of an image, that are looked up in others
 _PARTNERS = 6  # pairs of an image that its place is found by; those that others choose come on top
 _CELLS_PER_SIDE = 4  # cells of an image, a side, that its partners are to cover
+
+_PAIRS_AT_ONCE = 1024
 
 Pairs = list[tuple[int, int]]
 
@@ -158,19 +160,28 @@ def neighbours(
         first, second = partners.get(i, set()), partners.get(j, set())
         return min(len(first), len(second)) < _PARTNERS or not first & second
 
-    return [
-        pair
-        for pair in sorted(_nearest_pairs(centres, known, _NEIGHBOURS) - tried)
-        if needed(*pair)
-        and any(_share_seen(cameras, homographies, *both) >= _MIN_OVERLAP for both in (pair, pair[::-1]))
-    ]
+    pairs = [pair for pair in sorted(_nearest_pairs(centres, known, _NEIGHBOURS) - tried) if needed(*pair)]
+    both = np.array([*pairs, *(pair[::-1] for pair in pairs)], dtype=np.intp).reshape(-1, 2)
+    seen = _shares_seen(cameras, homographies, both)
+    return [pair for pair, most in zip(pairs, seen.reshape(2, -1).max(axis=0), strict=True) if most >= _MIN_OVERLAP]
 
 
-def _share_seen(cameras: Sequence[Camera], homographies: FloatArray, i: int, j: int) -> float:
-    """Share of one image that another shows, by places on a grid over it."""
+def _shares_seen(cameras: Sequence[Camera], homographies: FloatArray, pairs: IntArray) -> FloatArray:
+    """Share of the first image of each pair (M, 2) that the second shows, by places on a grid over it, (M,)."""
     share = (np.arange(_PLACES_PER_SIDE) + 0.5) / _PLACES_PER_SIDE
-    places = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) * cameras[i].image_size - 0.5
-    across = to_plane(cameras[i], np.linalg.inv(homographies[j]) @ homographies[i], places)
-    seen = from_plane(cameras[j], np.eye(3), across)
-    with np.errstate(invalid="ignore"):
-        return float(((seen > -0.5) & (seen < np.array(cameras[j].image_size) - 0.5)).all(axis=1).mean())
+    grid = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2)
+    different = list(dict.fromkeys(cameras))  # most images are of one
+    of_image = np.array([different.index(camera) for camera in cameras])
+    result = np.empty(len(pairs))
+    for kinds in np.unique(of_image[pairs], axis=0):
+        chosen = np.flatnonzero((of_image[pairs] == kinds).all(axis=1))
+        first, second = (different[kind] for kind in kinds)
+        flat = first.normalize(first.undistort(grid * first.image_size - 0.5))
+        lifted = np.column_stack([flat, np.ones(len(flat))])
+        for part in np.split(chosen, np.arange(_PAIRS_AT_ONCE, len(chosen), _PAIRS_AT_ONCE)):
+            across = np.linalg.inv(homographies[pairs[part, 1]]) @ homographies[pairs[part, 0]]
+            seen = second.distort(second.denormalize(project(lifted @ np.swapaxes(across, 1, 2))))
+            with np.errstate(invalid="ignore"):
+                inside = (seen > -0.5) & (seen < np.array(second.image_size) - 0.5)
+            result[part] = inside.all(axis=2).mean(axis=1)
+    return result

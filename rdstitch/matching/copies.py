@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rdstitch.geometry.camera import border_of
 from rdstitch.geometry.radial_homography import transfer
 from rdstitch.matching.two_view import Pair, PairRegistration
 
@@ -44,7 +45,7 @@ def _is_copy(pair: PairRegistration) -> bool:
     relation = pair.relation
     if not relation or relation.camera.image_size != relation.camera2.image_size:
         return False
-    corners = relation.camera.normalize(relation.camera.outline(1))
+    corners = relation.camera.normalize(border_of(relation.camera.image_size, 1))
     with np.errstate(all="ignore"):
         moved = transfer(relation.homography, relation.distortion, corners, relation.camera.higher) - corners
     if not (np.linalg.norm(moved, axis=1) * relation.camera.scale < 2.0 * _SAME_PX).all():

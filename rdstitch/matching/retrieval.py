@@ -157,8 +157,10 @@ def _compare(weights: "sparse.csr_array") -> Similarity:
         following = alike[np.arange(len(rows)), np.minimum(rows + 1, count - 1)]
         next_one[rows] = following > high
         alike[np.arange(len(rows)), rows] = -1.0
-        best[rows] = np.argsort(-alike, axis=1, kind="stable")[:, :kept]
-        values[rows] = np.take_along_axis(alike, best[rows], axis=1)
+        nearest = np.sort(np.argpartition(-alike, kept - 1, axis=1)[:, :kept], axis=1)
+        of_nearest = np.take_along_axis(alike, nearest, axis=1)
+        order = np.argsort(-of_nearest, axis=1, kind="stable")
+        best[rows], values[rows] = (np.take_along_axis(one, order, axis=1) for one in (nearest, of_nearest))
     excess = np.maximum(values - (usual[:, None] + usual[best]) / 2.0, 0.0)
     ordered = bool(next_one[:-1].mean() > _MIN_SEQUENTIAL_SHARE)
     return Similarity(_with_shared_neighbours(best, excess), best, ordered)

@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.alignment.motion_models import MODELS
-from rdstitch.alignment.result import Alignment, LinkFit
+from rdstitch.alignment.result import Alignment, LinkFit, links_by_image
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.choices import Purpose
 from rdstitch.errors import PartialResultError, RegistrationError
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, names_of, told_once
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.cache import Cache
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding, messages_of
@@ -169,12 +169,13 @@ def _worst(registration: Registration, findings: Iterable[Finding]) -> Offenders
         said = zip(pairs, messages_of(pairs, registration), strict=True)
         return {finding.images: message for finding, message in said}
     used = [fit for fit in registration.alignment.links if fit.used]
-    fit_share = agreement(used, len(registration.sources))
+    fit_share, links_of = agreement(used, len(registration.sources)), links_by_image(used)
     chosen = dict[tuple[int, ...], Message]()
+    beside: set[int] = set()
     for image in sorted(single, key=lambda k: (fit_share[k], k)):
-        linked = {fit.image1 + fit.image2 - image for fit in used if image in (fit.image1, fit.image2)}
-        if not linked & _images(chosen).keys():
+        if image not in beside:
             (chosen[image,],) = messages_of([single[image]], registration)
+            beside |= {k for fit in links_of.get(image, []) for k in fit.images}
     return chosen
 
 

@@ -1,5 +1,6 @@
 """Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -11,21 +12,22 @@ from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames import stored, turned_alignment, turned_link, turned_tilts, turns
+from rdstitch.alignment.plane_marks import Sighting
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.exif_orientation import quarter_turn
-from rdstitch.inputs.measurements import positions_of
+from rdstitch.geometry.exif_orientation import inverse, quarter_turn, turning_matrix
+from rdstitch.inputs.measurements import metres_around_median, positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
 from rdstitch.matching.copies import copies_of, distinct
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.cache import Cache
 from rdstitch.system.file_access import canonical_name
 from rdstitch.system.process_memory import return_freed_memory
@@ -100,7 +102,8 @@ class Aligner:
         megapixels = options.features.for_images(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
         orientations = tuple(quarter_turn(source.metadata.orientation) for source in sources)
-        decided = replace(alignment_options(sources, options), purpose=purpose)
+        control = _sightings(sources, cameras)
+        decided = replace(alignment_options(sources, options), purpose=purpose, control=control)
         return cls(paths, cameras, decided, cache, options.threshold, orientations=orientations)
 
     @property
@@ -274,6 +277,7 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
     back = stored([quarter_turn(source.metadata.orientation) for source in sources])
     attitudes = [source.attitude for source in sources if source.attitude is not None]
     exact = bool(attitudes) and options.attitude_std == 0.0
+    places = [source.metadata.gps for source in sources]
     return AlignmentOptions(
         reference=_reference(sources, options.reference),
         model=options.model,
@@ -284,8 +288,21 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
         attitudes_std=options.attitude_std,
         gravity=_gravity(sources, back),
         positions=positions_of(sources) if sources else None,
+        positions_std=[math.nan if p is None or p.std is None else p.std[0] for p in places],
         pose_covariance=options.pose_covariance,
     )
+
+
+def _sightings(sources: Sequence[Source], cameras: Sequence[Camera]) -> tuple[Sighting, ...]:
+    """Ground control points in the images as the camera stored them, of the size that features are detected at."""
+    shown = [(k, point) for k, source in enumerate(sources) for point in source.control if not point.check]
+    metres = metres_around_median([point.place for _, point in shown])
+    sightings = []
+    for (k, point), (east, north) in zip(shown, metres.tolist(), strict=True):
+        stored_turn = turning_matrix(inverse(quarter_turn(sources[k].metadata.orientation)))
+        x, y = (stored_turn @ sources[k].camera.normalize(point.pixel) * cameras[k].scale).tolist()
+        sightings.append(Sighting(k, (x, y), point.name, (east, north), point.std))
+    return tuple(sightings)
 
 
 def _gravity(sources: Sequence[Source], back: Sequence[int]) -> FloatArray | None:

@@ -9,25 +9,26 @@ from typing import Any
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import ChannelOrder, MatchBy
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, PartialResultError
 from rdstitch.export.georeference import Georeference
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.inputs.find import found_images
-from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs
+from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.band_lens import BandLens, band_lens
 from rdstitch.pipeline.compose import check_world_files, compose_images, image_files, plainly_viewed, write_page
-from rdstitch.pipeline.counterparts import MatchBy, MatchedBy, counterparts, registered_files
+from rdstitch.pipeline.counterparts import MatchedBy, counterparts, registered_files
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.straighten import turned_anew
 from rdstitch.results.messages import Message, told_once
 from rdstitch.results.messages import left_out as left_out_message
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
 from rdstitch.sidecar.write import (

@@ -3,18 +3,27 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from functools import reduce
+from itertools import chain
 from pathlib import Path
+
+import numpy as np
 
 from rdstitch.errors import ArgumentError
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.selection import selected
+from rdstitch.io import Layout, write_strips
+from rdstitch.io.encoding import Strip
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.tiff import written_strips
+from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import Recomposition, apply
-from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.system.outputs import check_outputs
+from rdstitch.system.outputs import Outputs, check_outputs
 from rdstitch.system.progress import Progress, silent
 
 
@@ -28,14 +37,15 @@ def mosaic_bands(
     progress: Progress = silent,
     beside: FilesBeside = NOTHING_BESIDE,
 ) -> tuple[StitchResult, tuple[Recomposition, ...]]:
-    """Stitch the images of several bands, each band into a file of its own, all on the same pixels.
+    """Stitch the images of several bands, all on the same pixels, into one file and each into one of its own.
 
     Parameters
     ----------
     inputs, options, every, progress, beside
         As for :func:`rdstitch.mosaic`; ``beside`` is for the first band.
     output : path
-        ``field.tif`` is written as ``field-NIR.tif`` and so on.
+        ``field.tif`` has all bands, with their names; ``field-NIR.tif`` and so on one each. Formats that hold no
+        number of bands have only the latter.
     bands : mapping of str to str
         Names of the bands, and patterns of the names of their images; the first band is registered.
 
@@ -47,7 +57,8 @@ def mosaic_bands(
     options, file = options or StitchOptions(), Path(output)
     files = [file.with_name(f"{file.stem}-{name}{file.suffix}") for name in bands]
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
-        check_outputs(files, options.overwrite, listed.files)
+        stack = [file] if file.suffix.lower() in (".tif", ".tiff") else []
+        check_outputs([*files, *stack], options.overwrite, listed.files)
         frames = selected(listed.frames, options.exclude, options.include_only)
         chosen = [_of_band(frames, pattern) for pattern in bands.values()]
         options = replace(options, exclude=(), include_only=())
@@ -65,7 +76,33 @@ def mosaic_bands(
             )
             for band, name in zip(chosen[1:], files[1:], strict=True)
         )
+        if stack:
+            _write_stack(file, dict(zip(bands, files, strict=True)), first, overwrite=options.overwrite)
+            first = first.with_messages([Message(f"{file} has all bands: {', '.join(bands)}", severity="note")])
     return first, others
+
+
+def _write_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, *, overwrite: bool) -> None:
+    """One file of all bands; what one of them does not show is transparent."""
+
+    def joined(parts: Sequence[Strip]) -> Strip:
+        alphas = [alpha for _, alpha in parts if alpha is not None]
+        return np.concatenate([samples for samples, _ in parts], axis=2), reduce(np.minimum, alphas) if alphas else None
+
+    streams = [written_strips(path) for path in bands.values()]
+    heads = [next(stream) for stream in streams]
+    if len(kinds := {samples.dtype for samples, _ in heads}) > 1:
+        raise ArgumentError(f"bands: some have {' and others '.join(sorted(map(str, kinds)))} samples; give each alone")
+    names: list[str] = []
+    for name, (samples, _) in zip(bands, heads, strict=True):
+        count = samples.shape[2]
+        names += [name] if count == 1 else [f"{name} {k}" for k in range(1, count + 1)]
+    metadata = Metadata(first.canvas.size, channels=len(names), planes=True, channel_names=tuple(names))
+    layout = Layout(first.canvas.size, len(names), kinds.pop(), transparent=True, metadata=metadata)
+    tags = [] if first.georeference is None else first.georeference.tiff_tags()
+    strips = map(joined, chain([heads], zip(*streams, strict=True)))
+    with Outputs(overwrite) as outputs:
+        write_strips(file, layout, strips, tags, outputs=outputs)
 
 
 def _of_band(frames: Sequence[Frame], pattern: str) -> list[Frame]:

@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rdstitch.alignment.result import Alignment
-from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.projection import PLANE
 from rdstitch.errors import ArgumentError, LimitError, RdstitchError
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
+from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import plane_of_most, realigned
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.compose import Layout
@@ -26,7 +27,6 @@ from rdstitch.pipeline.whole_pixels import on_whole_pixels
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.verification.verdict import RefusedError
 
 _MODELS = ("rotation", "pose", "homography")

@@ -10,6 +10,7 @@ from typing import Self
 
 import numpy as np
 
+from rdstitch.alignment.result import links_by_image
 from rdstitch.compositing import (
     Canvas,
     CompositeOptions,
@@ -26,7 +27,6 @@ from rdstitch.compositing import (
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.projection import PLANE
 from rdstitch.compositing.tiles import Block, BlockRunner, OutputStrip
-from rdstitch.compositing.upright_options import Corners
 from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, has_place, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes
@@ -35,6 +35,7 @@ from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
+from rdstitch.options.upright_options import Corners
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened
@@ -341,10 +342,11 @@ def viewed_images(result: StitchResult) -> list[ViewedImage]:
     """The images of a result with what was found of each."""
     alignment, registration = result.registration.alignment, result.registration
     names = [source.name for source in registration.sources]
+    links_of = links_by_image(fit for fit in alignment.links if fit.used)
     viewed = []
     for outlines, index in zip(result.canvas.outlines, np.flatnonzero(alignment.used).tolist(), strict=True):
         source = registration.sources[index]
-        links = [fit for fit in alignment.links if fit.used and index in (fit.image1, fit.image2)]
+        links = links_of.get(index, [])
         facts = [
             ("size", "{} x {} pixels".format(*source.camera.image_size)),
             ("features", str(registration.keypoints[index])),

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.composite_options import CompositeOptions, Interpolation
 from rdstitch.compositing.tables import CompositeTables
 from rdstitch.inputs.frame import in_order
+from rdstitch.options.composite_options import CompositeOptions, Interpolation
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.opencv_state import one_opencv_thread

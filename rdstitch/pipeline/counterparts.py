@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import MatchBy
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, files_of
 from rdstitch.inputs.measurements import metres_around_median
@@ -19,7 +20,6 @@ from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.sidecar.read import ImageRecord, SavedRegistration
 from rdstitch.system.file_access import canonical_name, canonical_text
 
-MatchBy = Literal["auto", "name", "order"]
 MatchedBy = Literal["name", "time", "position", "order"]
 _TOKEN = re.compile(r"\d+|[^\W\d_]+|[\W_]+")
 

@@ -16,11 +16,11 @@ from rdstitch.arrays import IntArray
 from rdstitch.errors import InputError
 from rdstitch.executors import batches, in_order
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, detect, detect_view
-from rdstitch.features.feature_options import CLOSER
 from rdstitch.features.prepared_image import Stretch, common_stretch, halving, usual_stretch
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
+from rdstitch.options.feature_options import CLOSER
 from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import reuse_freed_memory
 from rdstitch.system.progress import Progress

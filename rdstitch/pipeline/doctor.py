@@ -8,18 +8,19 @@ from typing import Any
 import cv2
 import numpy as np
 
+from rdstitch.choices import ChannelOrder
 from rdstitch.compositing import CompositePlan
 from rdstitch.errors import InputError, RegistrationError
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import points_over
 from rdstitch.inputs.find import found_images
-from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs
+from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.read import DecodedImage
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.results.messages import Message, bytes_in_words, seconds_in_words, shortened, told_once
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.verdict import RefusedError

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import TrajectoryFrame
 from rdstitch.errors import InputError
 from rdstitch.executors import ProcessExecutor
-from rdstitch.export.trajectory_files import TrajectoryFrame, covariance_in_frame, in_frame, ros_covariance
+from rdstitch.export.trajectory_files import covariance_in_frame, in_frame, ros_covariance
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.inputs.frame import Frame, Image, as_inputs
@@ -26,11 +27,11 @@ from rdstitch.inputs.selection import is_selected, mask_of, with_masks
 from rdstitch.inputs.source import Source
 from rdstitch.io.opening import check_readable
 from rdstitch.io.write import write_image
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import alignment_options
 from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.tracking import CameraPose, Preview, Tracked, TrackingOptions
 from rdstitch.tracking import Tracker as FrameTracker
 

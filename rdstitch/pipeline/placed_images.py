@@ -1,8 +1,8 @@
 """Registered images, ready to be composited: aligned locally, without what is static, on a canvas."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, Self
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import LocalAlignmentMode
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.compositing.canvas import NearPart
 from rdstitch.compositing.source_images import Displacement, PlacedImage
@@ -22,7 +23,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
-from rdstitch.local_alignment import LocalAlignment, LocalAlignmentMode, Match, align_locally, no_local_alignment
+from rdstitch.local_alignment import LocalAlignment, Match, align_locally, no_local_alignment
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
 
@@ -85,6 +86,7 @@ class PlacedImages:
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
     relief: float = 0.0  # pixels that neighbours are off together, where the ground is no plane
+    leverage: Mapping[int | str, float] = field(default_factory=dict)  # of positions and control points, see Located
     # pixels that the output is made on, as of an earlier run: from the plane (3, 3), their size, and their place
     grid: tuple[FloatArray, tuple[int, int], Georeference | None] | None = None
 
@@ -102,6 +104,7 @@ class PlacedImages:
             alignment.on_sphere,
             whole=registration.tiles is not None,
             relief=alignment.relief.size if alignment.relief.found else 0.0,
+            leverage={**alignment.leverage, **{k: alignment.leverage.get(int(i), 0.0) for k, i in enumerate(used)}},
         )
 
     @cached_property
@@ -138,6 +141,7 @@ class PlacedImages:
             [source.metadata.nadir for source in self.sources],
             [source.control for source in self.sources],
             self.relief,
+            self.leverage,
         )
 
     def images(self, near: Sequence[NearPart | None]) -> list[PlacedImage]:

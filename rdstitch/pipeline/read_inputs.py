@@ -15,8 +15,8 @@ from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.flat_field import read_flat_field
 from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.process_memory import return_freed_memory
 
 NO_FLAT_FIELD = Message(
@@ -79,8 +79,10 @@ def read_inputs(
         twice = f"{chosen[0].path} is named twice: " if len(chosen) > 1 else ""
         raise ArgumentError(f"{twice}stitching needs two different images or more; name at least one more")
     sources = with_attitudes(with_masks(sources, options.mask), options.attitude)
-    sources = with_positions(sources, options.positions, options.composite.epsg, options.positions_offset)
-    sources = with_ground_control(with_ground_control(sources, options.gcp), options.check_points, check=True)
+    epsg = options.composite.epsg
+    sources = with_positions(sources, options.positions, epsg, options.positions_offset, options.position_accuracy)
+    for points, check in ((options.gcp, False), (options.check_points, True)):
+        sources = with_ground_control(sources, points, epsg, check=check)
     return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), unread
 
 

@@ -6,39 +6,37 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 from rdstitch.alignment.frames import stored, turned_alignment
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.choices import Purpose
+from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.errors import OutputError, RdstitchError, RegistrationError
 from rdstitch.export.odometry_bag import check_bag, write_bag, write_bag_folder
-from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
+from rdstitch.export.trajectory_files import WRITERS, frame_of, has_times, path_as_svg
 from rdstitch.geometry.exif_orientation import quarter_turn
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of, with_times
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
+from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty
 from rdstitch.pipeline.choose_layout import LaidOut, choose_layout
 from rdstitch.pipeline.compose import blocks_on, check_world_files, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
-from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside, check_run
+from rdstitch.pipeline.output_plan import check_run, report_refused, stage_beside
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, told_once
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.write import sidecar
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, TemporaryFolder, check_not_read, check_outputs, json_bytes, text_bytes
 from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.verdict import RefusedError
-
-TrajectoryFormat = Literal["csv", "tum", "kitti", "bag"]
 
 _NO_TIMES = Message(
     "not every image has a time stamp: numbers of frames stand for them; give --timestamps", code="no-time-stamps"
@@ -322,7 +320,7 @@ def calibrate(
             result = _finished(at_full_size(accepted))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
-        return result.with_messages(beside.stage(outputs, result))
+        return result.with_messages(stage_beside(beside, outputs, result))
 
 
 @one_opencv_thread()
@@ -429,7 +427,7 @@ def _accepted(
         told = [str(replace(message, code="")) for message in told_once([*unread, *sources[0].guard.complaints])]
         error.args = ("; ".join([str(error), *told]),)
         if isinstance(error, RefusedError):
-            beside.explain(error.registration)
+            report_refused(beside, error.registration)
         raise
 
 
@@ -466,7 +464,7 @@ def compose_registration(
     if output is not None:
         failed += write_page(outputs, output, composed, partial(viewed_images, result))
     result = result.with_messages(failed)
-    result = result.with_messages(beside.stage(outputs, result))
+    result = result.with_messages(stage_beside(beside, outputs, result))
     if output is not None:
         # Last: whoever finds it finds what it belongs to.
         outputs.write(f"{output}.json", json_bytes(sidecar(result)))

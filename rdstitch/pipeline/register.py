@@ -15,6 +15,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.image_circle import with_image_circle
@@ -22,7 +23,6 @@ from rdstitch.pipeline.settle_repeated_pattern import match_crossings, settle_re
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.system.progress import Progress, silent

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from rdstitch.alignment.frames import stored, turned_alignment, turns
 from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import PosesFrame
 from rdstitch.compositing.boxes import intersection
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.preparation import prepare_composite
@@ -114,8 +115,6 @@ def write_layers(
 
 
 _LEVEL = 1e-9  # rounding of what a turn within the plane leaves as it is
-
-PosesFrame = Literal["enu", "ros", "camera", "map"]
 
 
 def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float = 1.0) -> str:

@@ -11,7 +11,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import RegistrationError
 from rdstitch.features import Correspondences
 from rdstitch.features.crossings import find_crossings
-from rdstitch.features.feature_options import CLOSER, WORK_MEGAPIXELS
 from rdstitch.features.prepared_image import Stretch, prepare
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import RadialHomography, from_plane, to_plane
@@ -19,6 +18,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.options.feature_options import CLOSER, WORK_MEGAPIXELS
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.robust.verification import places
 from rdstitch.verification.overlap_check import ComparedImages

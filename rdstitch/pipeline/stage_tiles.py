@@ -30,14 +30,16 @@ from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.options.tile_options import TileOptions
 from rdstitch.pipeline.choose_layout import lay_out
 from rdstitch.pipeline.compose import check_world_files, image_files
-from rdstitch.pipeline.output_plan import NOTHING_BESIDE, FilesBeside
+from rdstitch.pipeline.output_plan import files_beside
 from rdstitch.pipeline.read_inputs import NO_FLAT_FIELD, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
 from rdstitch.results.messages import MAX_NAMED, Message, left_out, names_of, shortened
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.stage.axes import with_axes_shown
 from rdstitch.stage.correlation import coarse_tile
@@ -59,7 +61,6 @@ from rdstitch.stage.register_tiles import (
     search_radius,
 )
 from rdstitch.stage.tile_frames import tile_frames, with_position_folders
-from rdstitch.stage.tile_options import TileOptions
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, text_bytes
 from rdstitch.system.progress import Progress, silent
@@ -319,7 +320,7 @@ def _check_outputs(
     named = [positions, None if options.flat_field in ("auto", "off") else options.flat_field]
     written = [] if output is None else image_files(check_suffix(output))
     written += [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
-    written += beside.files(frame.name for frame in listed.frames)
+    written += files_beside(beside, (frame.name for frame in listed.frames))
     check_outputs(written, options.overwrite, [*listed.files, *(file for file in named if file is not None)])
 
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing.composite_options import CompositeOptions
-from rdstitch.compositing.upright_options import UprightOptions
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.planar_motion import nearest_rotation
+from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.options.upright_options import UprightOptions
 from rdstitch.pipeline.placed_images import PlacedImages, plan
 from rdstitch.pipeline.vanishing_points import (
     Edges,
@@ -21,6 +21,7 @@ from rdstitch.pipeline.vanishing_points import (
     of_edges,
     of_rectangle,
     of_scene,
+    rotation,
     to_axes,
 )
 from rdstitch.results.messages import Message
@@ -46,7 +47,7 @@ def turned(placed: PlacedImages, options: CompositeOptions) -> tuple[PlacedImage
             text = f"not straightened: {after:.0%} of what the images show would be cut away, and not {before:.0%}"
             text += "; choose another --projection, or raise --max-stretch"
             matrix, said = None, [Message(text, code="not-straightened")]
-    if (view := options.view) is not None:
+    if (view := view_rotation(options)) is not None:
         if not placed.turned:
             raise ArgumentError(
                 "yaw, pitch and roll are for images taken by turning on the spot; these were not, use --rotate"
@@ -55,6 +56,14 @@ def turned(placed: PlacedImages, options: CompositeOptions) -> tuple[PlacedImage
     if matrix is None:
         return placed, said
     return replace(placed, homographies=matrix @ placed.homographies, orientation=matrix), said
+
+
+def view_rotation(options: UprightOptions) -> FloatArray | None:
+    """Rotation (3, 3) by which what is yaw degrees to the right and pitch degrees up comes straight ahead, if any."""
+    yaw, pitch, roll = np.radians([options.yaw, options.pitch, options.roll])
+    if not (yaw or pitch or roll):
+        return None
+    return (rotation((0.0, yaw, 0.0)) @ rotation((pitch, 0.0, 0.0)) @ rotation((0.0, 0.0, roll))).T
 
 
 def _cut_away(placed: PlacedImages, options: CompositeOptions, matrix: FloatArray) -> float:

@@ -4,17 +4,18 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack, get_args, overload
+from typing import Any, TypedDict, Unpack, get_args, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import ChannelOrder, Framing, ImageFormat
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedImage, compose
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.find import found_images
-from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, in_order
+from rdstitch.inputs.frame import Images, as_inputs, in_order
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.read import DecodedImage
@@ -24,10 +25,6 @@ from rdstitch.results.messages import Message, ignored
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import IMAGE_SUFFIXES, check_outputs, file_name
 from rdstitch.system.progress import Progress, silent
-
-Framing = Literal["same", "all", "valid"]
-
-ImageFormat = Literal["jpg", "png", "tif", "webp"]
 
 _POINTS_PER_SIDE = 256
 

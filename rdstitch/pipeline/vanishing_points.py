@@ -12,10 +12,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import Self
 
+import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.compositing.upright_options import rotation
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.robust.verification import binomial_tail
@@ -205,6 +206,11 @@ def of_edges(edges: Edges, axis: IntArray, start: FloatArray, focal: Focal, firs
         if np.abs(step).max() < 1e-12:
             break
     return Upright(axes[:2], Focal(math.exp(log_focal), focal.log_std))
+
+
+def rotation(vector: ArrayLike) -> FloatArray:
+    """Rotation (3, 3) about an axis (3,), by its length in radians."""
+    return np.asarray(cv2.Rodrigues(np.asarray(vector, dtype=np.float64))[0], dtype=np.float64)
 
 
 def nearest_axis(edges: Edges, axes: FloatArray, focal: float) -> IntArray:

@@ -9,16 +9,17 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.choices import ChannelOrder
 from rdstitch.compositing import Canvas, Composite, CompositePlan, SeamQuality
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference
-from rdstitch.inputs.frame import ChannelOrder, in_order
+from rdstitch.inputs.frame import in_order
 from rdstitch.io.preview import encode_preview, read_preview
 from rdstitch.io.read import read_image
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration, Verdict
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.outputs import Fingerprint
 
 _PREVIEW = 800  # pixels of the longer side

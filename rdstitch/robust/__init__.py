@@ -1,6 +1,6 @@
 from rdstitch.choices import SOLVERS, SolverName
+from rdstitch.options.estimation_options import EstimationOptions
 from rdstitch.robust.estimate import PairMatches, estimate_radial_homographies, estimate_radial_homography
-from rdstitch.robust.estimation_options import EstimationOptions
 
 __all__ = [
     "SOLVERS",

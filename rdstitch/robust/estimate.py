@@ -11,7 +11,7 @@ from rdstitch.choices import SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography, are_homographies
-from rdstitch.robust.estimation_options import EstimationOptions
+from rdstitch.options.estimation_options import EstimationOptions
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
-from rdstitch.robust.estimation_options import EstimationOptions
+from rdstitch.options.estimation_options import EstimationOptions
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel

@@ -344,7 +344,10 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
     unknown = [name for name in record.options.composite if name not in CompositeOptions.__dataclass_fields__]
     if unknown:
         raise InputError(f"{path}: options.composite.{unknown[0]}: this rdstitch has no such option")
-    composite = convert(record.options.composite, CompositeOptions, str(path), "options.composite")
+    try:
+        composite = CompositeOptions(**record.options.composite)
+    except ArgumentError as error:
+        raise InputError(f"{path}: options.composite.{error}") from error
     turned = record.model == "rotation"
     if composite.projection == "auto" and turned:
         composite = replace(composite, projection=record.output.projection or "auto")

@@ -5,20 +5,19 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import Origin, ScanOrder
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.tables import by_image, csv_rows, image_name
 from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.stage.grid import TileGrid
 from rdstitch.system.file_access import read_text
 
-ScanOrder = Literal["rows", "columns", "snake-rows", "snake-columns"]
-Origin = Literal["top-left", "top-right", "bottom-left", "bottom-right"]
 Positions = str | Path | ArrayLike | Mapping[str, ArrayLike]
 
 _COLUMNS = {"name": "name file filename image", "x": "x xpx", "y": "y ypx", "x_um": "xum", "y_um": "yum"}

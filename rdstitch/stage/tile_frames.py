@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from rdstitch.choices import ZPlane
 from rdstitch.errors import ArgumentError
 from rdstitch.inputs.find import IMAGE_SUFFIXES, natural_key
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage, as_image
-from rdstitch.io.stored_tiles import StoredTile, ZPlane, stored_tiles
+from rdstitch.io.stored_tiles import StoredTile, stored_tiles
 from rdstitch.results.messages import Message
 
 

@@ -72,6 +72,11 @@ TEXTS = {
         "something unique",
     ),
     "pattern": ("", "{count} of {of} pairs fit as well elsewhere (a repeated pattern?)"),
+    "looked at": (
+        "",
+        "of {of} overlaps {count} were compared in their pixels, {sampled} of them at random: at most {share:.1%} of "
+        "all are wrong, with a confidence of 95%",
+    ),
     "settled pattern": (
         "repeated-pattern",
         "the images show a repeated pattern; what is unique in them (dirt, a mark, an object) decided where they lie; "

@@ -16,6 +16,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import NO_CACHE, Cache
+from rdstitch.verification.limits import limit
 from rdstitch.verification.photometric_agreement import (
     COMPARED_SIDE,
     Agreement,
@@ -26,7 +27,14 @@ from rdstitch.verification.self_similarity import SLACK, Ambiguity, drawing_scal
 from rdstitch.verification.unique_places import unique_shifts
 
 _MAX_LINKS = 40
-"""Links that are looked at in a large set; the least confirmed ones."""
+"""Links up to which all are looked at; of more, so many of the least confirmed ones, and some of all at random."""
+
+_MOST_SAMPLED, _SAMPLED = 300, 0.05
+"""Links that are taken at random, and their share of all at the most. If none of 300 is wrong, with a confidence of
+95 % less than one in a hundred is, however many there are."""
+
+_CONFIDENCE = 1.645
+"""Standard deviations that a normal variable exceeds with a probability of 5 %."""
 
 _IMAGES_AT_ONCE = 128
 """Images that are kept while pairs are compared, 1 MB each."""
@@ -40,11 +48,12 @@ class CheckedLink:
     agreement: Agreement  # whether the two look alike where they are put together
     ambiguity: Ambiguity  # whether they would look as much alike elsewhere
     unique: bool = False  # whether they would, but for something unique that both show, which shows that they lie here
+    sampled: bool = False  # whether it was taken at random from more
 
     @property
     def pair(self) -> tuple[int, int]:
         """Its images."""
-        return self.fit.image1, self.fit.image2
+        return self.fit.images
 
 
 class ComparedImages:
@@ -83,27 +92,31 @@ class ComparedImages:
 
 
 def check_overlaps(registration: Registration, images: ComparedImages, cache: Cache = NO_CACHE) -> list[CheckedLink]:
-    """Compare the images of every used link, or of those that the fewest others confirm."""
+    """Compare the images of every used link; of many, of the least confirmed and of some at random."""
     alignment = registration.alignment
-    chosen = _least_confirmed([fit for fit in alignment.links if fit.used])
-    every = sorted(set(chain.from_iterable((fit.image1, fit.image2) for fit in chosen)))
+    used = [fit for fit in alignment.links if fit.used]
+    sampled = _at_random(used)
+    least = {fit.images for fit in _least_confirmed(used)}
+    chosen = [fit for fit in used if fit.images in least or fit.images in sampled]
+    every = sorted(set(chain.from_iterable(fit.images for fit in chosen)))
     described = [
         (k, source.content(cache), source.mask_content(cache), alignment.cameras[k], alignment.homographies[k])
         for k, source in ((k, registration.sources[k]) for k in every)
     ]
 
     def compute() -> list[CheckedLink]:
-        placed = images.aligned(alignment, every)
-
         def compare(fit: LinkFit) -> CheckedLink:
-            both = placed[fit.image1], placed[fit.image2]
-            both = _between(*both) if alignment.on_sphere else both
-            return CheckedLink(fit, overlap_agreement(*both), find_ambiguity(*both))
+            one, two = (images.placed(k, alignment.cameras[k], alignment.homographies[k]) for k in fit.images)
+            both = _between(one, two) if alignment.on_sphere else (one, two)
+            return CheckedLink(fit, overlap_agreement(*both), find_ambiguity(*both), sampled=fit.images in sampled)
 
         with ThreadPoolExecutor(images.threads) as pool:
             checked = list(pool.map(compare, chosen))
-        # On a plane that is not metric a period of a pattern is another shift at every place.
-        return checked if alignment.poses is None or alignment.on_sphere else _by_what_is_unique(placed, checked)
+        if alignment.poses is None or alignment.on_sphere:
+            # On a plane that is not metric a period of a pattern is another shift at every place.
+            return checked
+        doubtful = chain.from_iterable(link.pair for link in checked if link.ambiguity.ambiguous)
+        return _by_what_is_unique(images.aligned(alignment, doubtful), checked)
 
     inputs = (described, chosen, registration.stretch)
     return cache.recall("overlaps", inputs, compute)
@@ -113,6 +126,17 @@ def share_alike(checked: Sequence[CheckedLink]) -> float:
     """Share of all overlaps together that looks alike, in [0, 1]; NaN where nothing was compared."""
     cells = sum(link.agreement.cells for link in checked)
     return sum(link.agreement.confirming for link in checked) / cells if cells else float("nan")
+
+
+def wrong_at_most(checked: Sequence[CheckedLink]) -> float:
+    """Share of all links that may look unlike, by those taken at random (Wilson's upper bound, 95 %); 1 without any."""
+    cells, unlike = limit("cells"), limit("unlike")
+    sampled = [link.agreement for link in checked if link.sampled and link.agreement.cells >= cells]
+    if not sampled:
+        return 1.0
+    count, wrong, z = len(sampled), sum(each.share < unlike for each in sampled), _CONFIDENCE
+    middle = wrong + z**2 / 2.0
+    return float((middle + z * np.sqrt(wrong * (count - wrong) / count + z**2 / 4.0)) / (count + z**2))
 
 
 def _by_what_is_unique(placed: Mapping[int, ComparedImage], checked: Sequence[CheckedLink]) -> list[CheckedLink]:
@@ -134,6 +158,14 @@ def _between(first: ComparedImage, second: ComparedImage) -> tuple[ComparedImage
     return replace(first, homography=to_plane[0]), replace(second, homography=to_plane[1])
 
 
+def _at_random(links: Sequence[LinkFit]) -> set[tuple[int, int]]:
+    """Images of links that are taken at random, where there are too many for all to be looked at."""
+    if len(links) <= _MAX_LINKS:
+        return set()
+    count = min(_MOST_SAMPLED, int(_SAMPLED * len(links)))
+    return {links[k].images for k in np.random.default_rng(0).choice(len(links), count, replace=False)}
+
+
 def _least_confirmed(links: Sequence[LinkFit]) -> list[LinkFit]:
     """The links in the fewest triangles, then those with the fewest inliers; in their own order."""
     beside: dict[int, set[int]] = {}
@@ -141,5 +173,5 @@ def _least_confirmed(links: Sequence[LinkFit]) -> list[LinkFit]:
         beside.setdefault(fit.image1, set()).add(fit.image2)
         beside.setdefault(fit.image2, set()).add(fit.image1)
     doubtful = sorted(links, key=lambda fit: (len(beside[fit.image1] & beside[fit.image2]), fit.inliers))
-    chosen = {(fit.image1, fit.image2) for fit in doubtful[:_MAX_LINKS]}
-    return [fit for fit in links if (fit.image1, fit.image2) in chosen]
+    chosen = {fit.images for fit in doubtful[:_MAX_LINKS]}
+    return [fit for fit in links if fit.images in chosen]

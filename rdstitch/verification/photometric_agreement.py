@@ -5,6 +5,7 @@ the place where the two correlate best is searched around where the registration
 right nearly all cells find it there; elsewhere they find it anywhere.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box
+from rdstitch.compositing.seam_quality import SeamTile, share_alike
 from rdstitch.compositing.warp import Lattice
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
@@ -40,6 +42,7 @@ class Agreement:
     cells: int  # cells with texture in both images
     confirming: int  # cells that correlate best, and well, where the registration says
     in_all: int = 0  # cells with texture in the whole of the second image
+    coarsely: float = math.nan  # share of the overlap that looks alike three times smaller; NaN where it is too small
 
     @property
     def share(self) -> float:
@@ -121,7 +124,8 @@ def overlap_agreement(first: ComparedImage, second: ComparedImage) -> Agreement:
     textured = _have_texture(windows[:, _SEARCH_RADIUS:-_SEARCH_RADIUS, _SEARCH_RADIUS:-_SEARCH_RADIUS])
     known = textured & _have_texture(cells) & np.isfinite(windows).all(axis=(1, 2))
     confirming = sum(_confirms(*both) for both in zip(cells[known], windows[known], strict=True))
-    return Agreement(int(known.sum()), confirming, int(textured.sum()))
+    tiles = [SeamTile((0, 0, width, height), np.nan_to_num(grey), np.isfinite(grey)) for grey in (seen, second.grey)]
+    return Agreement(int(known.sum()), confirming, int(textured.sum()), share_alike(tiles, np.array([[0, 1]]), 1.0)[0])
 
 
 def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:

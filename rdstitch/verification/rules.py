@@ -9,12 +9,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from rdstitch.alignment.result import LinkFit
+from rdstitch.alignment.result import LinkFit, links_by_image
 from rdstitch.alignment.unaligned import few_features
 from rdstitch.inputs.source import Source
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
 from rdstitch.verification.limits import limit
+from rdstitch.verification.overlap_check import wrong_at_most
 from rdstitch.verification.second_motion import share_of
 
 MAX_WARNINGS = 3
@@ -31,9 +32,8 @@ def disagreeing_pairs(evidence: Evidence) -> Iterator[Finding]:
 
 def _misfitting_images(evidence: Evidence) -> Iterator[Finding]:
     """Images of whose matches too many do not fit into the whole, over all pairs that do."""
-    agreeing = [fit for fit in evidence.used if fit.inliers >= limit("inliers of a pair") * fit.count]
-    for k in range(len(evidence.registration.sources)):
-        fits = [fit for fit in agreeing if k in (fit.image1, fit.image2)]
+    for k, links in sorted(links_by_image(evidence.used).items()):
+        fits = [fit for fit in links if fit.inliers >= limit("inliers of a pair") * fit.count]
         if sum(fit.inliers for fit in fits) < limit("inliers of an image") * sum(fit.count for fit in fits):
             yield _of_matches("image misfits", (k,), fits, _reason(evidence, (k,), fits))
 
@@ -123,11 +123,23 @@ def _size_of_shape(evidence: Evidence) -> float:
 
 
 def _unlike(evidence: Evidence) -> Iterator[Finding]:
-    """Images that were put together and are no more alike there than by chance."""
+    """Images that were put together and are no more alike there than by chance; of a picture also at a coarse scale,
+    as depth shifts what it shows by a little nearly everywhere.
+    """
     for link in evidence.checked:
-        if link.agreement.cells >= limit("cells") and link.agreement.share < limit("unlike"):
+        coarsely = evidence.picture and link.agreement.coarsely >= limit("filled by a plane")
+        if link.agreement.cells >= limit("cells") and link.agreement.share < limit("unlike") and not coarsely:
             values = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
             yield Finding("unlike", link.pair, "failure", values)
+
+
+def _looked_at(evidence: Evidence) -> Iterator[Finding]:
+    """How many of many overlaps were compared in their pixels, and what that says of the others."""
+    checked, share = evidence.checked, wrong_at_most(evidence.checked)
+    if share < 1.0:
+        sampled = sum(link.sampled for link in checked)
+        values = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": share}
+        yield Finding("looked at", (), "detail", values)
 
 
 def _ambiguous(evidence: Evidence) -> Iterator[Finding]:
@@ -206,7 +218,16 @@ OF_MATCHES: tuple[Find, ...] = (_mixed_lenses, _matches_disagree, _misfitting_im
 OF_PAIRS: tuple[Find, ...] = (disagreeing_pairs, _unlike, _ambiguous)
 """Suspicions of pairs, the last of each counts: a failure where images hang on it alone."""
 
-OF_THE_WHOLE: tuple[Find, ...] = (_errors, _depth, _shape, _pattern, _second_motion, _two_left, _inputs)
+OF_THE_WHOLE: tuple[Find, ...] = (
+    _errors,
+    _depth,
+    _shape,
+    _looked_at,
+    _pattern,
+    _second_motion,
+    _two_left,
+    _inputs,
+)
 """Everything else."""
 
 OF_PLACES = {

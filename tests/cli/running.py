@@ -20,7 +20,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera, CameraRecord
 from rdstitch.geometry.radial_homography import project
-from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.sidecar.read import json_schema
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 from rdstitch.system.records import convert

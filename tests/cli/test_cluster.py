@@ -97,7 +97,7 @@ def test_one_and_four_worker_processes_give_the_same_bytes(
             handed.add(getattr(fn, "func", fn).__name__)
             return super().submit(fn, *args, **kwargs)
 
-    monkeypatch.setattr("rdstitch.results.stitch_options.open_executor", lambda workers, *_, **__: Recording(workers))
+    monkeypatch.setattr("rdstitch.options.stitch_options.open_executor", lambda workers, *_, **__: Recording(workers))
     outputs = []
     for workers in (1, 4):
         outputs.append(tmp_path / str(workers) / "out.png")

@@ -21,7 +21,7 @@ LIBRARY_ONLY = {"bands", "tile_size", "workers"}
 
 def test_names_and_defaults_are_the_librarys() -> None:
     """Of apply; those of the others are compared with all options of the library."""
-    given = cli.commands["apply"].make_context("apply", ["a.json", "--images", ".", "-o", "out.png"]).params
+    given = cli.load_all()["apply"].make_context("apply", ["a.json", "--images", ".", "-o", "out.png"]).params
     standard = CompositeOptions()
     for field in set(CompositeOptions.__dataclass_fields__) - LIBRARY_ONLY:
         assert given[field] == getattr(standard, field), field
@@ -65,10 +65,9 @@ def test_background_is_what_no_image_covers(rdstitch: Run, sidecar: Path, frames
 
 
 def test_amounts_of_memory() -> None:
-    from rdstitch_cli.parameter_types import BYTES
-
+    option = next(option for option in cli.load_all()["pano"].params if option.name == "max_memory")
     amounts = {"800M": 800 * 2**20, "2G": 2**31, "1.5 GiB": 3 * 2**29, "64k": 65536, "12345": 12345}
-    assert {text: BYTES.convert(text, None, None) for text in amounts} == amounts
+    assert {text: option.type.convert(text, None, None) for text in amounts} == amounts
 
 
 def test_dry_run_reports_and_writes_nothing(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rdstitch_cli.config import read_config
+from rdstitch_cli.flags import EnteredValue
 from rdstitch_cli.main import cli
 
 from rdstitch.errors import InputError
@@ -34,12 +36,12 @@ def _written(folder: Path, text: str) -> Path:
 
 def test_the_documented_example_is_read(tmp_path: Path) -> None:
     file = _written(tmp_path, _example())
-    common: dict[str, Any] = {"features": "sift", "work_megapixels": "2.5", "camera": "camera.json"}
+    common: dict[str, Any] = {"kind": "sift", "work_megapixels": "2.5", "camera": "camera.json"}
     common |= {"overwrite": True, "workers": "2"}
-    assert read_config(file, cli.commands, "calibrate") == common
+    assert read_config(file, cli.load_all(), "calibrate") == common
     # The parameter of --format is called otherwise.
-    assert read_config(file, cli.commands, "trajectory") == {**common, "layout": "tum", "height": "0.42"}
-    assert read_config(file, cli.commands, "undistort") == {"camera": "camera.json", "overwrite": True}
+    assert read_config(file, cli.load_all(), "trajectory") == {**common, "layout": "tum", "height": "0.42"}
+    assert read_config(file, cli.load_all(), "undistort") == {"camera": "camera.json", "overwrite": True}
 
 
 def test_flags_win_then_the_command_then_common(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
@@ -63,21 +65,38 @@ def test_a_required_option_may_be_in_the_file(rdstitch: Run, frames: list[Path],
 
 
 def _plausible(option: click.Option) -> Any:
-    """A value of an option, by its kind; None for those that parse a text of their own."""
     if option.is_flag:
         return True
     if isinstance(option.type, click.Choice):
         return str(option.type.choices[0])
-    return 2 if isinstance(option.type, (click.types.IntParamType, click.types.FloatParamType)) else None
+    if isinstance(option.type, EnteredValue) and not option.type.entry.words and option.metavar != "L":
+        with suppress(click.BadParameter):
+            option.type.convert("2", None, None)
+            return 2
+    return {
+        "tilt": "1,2",
+        "attitude_std": "0.5",
+        "max_memory": "1G",
+        "local_alignment": "auto",
+        "every": "auto",
+        "work_megapixels": "0.5",
+        "epsg": "25832",
+        "extent": "0,0,9,9",
+        "bands": "NIR=*_NIR.TIF,RED=*_RED.TIF",
+        "distortion": "0.1",
+        "z": "max",
+        "rectangle": "0,0,9,0,9,9,0,9",
+        "straighten": "auto",
+    }.get(option.name or "", "name")
 
 
-@pytest.mark.parametrize("name", sorted(cli.commands))
+@pytest.mark.parametrize("name", sorted(cli.load_all()))
 def test_every_option_can_be_in_the_file(name: str, tmp_path: Path) -> None:
-    options = [p for p in cli.commands[name].params if isinstance(p, click.Option) and p.expose_value]
-    values = {p: [_plausible(p)] if p.multiple else _plausible(p) for p in options if _plausible(p) is not None}
-    expected = {p.name: str(value) if type(value) is int else value for p, value in values.items()}
-    lines = [f"{max(p.opts, key=len)[2:]} = {json.dumps(value)}" for p, value in values.items()]
-    assert read_config(_written(tmp_path, "\n".join([f"[{name}]", *lines])), cli.commands, name) == expected
+    options = [p for p in cli.load_all()[name].params if isinstance(p, click.Option) and p.expose_value]
+    values = {p.name: [_plausible(p)] if p.multiple else _plausible(p) for p in options}
+    expected = {key: str(value) if type(value) is int else value for key, value in values.items()}
+    lines = [f"{max(p.opts, key=len)[2:]} = {json.dumps(values[p.name])}" for p in options]
+    assert read_config(_written(tmp_path, "\n".join([f"[{name}]", *lines])), cli.load_all(), name) == expected
 
 
 @settings(deadline=None)
@@ -87,7 +106,7 @@ def test_fuzz(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
     complaint = ""
     try:
         (folder / "config.toml").write_bytes(content)
-        read_config(folder / "config.toml", cli.commands, "mosaic")
+        read_config(folder / "config.toml", cli.load_all(), "mosaic")
     except InputError as error:
         complaint = str(error)
     finally:

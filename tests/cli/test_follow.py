@@ -14,8 +14,8 @@ import pytest
 from rdstitch.inputs.arrivals import Arrivals
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.follow import follow
-from rdstitch.results.stitch_options import StitchOptions
 from tests.cli.running import DISTORTION, FAST, Run, flight, rows_of, start
 from tests.sampled import sampled
 

@@ -8,13 +8,10 @@ import click
 import pytest
 from rdstitch_cli.help_pages import EXIT_STATUSES
 from rdstitch_cli.main import cli
-from rdstitch_cli.stitching import stitch_options
-from rdstitch_cli.terminal import Reporter
 
-from rdstitch.results.stitch_options import StitchOptions
 from tests.cli.running import Run
 
-COMMANDS = sorted(set(cli.commands) - {"help"})
+COMMANDS = sorted(set(cli.load_all()) - {"help"})
 
 
 def _options(command: click.Command) -> list[click.Option]:
@@ -29,7 +26,7 @@ def test_help_has_examples_exit_statuses_and_every_option(rdstitch: Run, name: s
     assert "RANGE" not in shown.out
     assert f"rdstitch {name} " in shown.out
     assert "Exit status:" in shown.out
-    for option in _options(cli.commands[name]):
+    for option in _options(cli.load_all()[name]):
         assert option.help, option.name
         assert any(
             f"{text} " in shown.out or f"{text}," in shown.out or f"{text}\n" in shown.out for text in option.opts
@@ -38,11 +35,11 @@ def test_help_has_examples_exit_statuses_and_every_option(rdstitch: Run, name: s
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_examples_use_only_options_that_exist(name: str) -> None:
-    epilog = cli.commands[name].epilog or ""
+    epilog = cli.load_all()[name].epilog or ""
     examples = [line for line in epilog.splitlines() if "rdstitch " in line and "find " not in line]
     assert examples
     for line in examples:
-        command = cli.commands[line.split("rdstitch ")[1].split()[0]]
+        command = cli.load_all()[line.split("rdstitch ")[1].split()[0]]
         known = {text for option in _options(command) for text in option.opts}
         used = set(re.findall(r"(?<=\s)--?[a-z][a-z-]*", line))
         assert used <= known, line
@@ -62,17 +59,6 @@ def test_every_status_of_the_error_tree_is_documented() -> None:
 def test_the_bare_command_shows_all_of_its_help(rdstitch: Run) -> None:
     assert rdstitch(status=2).err == rdstitch("-h").out
     assert "..." not in rdstitch("-h").out.partition("Examples:")[0].partition("[ARGS]...")[2]
-
-
-@pytest.mark.parametrize("name", ["pano", "mosaic", "calibrate", "trajectory"])
-def test_defaults_are_the_librarys(name: str) -> None:
-    context = cli.commands[name].make_context(name, ["a.png", "b.png", "-o", "out.png"])
-    of_command = {"inputs", "output", "every", "preview", "report", "as_json", "quiet", "verbose"}
-    of_command |= {"layout", "frame", "plot", "height", "following", "idle", "refresh"}
-    of_command |= {"all_blocks", "layers", "whole_layers", "poses", "hugin_project", "map_server"}
-    given = {key: value for key, value in context.params.items() if key not in of_command}
-    with context.scope(cleanup=False), Reporter(-1) as reporter:
-        assert stitch_options(reporter, **given) == StitchOptions()
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], *([name, "--help"] for name in COMMANDS)])

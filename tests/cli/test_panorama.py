@@ -12,10 +12,10 @@ from PIL import Image
 
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import viewed_images
 from rdstitch.pipeline.recipes import pano
 from rdstitch.report.pairs import match_graph
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.viewer import viewer_page

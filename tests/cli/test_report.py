@@ -16,13 +16,13 @@ from PIL import Image
 from rdstitch.compositing import CompositeOptions
 from rdstitch.io import preview
 from rdstitch.io.opening import MAX_IMAGE_GB
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline import accept
 from rdstitch.pipeline.recipes import calibrate, pano
 from rdstitch.report import page as report
 from rdstitch.report import report_page, write_report
 from rdstitch.report.pairs import matched
 from rdstitch.results.messages import Message
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.verification.findings import Finding
 from tests.cli.running import CACHED, OPTIONS, Run

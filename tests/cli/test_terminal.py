@@ -13,8 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rdstitch_cli.flags import FilePath
 from rdstitch_cli.main import run
-from rdstitch_cli.parameter_types import UserPath
 from rdstitch_cli.terminal import Reporter, spell_out
 
 from rdstitch.io import read_image
@@ -119,7 +119,7 @@ def test_tilde_is_the_home_folder_where_no_shell_saw_it(
     monkeypatch.setenv("USERPROFILE", str(tmp_path))
     rdstitch("pano", *frames, "--output=~/pano.png", *CACHED)
     assert (tmp_path / "pano.png").exists()
-    assert UserPath().convert("~no-such-user/x", None, None) == Path("~no-such-user/x")
+    assert FilePath().convert("~no-such-user/x", None, None) == Path("~no-such-user/x")
 
 
 _PROGRAM = "from rdstitch_cli.main import main; main()"

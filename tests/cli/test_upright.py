@@ -14,7 +14,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.synthetic import ImageTexture, Photometry, Sequence, ground, sequence_over
 from rdstitch.synthetic.poses import Poses
 from rdstitch.synthetic.textures import Texture

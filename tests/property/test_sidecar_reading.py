@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rdstitch.camera_files import load_camera, save_camera
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
-from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.sidecar.read import read_sidecar
 from rdstitch.sidecar.write import plain
 from tests.damaged_texts import damaged, damaged_text
@@ -124,7 +124,7 @@ def test_complaints_name_the_field(tmp_path: Path, path: tuple[str | int, ...], 
         holder = holder[key]
     holder[path[-1]] = value
     file = _write(tmp_path, json.dumps(content).encode())
-    with pytest.raises(InputError, match="^" + re.escape(f"{file}: {field}: ")):
+    with pytest.raises(InputError, match=rf"^{re.escape(str(file))}: {re.escape(field)}(: | must be )"):
         read_sidecar(file)
 
 

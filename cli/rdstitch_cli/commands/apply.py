@@ -2,43 +2,49 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
-import click
-
-from rdstitch_cli import options
-from rdstitch_cli.help_pages import command
-from rdstitch_cli.option_texts import option
-from rdstitch_cli.stitching import composite_fields, report_applied
+from rdstitch.choices import MatchBy
+from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.options.option import Option
+from rdstitch.options.shared_options import DryRun, Every, FlatField, Mask, Overwrite, Strict, Topic, Workers
+from rdstitch_cli.flags import ImageFile, command, flags, flags_of, is_given, taken
+from rdstitch_cli.stitching import report_applied, resolve
 from rdstitch_cli.terminal import Reporter
 
 
 @command(
-    "Compose again by a saved sidecar, without estimating.",
     """
   rdstitch apply field.tif.json --images flight/ -o field_again.tif --blend feather
   rdstitch apply field_red.tif.json --images flight_nir/ -o field_nir.tif
   rdstitch apply small.jpg.json --images originals/ -o large.tif --match name --strict
 """,
+    flags_of(CompositeOptions),
+    flags(
+        flat_field=(FlatField, "off"),
+        every=(Every, 1),
+        topic=(Topic, None),
+        mask=(Mask, None),
+        workers=(Workers, 0),
+        overwrite=(Overwrite, False),
+        strict=(Strict, False),
+        dry_run=(DryRun, False),
+    ),
 )
-@click.argument("sidecar", type=options.IMAGE, metavar="SIDECAR")
-@option("--images", options.IMAGE, required=True, multiple=True)
-@options.output
-@options.overwrite
-@options.every_frame
-@options.topic
-@option("--match", ("auto", "name", "order"), "auto")
-@options.mask
-@options.no_flat_field
-@options.compositing
-@options.workers
-@options.strict
-@options.verbosity
 def apply(
-    sidecar: Path,
-    images: tuple[Path, ...],
-    output: Path,
-    match: Literal["auto", "name", "order"],
+    sidecar: Annotated[Path, "SIDECAR"],
+    images: Annotated[
+        tuple[Path, ...],
+        Option("Images to compose: what 'rdstitch mosaic' takes; may be given several times.", "INPUT"),
+    ],
+    output: ImageFile,
+    match: Annotated[
+        MatchBy,
+        Option(
+            "Assign images by name (suffix and band may differ), by order, or (auto) by name, time or GPS position."
+        ),
+    ] = "auto",
+    *,
     reporter: Reporter,
     **given: Any,
 ) -> None:
@@ -51,12 +57,12 @@ def apply(
     from rdstitch.pipeline.apply_sidecar import apply as recipe
     from rdstitch.sidecar.read import read_sidecar
 
-    chosen = {name: value for name, value in composite_fields(given).items() if options.is_given(name)}
+    chosen = {name: value for name, value in taken(CompositeOptions, given).items() if is_given(name)}
     # What is given takes the place of what the sidecar has for the same purpose.
     if "scale" in chosen or "gsd" in chosen:
         chosen = {"scale": 1.0, "gsd": None, **chosen}
     if chosen.keys() & {"rectangle", "straighten", "level"}:
         chosen = {"rectangle": None, "straighten": "off", "level": False, **chosen}
     composite = replace(read_sidecar(sidecar).composite, **chosen)
-    result = recipe(sidecar, options.resolve(images), output, composite, match=match, progress=reporter, **given)
+    result = recipe(sidecar, resolve(images), output, composite, match=match, progress=reporter, **given)
     report_applied(result, reporter)

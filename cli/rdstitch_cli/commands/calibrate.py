@@ -1,36 +1,37 @@
 """``rdstitch calibrate``: the lens, from images of a plane."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from rdstitch_cli import options
-from rdstitch_cli.help_pages import command
-from rdstitch_cli.option_texts import option
-from rdstitch_cli.stitching import files_beside, report_registration, stitch_options
+from rdstitch.options.feature_options import FeatureOptions
+from rdstitch.options.files_beside import FilesBeside
+from rdstitch.options.option import Option
+from rdstitch.options.shared_options import Every
+from rdstitch.options.stitch_options import StitchOptions
+from rdstitch_cli.flags import Inputs, command, flags_of
+from rdstitch_cli.stitching import files_beside, report_registration, resolve, stitch_options
 from rdstitch_cli.terminal import Reporter
 
 
 @command(
-    "The lens, from images of a plane.",
     """
   rdstitch calibrate wall/ -o camera.json
   rdstitch calibrate wall/ -o camera.yml --report lens.html
   rdstitch undistort other/*.jpg --camera camera.json -o straight/
 """,
+    flags_of(StitchOptions, without="reference gcp check_points local_alignment dry_run save_camera"),
+    flags_of(FeatureOptions),
+    flags_of(FilesBeside, only="report"),
 )
-@options.inputs
-@option("-o --output", options.IMAGE, of="calibrate", required=True)
-@options.camera_format
-@options.every
-@options.topic
-@options.registration
-@options.as_json("the camera")
-@options.verbosity
 def calibrate(
-    inputs: tuple[Path, ...],
-    output: Path,
-    every: int | None,
-    as_json: bool,
+    inputs: Inputs,
+    output: Annotated[
+        Path,
+        Option("Camera file to write: .json, or in the format of others, see --camera-format.", "FILE", "-o --output"),
+    ],
+    every: Every = None,
+    as_json: Annotated[bool, Option("Print the camera as JSON.", flag="--json")] = False,
+    *,
     reporter: Reporter,
     **given: Any,
 ) -> None:
@@ -48,9 +49,9 @@ def calibrate(
     from rdstitch.pipeline.recipes import calibrate as recipe
     from rdstitch.sidecar.write import plain
 
-    paths = options.resolve(inputs)
+    paths = resolve(inputs)
     beside = files_beside(reporter, given)
-    wanted = stitch_options(reporter, save_camera=output, **given)
+    wanted = stitch_options(reporter, given, save_camera=output)
     registration = recipe(paths, wanted, every=every, progress=beside.timer, beside=beside)
     report_registration(registration, reporter, (lambda: plain(registration.camera.as_dict())) if as_json else None)
     for line in (

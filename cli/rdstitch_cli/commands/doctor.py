@@ -1,27 +1,30 @@
 """``rdstitch doctor``: what will happen, before a long run."""
 
-from pathlib import Path
+from typing import Annotated
 
 import click
 
-from rdstitch_cli import options
-from rdstitch_cli.help_pages import command
+from rdstitch.options.option import Option
+from rdstitch.options.shared_options import Every, Topic
+from rdstitch_cli.flags import Inputs, command
+from rdstitch_cli.stitching import resolve
 from rdstitch_cli.terminal import Reporter
 
 
 @command(
-    "What to expect of a run, and what to change before it.",
     """
   rdstitch doctor flight/
   rdstitch doctor drive.mp4 --json
 """,
 )
-@options.inputs
-@options.every
-@options.topic
-@options.as_json("what was found")
-@options.verbosity
-def doctor(inputs: tuple[Path, ...], every: int | None, topic: str | None, as_json: bool, reporter: Reporter) -> None:
+def doctor(
+    inputs: Inputs,
+    every: Every = None,
+    topic: Topic = None,
+    as_json: Annotated[bool, Option("Print what was found as JSON.", flag="--json")] = False,
+    *,
+    reporter: Reporter,
+) -> None:
     """Find out what a run will meet, and what to change before it.
 
     INPUT is what 'rdstitch mosaic' takes. Shown are sizes, cameras and zooms by EXIF, blur, exposure, and, by a dry run
@@ -31,7 +34,7 @@ def doctor(inputs: tuple[Path, ...], every: int | None, topic: str | None, as_js
     from rdstitch.pipeline.doctor import examine
     from rdstitch.system.outputs import json_bytes
 
-    examination = examine(options.resolve(inputs), every=every, topic=topic, progress=reporter)
+    examination = examine(resolve(inputs), every=every, topic=topic, progress=reporter)
     reporter.finish()
     if as_json:
         click.echo(json_bytes(examination.as_dict()), nl=False)

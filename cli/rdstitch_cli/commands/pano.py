@@ -1,31 +1,29 @@
 """``rdstitch pano``: a few overlapping images become one."""
 
-from pathlib import Path
 from typing import Any
 
-from rdstitch_cli import options
-from rdstitch_cli.help_pages import command
-from rdstitch_cli.stitching import files_beside, stitch_options, summarize
+from rdstitch.options.files_beside import FilesBeside
+from rdstitch.options.shared_options import Every
+from rdstitch_cli.flags import ImageFile, Inputs, PrintSidecar, command, flags_of
+from rdstitch_cli.stitching import STITCHING, files_beside, resolve, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
 
 
 @command(
-    "One image of a few that overlap.",
     """
   rdstitch pano left.jpg right.jpg -o pano.jpg
   rdstitch pano *.png -o wall.png --reference middle.png --report wall.html
   rdstitch pano a.jpg b.jpg -o ab.tif --camera camera.json
 """,
+    STITCHING,
+    flags_of(FilesBeside, only="report layers whole_layers hugin_project"),
 )
-@options.inputs
-@options.stitching
-@options.every
-@options.topic
 def pano(
-    inputs: tuple[Path, ...],
-    output: Path,
-    every: int | None,
-    as_json: bool,
+    inputs: Inputs,
+    output: ImageFile,
+    every: Every = None,
+    as_json: PrintSidecar = False,
+    *,
     reporter: Reporter,
     **given: Any,
 ) -> None:
@@ -36,9 +34,9 @@ def pano(
     """
     from rdstitch.pipeline.recipes import pano as recipe
 
-    paths = options.resolve(inputs)
+    paths = resolve(inputs)
     beside = files_beside(reporter, given)
-    stitch = stitch_options(reporter, **given)
+    stitch = stitch_options(reporter, given)
     result = recipe(paths, output, stitch, every=every, progress=beside.timer, beside=beside)
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:

@@ -1,27 +1,25 @@
 """``rdstitch tiles``: tiles from a motorised stage become one image, or a table of places."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from rdstitch.errors import PartialResultError
-from rdstitch_cli import options
-from rdstitch_cli.help_pages import command
-from rdstitch_cli.option_texts import option
-from rdstitch_cli.parameter_types import LENS, RealNumber, WholeNumber, word_or_number
-from rdstitch_cli.stitching import composite_fields, files_beside, report_registration, summarize
+from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.options.files_beside import FilesBeside
+from rdstitch.options.option import Option
+from rdstitch.options.tile_options import TileOptions, measured_samples
+from rdstitch_cli.flags import Inputs, PrintSidecar, command, flags_of, taken
+from rdstitch_cli.stitching import files_beside, report_registration, resolve, summarize
 from rdstitch_cli.terminal import Reporter
-
-ORDERS = ("rows", "columns", "snake-rows", "snake-columns")
-ORIGINS = ("top-left", "top-right", "bottom-left", "bottom-right")
 
 if TYPE_CHECKING:
     from rdstitch.stage import TileRegistration
 
 
 @command(
-    "One image of tiles taken on a microscope's stage.",
     """
   rdstitch tiles slide/ --grid 'r{row}c{col}' --overlap 10 -o slide.tif
   rdstitch tiles slide/*.tif --positions stage.csv -o slide.dzi
@@ -32,41 +30,26 @@ if TYPE_CHECKING:
   rdstitch tiles sem/ --grid 'img_{number}' --columns 12 --origin bottom-left -o sem.tif
   rdstitch tiles slide/ --positions TileConfiguration.txt --z max -o slide.ome.zarr
 """,
+    flags_of(TileOptions),
+    flags_of(measured_samples(), only="blend crop interpolation background max_memory scale max_size quality"),
+    flags_of(FilesBeside, only="report"),
 )
-@options.inputs
-@option("-o --output", options.IMAGE, of="tiles")
-@options.overwrite
-@option("--grid")
-@option("--overlap", RealNumber(0.0, 100.0), 10.0)
-@option("--columns", WholeNumber(1))
-@option("--order", ORDERS, "rows")
-@option("--origin", ORIGINS, "top-left")
-@option("--positions", options.IMAGE, of="tiles")
-@option("--positions-only", options.IMAGE)
-@option("--pixel-size", RealNumber(0.0))
-@option("--search", RealNumber(0.0))
-@option("--channel", WholeNumber(0))
-@option("--z", word_or_number(("max",), 0, 1_000_000))
-@option("--time", WholeNumber(0))
-@options.flat_field
-@option("--save-flat-field", options.IMAGE)
-@option("--lambda", LENS, dest="distortion")
-@options.cut
-@options.crop
-@options.interpolation
-@options.output_form
-@options.topic
-@options.workers
-@options.report
-@options.strict
-@options.as_json("the sidecar")
-@options.verbosity
 def tiles(
-    inputs: tuple[Path, ...],
-    output: Path | None,
-    positions_only: Path | None,
-    overlap: float,
-    as_json: bool,
+    inputs: Inputs,
+    output: Annotated[
+        Path | None,
+        Option("Image to write: .ome.tif, .ome.zarr, .tif, .png, .jpg, .webp or .dzi.", flag="-o --output"),
+    ] = None,
+    positions_only: Annotated[
+        Path | None,
+        Option(
+            "Write the places of the tiles to this CSV file, or to a .txt as Fiji's list; without --output nothing is "
+            "composed.",
+            "FILE",
+        ),
+    ] = None,
+    as_json: PrintSidecar = False,
+    *,
     reporter: Reporter,
     **given: Any,
 ) -> None:
@@ -76,17 +59,15 @@ def tiles(
     keep their places. Samples stay as they were measured: images are cut where they meet, neither blended nor
     brightened.
     """
-    from rdstitch.compositing import CompositeOptions
     from rdstitch.pipeline.stage_tiles import place_tiles
     from rdstitch.pipeline.stage_tiles import tiles as recipe
-    from rdstitch.stage import TileOptions
 
     if output is None and positions_only is None:
         raise click.UsageError("nothing to write: give --output or --positions-only")
-    paths = options.resolve(inputs)
+    paths = resolve(inputs)
     beside = files_beside(reporter, given)
-    composite = CompositeOptions(exposure="none", seam="none", **composite_fields(given))
-    chosen = TileOptions(overlap=overlap, composite=composite, **given)
+    composite = replace(measured_samples(), **taken(CompositeOptions, given))
+    chosen = TileOptions(**taken(TileOptions, given), composite=composite)
     if output is None:
         tiled, registration = place_tiles(paths, positions_only, chosen, progress=beside.timer)
         report_registration(registration, reporter)

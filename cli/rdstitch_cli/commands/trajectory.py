@@ -3,14 +3,17 @@
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
+from rdstitch.choices import TrajectoryFormat, TrajectoryFrame
+from rdstitch.options.feature_options import FeatureOptions
+from rdstitch.options.option import Option
+from rdstitch.options.shared_options import Every, Height
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch_cli import following as live
-from rdstitch_cli import options
-from rdstitch_cli.help_pages import command
-from rdstitch_cli.option_texts import option
-from rdstitch_cli.parameter_types import RealNumber
-from rdstitch_cli.stitching import report_registration, stitch_options
+from rdstitch_cli.flags import Inputs, command, flags_of
+from rdstitch_cli.following import FOLLOWING
+from rdstitch_cli.stitching import report_registration, resolve, stitch_options
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
@@ -18,36 +21,39 @@ if TYPE_CHECKING:
 
 
 @command(
-    "The path of the camera over the plane, for robots.",
     """
   rdstitch trajectory floor/ -o poses.csv
   rdstitch trajectory floor/ -o poses.txt --format tum --height 0.42
   rdstitch trajectory drive.bag --topic /camera/image_raw -o poses.csv
   rdstitch trajectory 0 -o poses.csv --follow | robot
 """,
+    flags_of(StitchOptions, without="reference gcp check_points local_alignment dry_run save_camera camera_format"),
+    flags_of(FeatureOptions),
+    FOLLOWING,
 )
-@options.inputs
-@option("-o --output", options.IMAGE, of="trajectory", required=True)
-@option("--format", ("csv", "tum", "kitti", "bag"), "csv", of="trajectory", dest="layout")
-@option("--frame", ("enu", "ros", "camera"), of="trajectory")
-@option("--height", RealNumber(), 1.0)
-@option("--plot", options.IMAGE)
-@options.overwrite
-@options.every_frame
-@options.topic
-@options.follow
-@options.known
-@options.estimation
-@options.trust
-@options.verbosity
 def trajectory(
-    inputs: tuple[Path, ...],
-    output: Path,
-    layout: Literal["csv", "tum", "kitti", "bag"],
-    frame: Literal["enu", "ros", "camera"] | None,
-    height: float,
-    plot: Path | None,
-    every: int | None,
+    inputs: Inputs,
+    output: Annotated[Path, Option("File to write.", "FILE", "-o --output")],
+    *,
+    layout: Annotated[
+        TrajectoryFormat,
+        Option(
+            "csv: a table with names, time stamps, x, y, yaw_deg, height and their covariances. tum: time, position "
+            "and quaternion. kitti: matrices. bag: nav_msgs/Odometry on /odom, ROS 1 (.bag) or ROS 2 (a folder).",
+            flag="--format",
+        ),
+    ] = "csv",
+    frame: Annotated[
+        TrajectoryFrame | None,
+        Option(
+            "Axes of positions. enu: x to the right and y to the top of the first image, z up; default of csv and tum. "
+            "ros: x to the top, y to the left, z up; default of bag. camera: x to the right, y to the bottom, z down; "
+            "default of kitti. yaw_deg is counterclockwise as seen from above in all."
+        ),
+    ] = None,
+    height: Height = 1.0,
+    plot: Annotated[Path | None, Option("Draw the path to FILE (SVG).", "FILE")] = None,
+    every: Every = 1,
     following: bool,
     idle: float | None,
     reporter: Reporter,
@@ -64,14 +70,14 @@ def trajectory(
     from rdstitch.pipeline.recipes import trajectory as recipe
 
     with ExitStack() as stack:
-        stitch = stitch_options(reporter, **given)
+        stitch = stitch_options(reporter, given)
         if following:
             printed = FollowedPoses(height, frame or frame_of(layout))
             watched: dict[str, Any] = {"output": output, "plot": plot, "every": every, "idle": idle, "poses": printed}
             arrived = live.followed(inputs, stitch, reporter, **watched)
             paths: Sequence[Named] = stack.enter_context(arrived)
         else:
-            paths = options.resolve(inputs)
+            paths = resolve(inputs)
         how: dict[str, Any] = {
             "layout": layout,
             "plot": plot,

@@ -1,33 +1,46 @@
 """``rdstitch undistort``: straight lines become straight."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 
-from rdstitch_cli import options
-from rdstitch_cli.help_pages import command
-from rdstitch_cli.option_texts import option
-from rdstitch_cli.stitching import read_lens
+from rdstitch.choices import Framing, ImageFormat
+from rdstitch.options.option import Option
+from rdstitch.options.shared_options import Distortion, Overwrite, Topic
+from rdstitch.options.stitch_options import StitchOptions
+from rdstitch_cli.flags import Inputs, command, flags, flags_of
+from rdstitch_cli.stitching import read_lens, resolve
 from rdstitch_cli.terminal import Reporter
 
 
 @command(
-    "Images with straight lines straight, by a known lens.",
     """
   rdstitch undistort frames/*.jpg --camera camera.json -o straight/
   rdstitch undistort wall.jpg --lambda -0.25 -o straight/
 """,
+    flags_of(StitchOptions, only="camera"),
+    flags(distortion=(Distortion, None), overwrite=(Overwrite, False), topic=(Topic, None)),
 )
-@options.inputs
-@options.lens
-@option("-o --output", options.IMAGE, of="undistort", required=True)
-@options.overwrite
-@options.topic
-@option("--view", ("same", "all", "valid"), "same")
-@option("--format", ("jpg", "png", "tif", "webp"), of="undistort", dest="image_format")
-@options.verbosity
-def undistort(inputs: tuple[Path, ...], camera: Path | None, output: Path, reporter: Reporter, **given: Any) -> None:
+def undistort(
+    inputs: Inputs,
+    camera: Path | None,
+    output: Annotated[Path, Option("Folder to write to; made if missing.", "DIR", "-o --output")],
+    view: Annotated[
+        Framing,
+        Option("Field of view: size and scale of the image, everything it shows, or without empty borders."),
+    ] = "same",
+    image_format: Annotated[
+        ImageFormat | None,
+        Option(
+            "Format of the files written; otherwise that of each image, or png where it cannot be written.",
+            flag="--format",
+        ),
+    ] = None,
+    *,
+    reporter: Reporter,
+    **given: Any,
+) -> None:
     """Undistort images with a known lens, each into a file of the same name in a folder.
 
     INPUT is what 'rdstitch mosaic' takes. The lens comes from a camera file, as 'rdstitch pano --save-camera' and
@@ -37,8 +50,10 @@ def undistort(inputs: tuple[Path, ...], camera: Path | None, output: Path, repor
 
     if (camera is None) == (given["distortion"] is None):
         raise click.UsageError("give either --camera FILE or --lambda L")
-    lens, paths = read_lens(camera, reporter), options.resolve(inputs)
-    written = recipe(paths, output, camera=lens, warn=reporter.tell, progress=reporter, **given)
+    lens, paths = read_lens(camera, reporter), resolve(inputs)
+    written = recipe(
+        paths, output, camera=lens, warn=reporter.tell, progress=reporter, view=view, image_format=image_format, **given
+    )
     reporter.finish()
     noun = "image" if len(written) == 1 else "images"
     reporter.made(f"{output}: {len(written)} {noun} undistorted")

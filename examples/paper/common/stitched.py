@@ -9,9 +9,9 @@ import numpy as np
 from examples.paper.common.report import Pixels
 from rdstitch.errors import RegistrationError
 from rdstitch.io.read import read_image
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import calibrate, mosaic
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import Sequence
 
 

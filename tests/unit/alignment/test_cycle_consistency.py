@@ -129,4 +129,5 @@ def test_a_fit_that_ran_away_is_suspected_and_says_nothing_of_others() -> None:
 def test_every_link_keeps_a_triangle_of_very_many(monkeypatch: pytest.MonkeyPatch) -> None:
     i, j = (index.astype(np.intp) for index in np.triu_indices(12, 1))
     monkeypatch.setattr("rdstitch.alignment.cycle_consistency._MAX_TRIANGLES", 5)
+    monkeypatch.setattr("rdstitch.alignment.cycle_consistency._TRIANGLES_PER_LINK", 0)
     assert set(triangles(12, i, j).ravel().tolist()) == set(range(len(i)))

@@ -13,7 +13,8 @@ from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
-from rdstitch.export.trajectory_files import TrajectoryFrame, as_csv
+from rdstitch.choices import TrajectoryFrame
+from rdstitch.export.trajectory_files import as_csv
 from tests.alignment_scenes import aligned, grid, scene
 
 FOCAL = 520.0

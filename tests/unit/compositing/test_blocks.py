@@ -13,7 +13,6 @@ import pytest
 from rdstitch import Composer
 from rdstitch.compositing import PlacedImage
 from rdstitch.compositing import plan as planning
-from rdstitch.compositing.composite_options import CompositeOptions
 from rdstitch.compositing.compositor import compose
 from rdstitch.compositing.plan import CompositePlan, default_memory, plan_composite
 from rdstitch.compositing.source_images import OPACITY_BYTES
@@ -21,9 +20,10 @@ from rdstitch.compositing.tables import CompositeTables
 from rdstitch.compositing.tiles import Block, OutputStrip
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.io import DecodedImage
+from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import pano
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.system.cache import Cache, Stored
 from tests.compositing_scenes import Scene, grey, render

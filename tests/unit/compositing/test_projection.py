@@ -24,6 +24,7 @@ from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage
+from rdstitch.pipeline.straighten import view_rotation
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import as_image, gradient, grey, place_images
@@ -313,9 +314,9 @@ def test_an_image_that_shows_the_horizon_does_not_blow_up_the_canvas() -> None:
 
 def test_a_view_is_turned_right_up_and_clockwise() -> None:
     for name, seen in (("yaw", (0.5, 0.0)), ("pitch", (0.0, -0.5))):
-        view = CompositeOptions(**{name: np.degrees(np.arctan(0.5))}).view
+        view = view_rotation(CompositeOptions(**{name: np.degrees(np.arctan(0.5))}))
         ahead = view @ (*seen, 1.0)
         np.testing.assert_allclose(ahead[:2], 0.0, atol=1e-12)
-    rolled = CompositeOptions(roll=10.0).view
+    rolled = view_rotation(CompositeOptions(roll=10.0))
     assert rolled @ (1.0, 0.0, 0.0) == pytest.approx((np.cos(np.radians(10)), -np.sin(np.radians(10)), 0.0))
-    assert CompositeOptions().view is None
+    assert view_rotation(CompositeOptions()) is None

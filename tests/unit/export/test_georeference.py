@@ -18,17 +18,18 @@ from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.georeference import Georeference, Located, georeference
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs, NamedSystem, utm
-from rdstitch.geometry.radial_homography import from_plane
+from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition, GroundControl
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.pipeline.result_files import poses_file, poses_table
 from rdstitch.report import report_page
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.results.stitch_result import StitchResult
+from rdstitch.robust.similarity_fit import fit_similarity
 from rdstitch.synthetic.poses import Poses
-from tests.cli.running import flight, transfers
+from tests.cli.running import DISTORTION, flight, transfers
 
 
 # Values of PROJ 9.
@@ -482,3 +483,29 @@ def _check_colmap(result: StitchResult, paths: list[Path], middles: FloatArray, 
     listed = np.array([[float(value) for value in row.split()[1:4]] for row in rows[1:]])
     centres = np.array([images[path.name].projection_center() for path in paths]) + origin
     np.testing.assert_allclose(listed, centres, atol=1e-3)
+
+
+def test_a_strip_that_drifts_bends_back_onto_its_control_points(tmp_path: Path) -> None:
+    """With a lens that is a little wrong; points that take no part come nearer too."""
+    sequence = flight(5, 14, 1, overlap=0.4)
+    paths = sequence.write(tmp_path, "s{:02}.jpg")
+    pixels = np.random.default_rng(0).uniform((60, 60), (340, 240), (14, 2))
+    places = np.concatenate([sequence.to_plane(k, pixels[k : k + 1]) for k in range(14)])
+    places = np.array([268_000.0, 6_346_000.0]) + places * (METRES_PER_TEXEL, -METRES_PER_TEXEL)
+    lines = [
+        f"{x} {y} 0 {u} {v} {path.name} P{k}"
+        for k, (path, (x, y), (u, v)) in enumerate(zip(paths, places.tolist(), pixels.tolist(), strict=True))
+    ]
+    for name, chosen in (("gcp", lines[::3]), ("checks", lines[1::3])):
+        (tmp_path / f"{name}.txt").write_text("\n".join(["EPSG:32734", *chosen]), encoding="utf-8")
+    options = StitchOptions(
+        workers=1, distortion=DISTORTION - 0.03, cache=tmp_path / "cache", composite=CompositeOptions(scale=0.2)
+    )
+    held = mosaic(paths, options=replace(options, gcp=tmp_path / "gcp.txt", check_points=tmp_path / "checks.txt"))
+    alignment = mosaic(paths, options=options).registration.alignment
+
+    seen = [to_plane(alignment.cameras[k], alignment.homographies[k], pixels[k : k + 1])[0] for k in range(14)]
+    fit = fit_similarity(np.array(seen) @ [1.0, -1.0j], places @ [1.0, 1.0j], 1e3)
+    without, checks = fit.residuals[1::3], np.array([check.off for check in held.georeference.checks])
+    assert np.sqrt(np.mean(checks**2)) < 0.5 * np.sqrt(np.mean(without**2))
+    assert np.sqrt(np.mean(checks**2)) < 3.0 * held.georeference.rms

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 import rdstitch
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import FeatureName
 from rdstitch.errors import ArgumentError
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, View, detect, detect_view, match
 from rdstitch.features.crossings import find_crossings
@@ -39,7 +40,7 @@ def same(a: Features, b: Features) -> bool:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_turned_image_matches(kind: str, image: NDArray[np.uint8]) -> None:
+def test_a_turned_image_matches(kind: FeatureName, image: NDArray[np.uint8]) -> None:
     motion = np.asarray(cv2.getRotationMatrix2D(((WIDTH - 1) / 2, (HEIGHT - 1) / 2), 20.0, 1.0), np.float64)
     turned = np.asarray(cv2.warpAffine(image, motion, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC), np.uint8)
     options = FeatureOptions(kind=kind, max_features=1500)
@@ -68,7 +69,7 @@ def test_an_image_that_was_read_smaller_is_worked_on_at_the_same_size(size: tupl
 
 
 @pytest.mark.parametrize("kind", ["rootsift", "orb"])
-def test_an_image_with_few_features_is_detected_at_a_larger_size(image: NDArray[np.uint8], kind: str) -> None:
+def test_an_image_with_few_features_is_detected_at_a_larger_size(image: NDArray[np.uint8], kind: FeatureName) -> None:
     options = FeatureOptions(kind=kind, work_megapixels=0.02)
     small = cv2.resize(image, (90, 75), interpolation=cv2.INTER_AREA)
     found = len(detect(small, FeatureOptions(kind=kind, work_megapixels=None)))
@@ -78,7 +79,7 @@ def test_an_image_with_few_features_is_detected_at_a_larger_size(image: NDArray[
 
 @pytest.mark.parametrize("kind", ["sift", "surf"])
 @pytest.mark.parametrize("work_megapixels", [None, 0.1])
-def test_a_blob_is_where_it_is_at_any_working_size(kind: str, work_megapixels: float | None) -> None:
+def test_a_blob_is_where_it_is_at_any_working_size(kind: FeatureName, work_megapixels: float | None) -> None:
     v, u = np.mgrid[:480, :641]
     center, sigma = (300.3, 212.4), 18.0
     grey = np.rint(60 + 150 * np.exp(-((u - center[0]) ** 2 + (v - center[1]) ** 2) / (2 * sigma**2)))
@@ -91,7 +92,7 @@ def test_a_blob_is_where_it_is_at_any_working_size(kind: str, work_megapixels: f
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", [(240, 320), (240, 320, 3), (7, 5), (1, 1)])
-def test_a_blank_image_has_no_features(kind: str, shape: tuple[int, ...]) -> None:
+def test_a_blank_image_has_no_features(kind: FeatureName, shape: tuple[int, ...]) -> None:
     found = detect(np.full(shape, 90, np.uint8), FeatureOptions(kind=kind))
     assert found.points.shape == (0, 2)
     assert found.descriptors.shape[0] == 0
@@ -100,7 +101,7 @@ def test_a_blank_image_has_no_features(kind: str, shape: tuple[int, ...]) -> Non
 
 
 @pytest.mark.parametrize("kind", ["rootsift", "surf", "orb"])
-def test_nothing_is_seen_behind_a_mask(kind: str, image: NDArray[np.uint8]) -> None:
+def test_nothing_is_seen_behind_a_mask(kind: FeatureName, image: NDArray[np.uint8]) -> None:
     allowed = np.ones((HEIGHT, WIDTH), dtype=bool)
     allowed[100:220, 60:200] = False
     covered = image.copy()
@@ -159,7 +160,7 @@ def test_sift_tells_dark_blobs_from_light_ones(enlarged: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["rootsift", "surf", "orb", "akaze"])
-def test_threads_change_nothing(kind: str, image: NDArray[np.uint8]) -> None:
+def test_threads_change_nothing(kind: FeatureName, image: NDArray[np.uint8]) -> None:
     options = FeatureOptions(kind=kind, max_features=700)
     sources = [lambda _, i=i: View(np.rot90(image, i).copy()) for i in range(4)]
     one = [detect_view(source, options) for source in sources]
@@ -335,7 +336,7 @@ def test_an_image_of_nothing_has_none() -> None:
 
 
 @pytest.mark.parametrize(("kind", "bytes_each"), [("rootsift", (1, 2)), ("sift", (1,)), ("orb", (1,)), ("surf", (2,))])
-def test_packed_features_match_as_before(kind: str, bytes_each: tuple[int, ...]) -> None:
+def test_packed_features_match_as_before(kind: FeatureName, bytes_each: tuple[int, ...]) -> None:
     colour = ground((320, 240), 11, 1).region(0, 0, 320, 240)
     image = np.rint(cv2.GaussianBlur(colour, (0, 0), 1.0).reshape(240, 320) * 255).astype(np.uint8)
     options = FeatureOptions(kind=kind, max_features=500)

@@ -26,8 +26,8 @@ def test_distances_are_those_on_the_ground_at_any_place() -> None:
     west, east = GpsPosition(70.0, 179.9995), GpsPosition(70.0, -179.9995, 120.0)
     north = GpsPosition(70.001, 179.9995)
     one, two, three = positions_of([_source(west), _source(east), _source(north)])
-    assert np.isclose(np.linalg.norm(one - two), 111_195 * 0.001 * np.cos(np.radians(70.0)), rtol=1e-3)
-    assert np.isclose(np.linalg.norm(one - three), 111.195, rtol=1e-3)
+    assert np.isclose(np.linalg.norm(one - two), 38.187, rtol=1e-3)  # on the ellipsoid
+    assert np.isclose(np.linalg.norm(one - three), 111.562, rtol=1e-3)
     assert two[0] - one[0] > 30.0
     assert three[1] - one[1] > 110.0
 
@@ -173,7 +173,7 @@ def test_projected_numbers_in_other_notations_and_zero_longitude(tmp_path: Path)
         ("1 2 3 4 5 a.jpg", "line 1: expected a coordinate system"),
         ("EPSG:4326\n1 2 3 4 a.jpg", "line 2: expected X Y Z PX PY IMAGE"),
         ("EPSG:4326\n1 2 3 640 5 a.jpg", "line 2: is not within the 640 x 480 pixels of a.jpg"),
-        ("EPSG:4326\n1 2 3 nan 5 a.jpg", "line 2: is not within the 640 x 480 pixels of a.jpg"),
+        ("EPSG:4326\n1 2 3 nan 5 a.jpg", "line 2: has no number for px"),
         ("EPSG:4326\n1 2 3 4 5 z.jpg", "has no ground control point in any of the images"),
     ],
 )
@@ -246,3 +246,21 @@ def test_control_points_of_images_with_spaces_in_other_case_and_to_check(tmp_pat
     read = with_ground_control(with_ground_control(sources, tmp_path / "gcp.txt"), tmp_path / "gcp.txt", check=True)
     assert [(point.name, point.check) for point in read[0].control] == [("corner one", False), ("corner one", True)]
     assert read[1].control[0].name == "500010 5000000"
+
+
+def test_control_points_as_a_table_with_accuracies(tmp_path: Path) -> None:
+    rows = "px;py;image;name;x;y;accuracy\n300.5;200;flight\\a.jpg;P 1;268832.2996;6246117.7881;0.02\n1;2;b.jpg;;1;2;\n"
+    (tmp_path / "gcp.csv").write_text(f"EPSG:32734\n{rows}", encoding="utf-8")
+    (tmp_path / "plain.csv").write_text(rows, encoding="utf-8")
+    one, two, _ = (source.control for source in with_ground_control(_sources(), tmp_path / "gcp.csv"))
+    assert [(c.name, c.pixel, c.std) for c in (*one, *two)] == [("P 1", (300.5, 200), 0.02), ("1 2", (1, 2), None)]
+    assert with_ground_control(_sources(), tmp_path / "plain.csv", 32734)[0].control == one
+    with pytest.raises(InputError, match="--crs"):
+        with_ground_control(_sources(), tmp_path / "plain.csv")
+
+
+def test_positions_that_tell_no_accuracy_get_the_one_given(tmp_path: Path) -> None:
+    table = "name,lat,lon,hAcc\na.jpg,48,2,0.5\nb.jpg,48,2,\n"
+    (tmp_path / "p.csv").write_text(table, encoding="utf-8")
+    placed = with_positions(_sources(), tmp_path / "p.csv", accuracy=0.02)
+    assert [s.metadata.gps and s.metadata.gps.std for s in placed] == [(0.5, 1.0), (0.02, 0.04), None]

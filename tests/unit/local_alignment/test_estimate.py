@@ -161,6 +161,14 @@ def test_what_lies_far_off_the_plane_is_reached(level: float) -> None:
     assert np.percentile(on, 95) < 3.0
 
 
+def test_where_matches_are_dense_fields_are_as_fine_as_the_ground() -> None:
+    sequence = scene("bumps", 0.1)
+    matrices = homographies(sequence)
+    on = displacements(sequence, matrices, align_locally(matches(sequence, count=1500), CAMERAS, matrices))
+    assert np.median(on) < 0.25  # pixels; 0.2 is the noise of a match
+    assert np.percentile(on, 95) < 0.6
+
+
 @pytest.mark.parametrize("noise", [0.1, 1.0])
 def test_on_a_plane_nothing_is_moved(noise: float) -> None:
     sequence = scene(None)
@@ -360,7 +368,7 @@ def test_fields_that_bend_straight_edges_more_than_they_mend_are_left_out() -> N
     assert len(on.fields) == 6
     worst = max(float(np.percentile(field.bends(ends), 95)) for field in on.fields)
     assert worst > 1.0
-    assert all(np.percentile(field.bends(ends), 95) < 0.5 * worst for field in off.fields)
+    assert all(np.percentile(field.bends(ends), 95) < 0.65 * worst for field in off.fields)
 
 
 def test_a_bend_is_the_distance_from_a_straight_line() -> None:

@@ -16,12 +16,12 @@ from rdstitch.io import write_image
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import _without, accept
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, reselect_inliers, select_by_whole_lens
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.pipeline.register import register
 from rdstitch.results.messages import Message, left_out
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.system.cache import NO_CACHE
 from rdstitch.verification.verdict import RefusedError
 from tests.alignment_scenes import grid, scene

@@ -14,10 +14,10 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.map_grid import read_grid
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.bands import mosaic_bands
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.results.stitch_options import StitchOptions
 from tests.cli.running import flight
 
 _SHIFT = np.array([-7.0, 9.0])
@@ -81,6 +81,14 @@ def test_all_bands_of_a_rig_at_once(rig: Path, tmp_path: Path) -> None:
     assert first.output == tmp_path / "f-RED.tif"
     assert [other.output for other in others] == [tmp_path / "f-NIR.tif"]
     assert _shift_between(tmp_path / "f-RED.tif", tmp_path / "f-NIR.tif") < 0.3
+    with rasterio.open(tmp_path / "f.tif") as stack, rasterio.open(tmp_path / "f-NIR.tif") as nir:
+        assert stack.descriptions == ("RED 1", "RED 2", "RED 3", "NIR", None)
+        assert (stack.transform, stack.shape, stack.crs) == (nir.transform, nir.shape, nir.crs)
+        valid = stack.read(5) > 0
+        np.testing.assert_array_equal(stack.read(4)[valid], nir.read(1)[valid])
+        assert valid[nir.dataset_mask() > 0].mean() > 0.95
+        assert stack.colorinterp[-1] == rasterio.enums.ColorInterp.alpha
+        assert stack.overviews(1)
     with pytest.raises(ArgumentError, match="no image has a name like"):
         mosaic_bands([rig / "red"], tmp_path / "g.tif", bands, options)
 

@@ -8,11 +8,11 @@ import pytest
 
 from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.io import write_image
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.choose_layout import _is_stretched
 from rdstitch.pipeline.compose import Layout, seam_messages
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recipes import mosaic, pano
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic.textures import ground
 from tests.registrations import CAMERA, source
 

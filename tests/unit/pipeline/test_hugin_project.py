@@ -14,9 +14,9 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import read_camera_file
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.pipeline.result_files import project_of_hugin
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic.panorama import panorama_rotations, turning_sequence
 from tests.cli.running import flight
 

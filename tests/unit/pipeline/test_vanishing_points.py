@@ -109,7 +109,7 @@ def test_straightening_that_cuts_the_picture_away_is_not_done(
     looks = np.stack([camera_rotations(yaw, 0.0, 0.0)[0] for yaw in (-0.3, 0.0, 0.3)])
     directions = np.swapaxes(looks, 1, 2) @ np.diag([1.0, 1.0, 260.0 / lens.scale])
     placed = PlacedImages([source(f"{k}.jpg") for k in range(3)], [lens] * 3, directions, 1, turned=True)
-    upwards = CompositeOptions(pitch=-50.0).view
+    upwards = straighten.view_rotation(CompositeOptions(pitch=-50.0))
     monkeypatch.setattr(straighten, "_upright", lambda placed, options: (upwards, []))
     options = CompositeOptions(straighten="auto", projection=projection)
     found, said = straighten.turned(placed, options)

@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.camera import Camera
-from rdstitch.results.stitch_options import StitchOptions
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.system import cache
 from rdstitch.system.cache import Cache, Stored, digest, pack, unpack
 from rdstitch.system.outputs import TemporaryFolder

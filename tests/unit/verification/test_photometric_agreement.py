@@ -1,5 +1,6 @@
 """Whether images agree where they overlap."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,9 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.io import DecodedImage, Metadata
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification import overlap_check
-from rdstitch.verification.overlap_check import _least_confirmed
+from rdstitch.verification.overlap_check import CheckedLink, _least_confirmed, wrong_at_most
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE, Agreement, ComparedImage, overlap_agreement
+from rdstitch.verification.self_similarity import Ambiguity
 
 PLANE = ground((900, 700), seed=3, channels=1).region(0, 0, 900, 700)[:, :, 0]
 SIZE = (400, 300)
@@ -138,6 +140,20 @@ def test_of_many_those_with_the_fewest_triangles_and_matches_are_compared() -> N
     chosen = _least_confirmed([*weak, *chain])
     assert {fit for fit in weak if fit.inliers == 10} <= set(chosen)
     assert chosen == [fit for fit in [*weak, *chain] if fit in chosen]
+
+
+def test_of_very_many_some_are_compared_at_random_wherever_they_lie() -> None:
+    links = [_fit(k, k + 1) for k in range(8000)]
+    chosen = overlap_check._at_random(links)
+    assert chosen == overlap_check._at_random(links)
+    assert len(chosen) == 300
+    quarters = np.bincount([image // 2000 for image, _ in chosen], minlength=4)
+    assert quarters.min() > 50
+    sampled = [CheckedLink(fit, Agreement(20, 20), Ambiguity(1.0, 0.0, 0.0), sampled=True) for fit in links[:300]]
+    assert 0.008 < wrong_at_most(sampled) < 0.01
+    wrong = [replace(link, agreement=Agreement(20, 0)) for link in sampled[:6]]
+    assert 0.03 < wrong_at_most([*wrong, *sampled[6:]]) < 0.05
+    assert wrong_at_most([replace(link, sampled=False) for link in sampled]) == 1.0
 
 
 def test_a_turn_is_compared_between_the_two_images() -> None:

@@ -14,11 +14,11 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
 from rdstitch.matching.mixed_lenses import TwoLenses
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import pano
 from rdstitch.pipeline.register import register
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_options import StitchOptions
 from rdstitch.synthetic import Photometry, camera_rotations, turning_sequence
 from rdstitch.verification import evidence, verdict
 from rdstitch.verification.evidence import Evidence
@@ -149,6 +149,17 @@ def test_a_tenth_of_an_overlap_must_look_alike(
     found = _checked_by(monkeypatch, good, _checked(cells, confirming))
     assert [message.severity for message in found] == ([] if severity is None else [severity])
     assert all(f"({confirming} of {cells}" in message.text for message in found)
+
+
+@pytest.mark.parametrize(("coarsely", "picture", "poses"), [(0.8, 0, 1), (0.4, 1, 1)])
+def test_depth_shifts_what_a_picture_shows_by_a_little(
+    good: Registration, monkeypatch: pytest.MonkeyPatch, coarsely: float, picture: int, poses: int
+) -> None:
+    """Few cells agree to 2.5 pixels then, but most at a coarse scale."""
+    checked = _checked(100, 6)
+    checked = replace(checked, agreement=replace(checked.agreement, coarsely=coarsely))
+    monkeypatch.setattr(evidence, "check_overlaps", lambda *_: [checked])
+    assert [len(judge(good, THRESHOLD, purpose)) for purpose in ("mosaic", "trajectory")] == [picture, poses]
 
 
 @pytest.mark.parametrize(("clear", "severity"), [(True, "warning"), (False, "failure")])

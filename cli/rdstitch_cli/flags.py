@@ -1,0 +1,185 @@
+"""The command line of declared options: flags, their types and limits, defaults and help follow from annotations."""
+
+import inspect
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_origin
+
+import click
+from click.core import ParameterSource
+
+from rdstitch.options.option import Declared, Option, declaration, declared
+from rdstitch_cli.config import config
+from rdstitch_cli.help_pages import EXIT_STATUSES, GroupedCommand
+from rdstitch_cli.terminal import Reporter
+
+Inputs = Annotated[tuple[Path, ...], "INPUT..."]  # an argument rather than an option
+ImageFile = Annotated[Path, Option("Image to write: .jpg, .png, .tif, .webp or .dzi.", flag="-o --output")]
+PrintSidecar = Annotated[bool, Option("Print the sidecar as JSON.", flag="--json")]
+
+
+def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callable[..., Any]], click.Command]:
+    """A command of a function: its parameters with options become flags, and so do the options given.
+
+    Values of those arrive as ``**given``; -q and -v as ``reporter``.
+    """
+
+    def make(function: Callable[..., Any]) -> click.Command:
+        @wraps(function)
+        def run(*, quiet: bool, verbose: bool, **given: Any) -> Any:
+            with Reporter(verbose - quiet) as reporter:
+                return function(reporter=reporter, **given)
+
+        parameters: list[click.Parameter] = []
+        for name, parameter in inspect.signature(function).parameters.items():
+            if option := declaration(name, parameter.annotation):
+                parameters.append(_flag(option, parameter.default))
+            elif metavar := getattr(parameter.annotation, "__metadata__", None):
+                many = -1 if metavar[0].endswith("...") else 1
+                kind = FilePath(allow_dash=many < 0)
+                parameters.append(click.Argument([name], nargs=many, required=True, type=kind, metavar=metavar[0]))
+        parameters += [option for group in options for option in group]
+        parameters += [
+            click.Option(["-q", "--quiet"], is_flag=True, help="Print errors only."),
+            click.Option(["-v", "--verbose"], is_flag=True, help="Print details."),
+            config,
+        ]
+        epilog = f"\b\nExamples:{examples}\n\n{EXIT_STATUSES}"
+        return GroupedCommand(function.__name__, callback=run, params=parameters, help=function.__doc__, epilog=epilog)
+
+    return make
+
+
+def flags_of(options: Any, *, only: str = "", without: str = "") -> list[click.Option]:
+    """Flags of the options of a class, or of an object whose values are the defaults; all, or those of some names."""
+    chosen = [option for option in declared(options).values() if option.option.command_line]
+    if only:
+        chosen = [option for option in chosen if option.name in only.split()]
+    return [_flag(o, getattr(options, o.name)) for o in chosen if o.name not in without.split()]
+
+
+def flags(**options: tuple[Any, Any]) -> list[click.Option]:
+    """Flags by the names of parameters: their annotations and defaults."""
+    found = ((declaration(name, annotation), default) for name, (annotation, default) in options.items())
+    return [_flag(option, default) for option, default in found if option is not None]
+
+
+def taken(kind: Any, given: dict[str, Any]) -> dict[str, Any]:
+    """Take the options of a class out of those that a command was given."""
+    names = [name for name, option in declared(kind).items() if option.option.command_line and name in given]
+    return {name: given.pop(name) for name in names}
+
+
+def is_given(name: str) -> bool:
+    """Check whether the user set an option of the running command, rather than left it at its default."""
+    return click.get_current_context().get_parameter_source(name) not in (None, ParameterSource.DEFAULT)
+
+
+def _flag(entry: Declared, default: Any) -> click.Option:
+    option = entry.option
+    if option.entered is not None and (entered := declaration(entry.name, Annotated[option.entered, option])):
+        entry = entered
+    names = [*(option.flag or f"--{entry.name.replace('_', '-')}").split(), entry.name]
+    how: dict[str, Any] = {"required": True} if default is inspect.Parameter.empty else {"default": default}
+    unset = default is None or default is False or default == () or default is inspect.Parameter.empty
+    shown = option.default or ("" if unset else str(default))
+    if "/" in names[-2] and entry.words:  # a switch between two words
+        off, on = entry.words
+        how |= {"is_flag": True, "default": default == on, "callback": lambda _c, _o, value: on if value else off}
+        shown = ""
+    elif entry.types == (bool,):
+        how["is_flag"] = True
+    elif not entry.types:
+        how["type"] = click.Choice([word.replace("_", "-") for word in entry.words])
+        how["callback"] = lambda _c, _o, value: next((w for w in entry.words if w.replace("_", "-") == value), value)
+    elif Path in entry.types:
+        how["type"] = FilePath(entry.words)
+    elif entry.types == (str,):
+        how["type"] = str
+    elif entry.types[0] in (tuple[str, ...], tuple[Path, ...]):
+        how |= {"multiple": True, "type": FilePath() if entry.types[0] == tuple[Path, ...] else str}
+    else:
+        how["type"] = EnteredValue(entry)
+        shown = option.default or (how["type"].shown(default) if shown or option.none else "")
+    text = option.text + f"  [default: {shown}]" * bool(shown)
+    return click.Option(names, metavar=option.metavar or None, help=text, **how)
+
+
+class FilePath(click.Path):
+    """A file or folder, or a word that stands for something else; a file of that name is written ``./word``.
+
+    Whether a file can be read is for the library to find out: it knows more, and has an exit status for it.
+    """
+
+    def __init__(self, words: Sequence[str] = (), *, allow_dash: bool = False) -> None:
+        super().__init__(path_type=Path, readable=False, allow_dash=allow_dash)
+        self.words = words
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Replace ``~``, also where no shell has; an address stays text: as a path it would lose one of its slashes."""
+        if value in self.words or "://" in str(value):
+            return value
+        path = super().convert(value, param, ctx)
+        try:
+            return path.expanduser() if isinstance(path, Path) else path
+        except RuntimeError:  # there is no such user
+            return path
+
+
+class EnteredValue(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    """Numbers, within their limits, or a word."""
+
+    name = "N"
+
+    def __init__(self, entry: Declared) -> None:
+        option = entry.option
+        if option.unit == "radians":
+            limits: dict[str, Any] = {
+                name: math.degrees(getattr(option, name)) for name in ("least", "above", "most", "below")
+            }
+            option = replace(option, unit="degrees", **limits)
+        self.entry = replace(entry, option=option)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The value of a text."""
+        if not isinstance(value, str) or value in self.entry.words:
+            return value
+        if value == self.entry.option.none:
+            return None
+        for kind in self.entry.types:
+            with suppress(ValueError, OverflowError):
+                parsed = self._parsed(value, kind)
+                if self.entry.fits(parsed):
+                    return self._in_radians(parsed) if self.entry.option.unit == "degrees" else parsed
+        expected = self.entry.expected
+        if self.entry.option.unit == "bytes":
+            expected = "an amount of memory such as 800M or 2G"
+        elif self.entry.option.none:
+            expected = f"{self.entry.option.none} or {expected}"
+        return self.fail(f"expected {expected}, not {value!r}", param, ctx)
+
+    def shown(self, value: Any) -> str:
+        """A default, as one would enter it."""
+        if value is None:
+            return self.entry.option.none
+        if self.entry.option.unit == "degrees":
+            value = math.degrees(value)
+        return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+    def _parsed(self, text: str, kind: Any) -> Any:
+        if get_origin(kind) is tuple:
+            inner = get_args(kind)[0]
+            return tuple(self._parsed(part, inner) for part in text.split(";" if get_origin(inner) is tuple else ","))
+        if self.entry.option.unit == "bytes":
+            parts = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(?:i?B)?\s*", text, re.IGNORECASE)
+            return int(float(parts[1]) * 2 ** (10 * " KMGT".index(parts[2].upper() or " "))) if parts else 0
+        prefix, colon, _ = self.entry.option.metavar.rpartition(":")  # EPSG:
+        return kind(text.upper().removeprefix(prefix + colon))
+
+    def _in_radians(self, degrees: Any) -> Any:
+        return tuple(map(math.radians, degrees)) if isinstance(degrees, tuple) else math.radians(degrees)

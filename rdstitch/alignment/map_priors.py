@@ -1,0 +1,254 @@
+"""Positions of cameras and ground control points as priors: what bends a long chain hardly changes how neighbours fit.
+
+The plane is a view from above, so that a similarity takes metres east and south to it. It is fitted robustly, the
+cameras and the points are drawn to where it puts them, each as surely as its accuracy and the scatter that is left
+say, and so in turn; the frame is free meanwhile. Where the images disagree, with larger errors or with cameras that
+stay away, the map does not count.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.bundle_adjustment import BundleAdjuster
+from rdstitch.alignment.motion_models import PlanarModel, X, Y
+from rdstitch.alignment.noise import EXACTNESS
+from rdstitch.alignment.plane_marks import PlaneMarks
+from rdstitch.alignment.priors import CameraPriors
+from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.robust.loss import RAYLEIGH_MEDIAN
+from rdstitch.robust.similarity_fit import OUTLYING, SimilarityFit, fit_similarity
+
+POSITION_STD = 3.0
+"""Metres: of one coordinate of a position by a receiver without corrections, within one flight."""
+
+_MIN_POSITIONS, _MIN_CONTROL, _MIN_SPREAD = 4, 3, 5.0
+"""Positions, and points, and standard deviations that they must be spread over, to say anything of the shape."""
+
+_CLICK = 0.5  # pixels: of a coordinate of where an image shows a control point
+_ROUNDS, _SETTLED = 8, 0.1
+"""Of fitting the similarity and adjusting again; standard deviations by which what is known still moves at the end."""
+
+_MAX_GROWTH = 1.1
+"""Times by which the errors of the images may grow."""
+
+_SURE = 1.0 - 1e-6  # leverage beyond which rounding counts
+_MANY = 50  # positions whose leverage is computed; that of others is taken to be the median
+
+ComplexArray = NDArray[np.complex128]
+_COMPLEX = np.array([1.0, 1.0j])
+
+
+@dataclass(frozen=True)
+class Held:
+    """A fit with what the map says, or without, and why."""
+
+    problem: Problem
+    fit: Fit
+    disagreement: str = ""
+    leverage: Mapping[int | str, float] = field(default_factory=dict)  # by image of the problem, and name of a point
+
+    def leverage_of(self, images: IntArray) -> dict[int | str, float]:
+        """The same by what those of the problem are among all images (N,)."""
+        return {key if isinstance(key, str) else int(images[key]): value for key, value in self.leverage.items()}
+
+
+def hold_on_map(problem: Problem, fit: Fit) -> Held:
+    """Adjust again with positions and control points as priors, where there are enough of them, and they agree."""
+    if not isinstance(fit.model, PlanarModel):
+        return Held(problem, fit)
+    every: list[_Side] = [_Control(problem, fit), _Positions(problem)]
+    sides = [side for side in every if side.enough]
+    disagreement = ""
+    while sides:
+        held = _held(problem, fit, sides)
+        if not held.disagreement:
+            return replace(held, disagreement=disagreement)
+        disagreement, sides = disagreement or held.disagreement, sides[1:]
+    return Held(problem, fit, disagreement)
+
+
+class _Side:
+    """N places that are known on the map, and where a fit has them, in units of the poses."""
+
+    metres: ComplexArray  # (N,): east - i north
+    std: FloatArray  # (N,): of a coordinate, m
+    least: int
+    name: str
+
+    def here(self, fit: Fit) -> ComplexArray:
+        """(N,)."""
+        raise NotImplementedError
+
+    def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
+        """With the places at targets (N, 2), as surely as inverse variances (N,) say."""
+        raise NotImplementedError
+
+    def sightings(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Images (M,), derivatives (M, 2, D + S + K) of places by their poses and the shared parameters, precision."""
+        raise NotImplementedError
+
+    def named(self) -> tuple[IntArray, Sequence[int | str]]:
+        """Which of N places each sighting (M,) is one of, and what these are called."""
+        raise NotImplementedError
+
+    @property
+    def enough(self) -> bool:
+        """Whether they say anything of the shape; whatever a few of them are."""
+        if len(self.metres) < self.least:
+            return False
+        middle = complex(np.median(self.metres.real), np.median(self.metres.imag))
+        return float(np.median(np.abs(self.metres - middle) / self.std)) >= _MIN_SPREAD
+
+    def drawn(self, known: CameraPriors, fit: Fit) -> tuple[CameraPriors, SimilarityFit, float]:
+        """The prior by the places of a fit, the similarity to the map, and by how much errors exceed their std."""
+        here = self.here(fit)
+        similar = fit_similarity(here, self.metres, float(np.median(self.std)))
+        scale = similar.scale or 1e-300
+        target = ((self.metres - similar.origin) / scale).view(np.float64).reshape(-1, 2)
+        count = len(here)
+        excess = float(np.median(similar.residuals / self.std)) / RAYLEIGH_MEDIAN * math.sqrt(count / (count - 2))
+        excess = max(excess, 1.0)
+        precision = similar.weights * (abs(scale) / (self.std * excess)) ** 2
+        return self.prior(known, target, precision), similar, excess
+
+
+class _Positions(_Side):
+    least, name = _MIN_POSITIONS, "GPS positions"
+
+    def __init__(self, problem: Problem) -> None:
+        metres, std = problem.camera_priors.positions @ np.array([1.0, -1.0j]), problem.camera_priors.positions_std
+        self.known = np.isfinite(metres)
+        self.metres = metres[self.known]
+        self.std = np.where(np.isfinite(std), std, POSITION_STD)[self.known]
+
+    def here(self, fit: Fit) -> ComplexArray:
+        places: ComplexArray = fit.adjusted.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX
+        return places
+
+    def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
+        places, surely = np.zeros((len(self.known), 2)), np.zeros(len(self.known))
+        places[self.known], surely[self.known] = target, precision
+        return replace(known, places=places, places_precision=surely)
+
+    def sightings(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
+        assert isinstance(fit.model, PlanarModel)
+        image = np.flatnonzero(self.known)
+        axes = [fit.model.free.index(column) for column in (X, Y)]
+        shared = len(fit.model.shared_names) + int(adjuster.free.lens.sum())
+        derivative = np.zeros((len(image), 2, fit.model.pose_size + shared))
+        derivative[:, [0, 1], axes] = 1.0
+        return image, derivative, adjuster.priors.poses_precision[image, axes[0]]
+
+    def named(self) -> tuple[IntArray, Sequence[int | str]]:
+        names = np.flatnonzero(self.known)
+        return np.arange(len(names)), names.tolist()
+
+
+class _Control(_Side):
+    least, name = _MIN_CONTROL, "ground control points"
+
+    def __init__(self, problem: Problem, fit: Fit) -> None:
+        self.points = known = problem.camera_priors.control
+        self.metres = known.places @ np.array([1.0, -1.0j])
+        self.count = np.bincount(known.point, minlength=len(known.names))
+        self.std = known.std
+        if len(self.metres) >= self.least:
+            here = self.here(fit)
+            usable = np.isfinite(here)
+            pixel = np.bincount(known.point, known.pixel) / np.maximum(self.count, 1)
+            scale = abs(fit_similarity(here[usable], self.metres[usable], 0.0).scale) if usable.sum() > 1 else 1.0
+            self.std = np.hypot(known.std, _CLICK * pixel * scale)
+
+    def marks(self, target: FloatArray, precision: FloatArray) -> PlaneMarks:
+        known = self.points
+        # What a point is off by is the same in all images that show it.
+        shared = (precision / np.maximum(self.count, 1))[known.point]
+        return PlaneMarks(known.image, known.points, target[known.point], shared)
+
+    def here(self, fit: Fit) -> ComplexArray:
+        adjusted = fit.adjusted
+        every = np.zeros((len(self.metres), 2))
+        focal = float(np.exp(adjusted.parameters.shared[-1]))
+        marks = self.marks(every, np.zeros(len(every)))
+        seen = marks.places(adjusted.matrices.matrices, adjusted.parameters.lens, focal)
+        np.add.at(every, self.points.point, seen)
+        means: ComplexArray = (every / np.maximum(self.count, 1)[:, None]) @ _COMPLEX
+        return means
+
+    def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
+        return replace(known, marks=self.marks(target, precision))
+
+    def sightings(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
+        parameters, marks = fit.adjusted.parameters, adjuster.priors.marks
+        assert marks is not None
+        focal = float(np.exp(parameters.shared[-1]))
+        derivative = marks.equations(fit.adjusted.matrices, parameters.lens, adjuster.free.lens, focal)[1]
+        return marks.image, derivative, marks.precision
+
+    def named(self) -> tuple[IntArray, Sequence[int | str]]:
+        return self.points.point, self.points.names
+
+
+def _held(problem: Problem, fit: Fit, sides: list[_Side]) -> Held:
+    """The fit with all of them, and which of the first ones the images contradict."""
+    refined, free = fit, replace(problem.camera_priors, fix_frame=False)
+    for _ in range(_ROUNDS):
+        before, known = [side.here(refined) for side in sides], free
+        drawn = []
+        for side in sides:
+            known, similar, excess = side.drawn(known, refined)
+            drawn.append((similar, excess))
+        held = replace(problem, camera_priors=known)
+        refined = held.refine(fit.model, refined.adjusted.parameters, fit.tilt_spread or None)
+        moved = [
+            np.abs(side.here(refined) - was).max() * abs(similar.scale) / (np.median(side.std) * excess)
+            for side, was, (similar, excess) in zip(sides, before, drawn, strict=True)
+        ]
+        if max(moved) < _SETTLED:
+            break
+    for side in sides:
+        known, similar, excess = side.drawn(known, refined)
+    growth = math.hypot(refined.adjusted.sigma, EXACTNESS) / math.hypot(fit.adjusted.sigma, EXACTNESS)
+    side, (similar, excess) = sides[0], drawn[0]
+    off, usual = float(np.median(similar.residuals)), max(float(np.median(side.std)), POSITION_STD)
+    why = ""
+    if isinstance(side, _Positions) and off > OUTLYING * usual:
+        why = f"half of them are {off:.0f} m or more from where the images were taken"
+    elif not growth <= _MAX_GROWTH:
+        why = f"with them the errors of the matches grow by {growth - 1.0:.0%}"
+    if why:
+        return Held(problem, fit, f"the {side.name} contradict the images ({why}) and were not used for the alignment")
+    fixed = replace(held, camera_priors=replace(held.camera_priors, fix_frame=True))
+    return Held(fixed, refined, "", _leverage(held, refined, sides))
+
+
+def _leverage(problem: Problem, fit: Fit, sides: Sequence[_Side]) -> dict[int | str, float]:
+    """How far (0 to 1) what is known puts itself where the fit has it; see :meth:`_Side.named`."""
+    adjuster = problem.adjuster_of(fit)
+    normal, free = adjuster.normal_equations(fit.adjusted), adjuster.free.poses
+    row = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
+    leverage: dict[int | str, float] = {}
+    for side in sides:
+        image, derivative, precision = side.sightings(adjuster, fit)
+        item, names = side.named()
+        chosen = np.unique(np.linspace(0, len(names) - 1, min(len(names), _MANY)).astype(np.intp))
+        gradients = np.zeros((len(normal.gradient_poses), len(chosen), 2))
+        of_shared = np.zeros((len(normal.gradient_shared), len(chosen), 2))
+        counts, sums = np.bincount(item, minlength=len(names)), np.bincount(item, precision, len(names))
+        for column, one in enumerate(chosen.tolist()):
+            for m in np.flatnonzero(item == one).tolist():
+                gradients[row[image[m]], column] += derivative[m, :, : free.shape[1]].T / counts[one]
+                of_shared[:, column] += derivative[m, :, free.shape[1] :].T / counts[one]
+        flat = [part.reshape(len(part), -1) for part in (gradients, of_shared)]
+        steps = normal.responses(-flat[0], -flat[1])
+        variance = sum(np.einsum("pc,pc->c", one, other) for one, other in zip(flat, steps, strict=True))
+        own = np.clip(np.reshape(variance, (-1, 2)).mean(axis=1) * sums[chosen], 0.0, _SURE)
+        shares = np.full(len(names), np.median(own))
+        shares[chosen] = own
+        leverage.update(zip(names, np.where(sums > 0.0, shares, 0.0).tolist(), strict=True))
+    return leverage

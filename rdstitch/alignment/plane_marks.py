@@ -1,0 +1,115 @@
+"""Marks on the plane, as ground control points are: where images show them, and where they are."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from rdstitch.alignment.link_equations import split_lens
+from rdstitch.alignment.motion_models import ModelMatrices
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.division_model import undistort
+from rdstitch.geometry.radial_homography import inverses
+
+_STEP = 1e-6  # of a lens parameter, for derivatives
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A ground control point in an image."""
+
+    image: int
+    offset: tuple[float, float]  # from the distortion centre, pixels of the camera
+    name: str
+    place: tuple[float, float]  # metres east and north
+    std: float | None = None  # of one coordinate of the place, m, where that is known
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """P ground control points in M sightings."""
+
+    names: tuple[str, ...]  # (P,)
+    places: FloatArray  # (P, 2): metres east and north
+    std: FloatArray  # (P,): of one coordinate, m; 0 where that is not known
+    point: IntArray  # (M,): which of them
+    image: IntArray  # (M,)
+    points: FloatArray  # (M, 2): measured, in half diagonals from the distortion centre
+    pixel: FloatArray  # (M,): a pixel, half diagonals
+
+    @classmethod
+    def of(cls, sightings: Sequence[Sighting], cameras: Sequence[Camera]) -> Self:
+        """In images of these cameras."""
+        first = {one.name: one for one in reversed(sightings)}
+        names = tuple(dict.fromkeys(one.name for one in sightings))
+        number = {name: k for k, name in enumerate(names)}
+        return cls(
+            names,
+            np.array([first[name].place for name in names]).reshape(-1, 2),
+            np.array([first[name].std or 0.0 for name in names]),
+            np.array([number[one.name] for one in sightings], dtype=np.intp),
+            np.array([one.image for one in sightings], dtype=np.intp),
+            np.array([np.array(one.offset) / cameras[one.image].scale for one in sightings]).reshape(-1, 2),
+            np.array([1.0 / cameras[one.image].scale for one in sightings]),
+        )
+
+    def within(self, images: IntArray) -> Self:
+        """In some of the images (N,), ascending, which get the numbers 0 to N - 1."""
+        seen = np.isin(self.image, images)
+        known, point = np.unique(self.point[seen], return_inverse=True)
+        return type(self)(
+            tuple(self.names[k] for k in known.tolist()),
+            self.places[known],
+            self.std[known],
+            point.astype(np.intp),
+            np.searchsorted(images, self.image[seen]).astype(np.intp),
+            self.points[seen],
+            self.pixel[seen],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneMarks:
+    """M sightings of marks by a planar model; errors are on the plane, multiplied by the focal length as poses are."""
+
+    image: IntArray  # (M,)
+    points: FloatArray  # (M, 2): measured, in half diagonals from the distortion centre
+    target: FloatArray  # (M, 2): where the marks are
+    precision: FloatArray  # (M,): inverse variance of a coordinate
+
+    def places(self, matrices: FloatArray, lens: FloatArray, focal: float) -> FloatArray:
+        """Where images with plane-to-image matrices (N, 3, 3) put the marks, (M, 2)."""
+        seen = self._lifted(matrices, lens)[0]
+        places: FloatArray = focal * seen[:, :2] / seen[:, 2:]
+        return places
+
+    def cost(self, matrices: FloatArray, lens: FloatArray, focal: float) -> float:
+        """Squared errors over their variances."""
+        errors = self.places(matrices, lens, focal) - self.target
+        return float((self.precision[:, None] * errors**2).sum())
+
+    def equations(
+        self, matrices: ModelMatrices, lens: FloatArray, free_lens: BoolArray, focal: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Errors (M, 2); derivatives (M, 2, D + S + K) by pose, shared parameters, of which log f is last, and lens."""
+        seen, inverse = self._lifted(matrices.matrices, lens)
+        by_matrix = np.concatenate([matrices.by_pose, matrices.by_shared], axis=1)[self.image]
+        moved = -np.einsum("mij,mpjk,mk->mpi", inverse, by_matrix, seen)
+        steps = [_STEP * unit for unit in np.eye(len(lens))[free_lens]]
+        ends = [[self._lifted(matrices.matrices, lens + sign * step)[0] for sign in (1.0, -1.0)] for step in steps]
+        by_lens = [(after - before)[:, None] / (2.0 * _STEP) for after, before in ends]
+        moved = np.concatenate([moved, *by_lens], axis=1)
+        place = seen[:, :2] / seen[:, 2:]
+        by_seen = (moved[..., :2] - place[:, None] * moved[..., 2:]) / seen[:, None, 2:]
+        derivative = focal * by_seen.transpose(0, 2, 1)
+        derivative[:, :, by_matrix.shape[1] - 1] += focal * place
+        return focal * place - self.target, derivative
+
+    def _lifted(self, matrices: FloatArray, lens: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The marks on the plane (M, 3), homogeneous, and the matrices from their images to it (M, 3, 3)."""
+        distortion, higher, center = split_lens(lens)
+        inverse = inverses(matrices)[self.image]
+        points = undistort(self.points - center, distortion, higher)
+        return np.einsum("mij,mj->mi", inverse, np.column_stack([points, np.ones(len(points))])), inverse

@@ -1,0 +1,89 @@
+"""Options of feature detection."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from rdstitch.choices import FeatureName
+from rdstitch.errors import ArgumentError
+from rdstitch.options.option import Option, check_options, documented
+
+WORK_MEGAPIXELS = 0.6
+"""10⁶ pixels to which images of a large set are halved unless it is said otherwise."""
+MAX_FEATURES = 2000
+"""Keypoints kept per image of a large set unless it is said otherwise."""
+CLOSER = 4.0
+"""Times as many pixels are used where the working size shows too little."""
+
+_BUDGET = 8  # images of a large set whose pixels and keypoints fewer images may share among them
+_MAX_PIXELS, _MAX_FEATURES = 4.0, 2.0
+"""Times as many pixels, and keypoints, that an image of a small set gets at most: keypoints beyond the strongest 4,000
+made λ of single pairs of a flight less certain, not more."""
+
+
+@documented
+@dataclass(frozen=True)
+class FeatureOptions:
+    """Choice of the features to detect, and how many."""
+
+    kind: Annotated[FeatureName, Option("Feature detector and descriptor.", flag="--features")] = "rootsift"
+    max_features: Annotated[
+        int | None,
+        Option(
+            "Most features of an image.",
+            least=1,
+            default="2000; of fewer than 8 images 16000 together, at most 4000 each",
+        ),
+    ] = None
+    work_megapixels: Annotated[
+        float | Literal["auto"] | None,
+        Option(
+            "Images are halved until they have no more megapixels before features are detected, once less where that "
+            "shows too few; 0 is full size.",
+            "MP",
+            least=0.0,
+            default="0.6; of fewer than 8 images 4.8 together, at most 2.4 each",
+        ),
+    ] = "auto"
+    # keep the strongest of each cell of a grid in turn, rather than the strongest of the image
+    spread: bool = True
+    # grey levels that become 0 and 255; None: those of the set where its images have more than 8 bits, see
+    # :mod:`rdstitch.pipeline.detect_features`, else none
+    stretch: tuple[float, float] | None = None
+    # equalize local contrast before detection; None: of a set whose images show too little otherwise
+    equalize: bool | None = None
+    aliked_model: Annotated[str | Path | None, Option("ONNX file of the network of --features aliked.", "FILE")] = None
+    aliked_size: Annotated[
+        int, Option("Side of the square image that the network takes, pixels.", least=1, command_line=False)
+    ] = 640
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.kind == "aliked" and self.aliked_model is None:
+            raise ArgumentError("features 'aliked' need the ONNX file of the network (--aliked-model)")
+        if self.work_megapixels == 0:
+            object.__setattr__(self, "work_megapixels", None)
+
+    def for_images(self, count: int) -> Self:
+        """The same with numbers for what was left open, which depend on how many images there are.
+
+        A pair takes a second anyway, and all that is known of its lens comes from its own keypoints; hundreds of
+        images have enough together. Fewer than eight images share what eight would have, up to four times as many
+        pixels and twice as many keypoints each.
+        """
+        share = max(_BUDGET / max(count, 1), 1.0)
+        return replace(
+            self,
+            max_features=self.max_features or round(MAX_FEATURES * min(share, _MAX_FEATURES)),
+            work_megapixels=WORK_MEGAPIXELS * min(share, _MAX_PIXELS)
+            if self.work_megapixels == "auto"
+            else self.work_megapixels,
+        )
+
+    @property
+    def limits(self) -> tuple[int, float | None]:
+        """Keypoints of an image, and its megapixels when they are detected; of many images where that is open."""
+        budget = self.for_images(_BUDGET)
+        assert budget.max_features is not None
+        assert budget.work_megapixels != "auto"
+        return budget.max_features, budget.work_megapixels

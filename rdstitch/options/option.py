@@ -1,0 +1,141 @@
+"""An option is declared once, as an annotated field: ``height: Annotated[float, Option("Metres.", above=0)] = 1.0``.
+
+From this its value is checked, the documentation of its class is made, and the command line with its help. Nothing
+large is imported here or by the modules of the options, so that ``--help`` is quick.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from numbers import Integral, Real
+from os import PathLike
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
+
+from rdstitch.errors import ArgumentError
+
+Class = TypeVar("Class", bound=type)
+
+
+@dataclass(frozen=True)
+class Option:
+    """What is said of an option besides its type and its default; the limits hold for every number in it."""
+
+    text: str
+    metavar: str = ""  # what help pages call the value; empty: by its type
+    flag: str = ""  # as "--lambda", "-j --workers" or "--crop/--no-crop"; empty: by the name of the field
+    least: float = -math.inf
+    above: float = -math.inf
+    most: float = math.inf
+    below: float = math.inf
+    unit: Literal["", "radians", "degrees", "bytes"] = ""  # entered as degrees, and as 800M, on the command line
+    none: str = ""  # the word for None on the command line
+    default: str = ""  # what help pages say of the default, where its value says too little
+    entered: Any = None  # the type on the command line, where that of the field is another one
+    command_line: bool = True
+
+    def allows(self, number: float) -> bool:
+        """Check a number by the limits."""
+        return self.least <= number <= self.most and self.above < number < self.below and math.isfinite(number)
+
+    @property
+    def limits(self) -> str:
+        """The limits, in words."""
+        if math.isfinite(self.least) and math.isfinite(self.most):
+            return f" from {self.least:g} to {self.most:g}"
+        limits = {"of at least": self.least, "above": self.above, "of at most": self.most, "below": self.below}
+        return " and".join(f" {words} {value:g}" for words, value in limits.items() if math.isfinite(value))
+
+
+@dataclass(frozen=True)
+class Declared:
+    """An option with its name and type: one of some words, a value of other types, or None."""
+
+    name: str
+    option: Option
+    words: tuple[str, ...]
+    types: tuple[Any, ...]
+    optional: bool
+
+    @property
+    def expected(self) -> str:
+        """What it may be, in words."""
+        words = [f"one of {', '.join(self.words)}"] if len(self.words) > 2 else list(self.words)
+        return " or ".join([*words, *(_in_words(kind, self.option) for kind in self.types)])
+
+    def fits(self, value: Any) -> bool:
+        """Check a value; of texts and files only that they are none of another type."""
+        if value is None or (isinstance(value, str) and value in self.words):
+            return value is not None or self.optional
+        return any(_fits(value, kind, self.option) for kind in self.types)
+
+
+def declaration(name: str, annotation: Any) -> Declared | None:
+    """The option of an annotated field or parameter, if it is one."""
+    option = next((item for item in getattr(annotation, "__metadata__", ()) if isinstance(item, Option)), None)
+    if option is None:
+        return None
+    members = _members(get_args(annotation)[0])
+    words = [word for member in members if get_origin(member) is Literal for word in get_args(member)]
+    types = [member for member in members if get_origin(member) is not Literal and member is not NoneType]
+    optional = any(member is NoneType or isinstance(member, ForwardRef) for member in members)
+    return Declared(name, option, tuple(words), tuple(types), optional)
+
+
+def declared(kind: Any) -> dict[str, Declared]:
+    """The options among the fields of a dataclass."""
+    found = (declaration(field.name, field.type) for field in fields(kind))
+    return {option.name: option for option in found if option is not None}
+
+
+def check_options(options: Any) -> None:
+    """Refuse a value that its field may not have; text that names a file becomes a path, lists become tuples."""
+    for name, option in declared(options).items():
+        value = getattr(options, name)
+        if isinstance(value, str) and option.types == (Path,):
+            value = Path(value)
+        elif isinstance(value, list):
+            value = tuple(tuple(item) if isinstance(item, list) else item for item in value)
+        if not option.fits(value):
+            raise ArgumentError(f"{name} must be {option.expected}, not {value!r}")
+        object.__setattr__(options, name, value)
+
+
+def documented(kind: Class) -> Class:
+    """Describe the options of a class in its documentation."""
+    entries = (f"{name}\n    {option.option.text}" for name, option in declared(kind).items())
+    kind.__doc__ = "\n".join([kind.__doc__ or "", "", "Attributes", "----------", *entries])
+    return kind
+
+
+def _members(kind: Any) -> Sequence[Any]:
+    return [m for each in get_args(kind) for m in _members(each)] if get_origin(kind) in (Union, UnionType) else [kind]
+
+
+def _fits(value: Any, kind: Any, option: Option) -> bool:
+    if get_origin(kind) is tuple:
+        parts = get_args(kind)
+        if isinstance(value, str) or not hasattr(value, "__len__"):
+            return False
+        if parts[-1] is Ellipsis:
+            return all(_fits(item, parts[0], option) for item in value)
+        return len(value) == len(parts) and all(map(_fits, value, parts, [option] * len(parts)))
+    if kind in (int, float):
+        number = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+        return number and option.allows(value)
+    return isinstance(value, {str: str, Path: PathLike, bool: bool}.get(kind, object))
+
+
+def _in_words(kind: Any, option: Option) -> str:
+    unit = f", {option.unit}," if option.unit else ""
+    if get_origin(kind) is tuple:
+        parts = get_args(kind)
+        return f"{len(parts)} numbers{unit}{option.limits}" if parts[-1] is not Ellipsis else "a list"
+    names = {
+        bool: "true or false",
+        int: f"a whole number{unit}{option.limits}",
+        float: f"a number{unit}{option.limits}",
+        Path: "a file",
+    }
+    return names.get(kind, "a text")

@@ -1,0 +1,43 @@
+"""Options that stand in several classes, or are parameters of several functions."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from rdstitch.options.option import Option
+
+Every = Annotated[
+    int | None,
+    Option(
+        "Every N-th frame of a video or ROS bag; auto: frames that show new ground.",
+        "auto|N",
+        least=1,
+        most=1_000_000,
+        none="auto",
+    ),
+]
+Topic = Annotated[str | None, Option("Image topic of a ROS bag.", "NAME")]
+Mask = Annotated[
+    str | Path | None,
+    Option(
+        "Mask whose black pixels are excluded: a folder of masks with the images' names, or one file for all.",
+        "DIR|FILE",
+    ),
+]
+FlatField = Annotated[
+    str | Path,
+    Option(
+        "Flat-field correction: estimated from the images, or read from FILE (second page: the dark field).",
+        "auto|off|FILE",
+        entered=Literal["auto", "off"] | Path,
+    ),
+]
+Workers = Annotated[
+    int, Option("Threads; 0: one for each usable core.", "N", "-j --workers", least=0, most=1024)
+]  # more than any machine has cores for
+Overwrite = Annotated[bool, Option("Replace existing output files.")]
+Strict = Annotated[bool, Option("Fail with status 5 when an image is left out.")]
+DryRun = Annotated[bool, Option("Print size, memory and time of compositing; write nothing.")]
+Height = Annotated[float, Option("Height of the first frame above the plane; positions have its unit.", "H", above=0.0)]
+Distortion = Annotated[
+    float | None, Option("Known λ (half-diagonal frame); it is not estimated.", "L", "--lambda", above=-1.0, below=1.0)
+]

@@ -1,0 +1,247 @@
+"""Options of the recipes: the same names and defaults as on the command line."""
+
+import math
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, Self
+
+from rdstitch.choices import CameraFormat, ChannelOrder, LensName, LocalAlignmentMode, ModelName
+from rdstitch.errors import ArgumentError
+from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.options.estimation_options import Confidence, EstimationOptions, Iterations, Seed, Solver, Threshold
+from rdstitch.options.feature_options import FeatureOptions
+from rdstitch.options.option import Option, check_options, documented
+from rdstitch.options.shared_options import Distortion, DryRun, Mask, Overwrite, Strict, Topic, Workers
+from rdstitch.system.machine import processor_count
+
+if TYPE_CHECKING:
+    from rdstitch.geometry.camera import Camera
+
+_SELECT_MODEL_BELOW = 50
+"""Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
+
+
+@documented
+@dataclass(frozen=True)
+class StitchOptions:
+    """How images are registered and composited.
+
+    Raises :class:`rdstitch.errors.ArgumentError` where a value is out of range, unknown, or contradicts another one.
+    A camera may also be given as the path of its file, or of a ROS bag with camera_info.
+    """
+
+    features: FeatureOptions = field(default_factory=FeatureOptions)
+    ratio: Annotated[
+        float | None,
+        Option(
+            "Largest ratio of the distances to the nearest and second nearest descriptor; None: what suits the "
+            "features.",
+            above=0.0,
+            command_line=False,
+        ),
+    ] = None
+    lightglue_model: Annotated[str | Path | None, Option("LightGlue network (ONNX) for these features.", "FILE")] = None
+    solver: Solver = "auto"
+    lens: Annotated[
+        LensName,
+        Option("Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient."),
+    ] = "auto"
+    model: Annotated[ModelName, Option("Motion model of the camera.")] = "auto"
+    threshold: Threshold = 3.0
+    confidence: Confidence = 0.999
+    max_iterations: Iterations = 10000
+    camera: Annotated[
+        "Camera | None",
+        Option(
+            "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is not "
+            "estimated.",
+            "FILE",
+            entered=Path | None,
+        ),
+    ] = None
+    distortion: Distortion = None
+    focal: Annotated[
+        float | None, Option("Focal length, pixels; otherwise from EXIF, or a guess.", "PX", above=0.0)
+    ] = None
+    tilt: Annotated[
+        tuple[float, float] | None,
+        Option(
+            "Known tilt of the camera, degrees.",
+            "PSI,THETA",
+            above=-math.pi / 2,
+            below=math.pi / 2,
+            unit="radians",
+        ),
+    ] = None
+    attitude: Annotated[
+        Literal["xmp"] | str | Path | None,
+        Option("Tilt of each image: CSV name,psi,theta in degrees; xmp: from the XMP of drone images.", "FILE|xmp"),
+    ] = None
+    attitude_std: Annotated[
+        float,
+        Option(
+            "Standard deviation of the attitudes, degrees; 0 for exact ones.",
+            "DEG",
+            least=0.0,
+            most=math.pi / 2,
+            unit="radians",
+        ),
+    ] = math.radians(1.0)
+    timestamps: Annotated[
+        str | Path | None,
+        Option(
+            "Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; otherwise those of the "
+            "video, bag or EXIF.",
+            "FILE",
+        ),
+    ] = None
+    positions: Annotated[
+        str | Path | None,
+        Option(
+            "Where images were taken, instead of EXIF: CSV name,lat,lon or name,x,y (see --crs), exiftool's -csv or "
+            "-json, OpenDroneMap's geo.txt, or a GPX track.",
+            "FILE",
+        ),
+    ] = None
+    positions_offset: Annotated[
+        float, Option("Seconds from the times of the images to those of the GPX track (UTC).", "S")
+    ] = 0.0
+    position_accuracy: Annotated[
+        float | None,
+        Option("Standard deviation of a horizontal coordinate of positions that tell none, metres.", "M", above=0.0),
+    ] = None
+    gcp: Annotated[
+        str | Path | None,
+        Option(
+            "Ground control points, as OpenDroneMap's gcp_list.txt, or CSV x,y,px,py,image,name,accuracy (see --crs); "
+            "they bend the alignment, and place the output on the Earth.",
+            "FILE",
+        ),
+    ] = None
+    check_points: Annotated[
+        str | Path | None,
+        Option("Points like those of --gcp that are compared with the map, and take no part in it.", "FILE"),
+    ] = None
+    mask: Mask = None
+    channel_order: Annotated[
+        ChannelOrder, Option("Order of the channels of arrays that come in or go out.", command_line=False)
+    ] = "bgr"
+    exclude: Annotated[
+        tuple[str, ...],
+        Option("Exclude the image of this name, or all that match a pattern like 'img_49*'; repeatable.", "NAME"),
+    ] = ()
+    include_only: Annotated[
+        tuple[str, ...], Option("Use only the images of this name or pattern; repeatable.", "NAME")
+    ] = ()
+    topic: Topic = None
+    reference: Annotated[str | None, Option("Reference image; otherwise the best connected one.", "NAME")] = None
+    pose_covariance: Annotated[
+        bool, Option("Compute covariances of the poses, for the sidecar and tables of poses.", command_line=False)
+    ] = False
+    local_alignment: Annotated[
+        LocalAlignmentMode,
+        Option(
+            "Smooth displacement of each image where the scene has depth. auto: if held-out matches come nearer; N: "
+            "always, with N cells along an image's longer side.",
+            "auto|off|N",
+            least=2,
+            most=100,
+        ),
+    ] = "auto"
+    composite: CompositeOptions = field(default_factory=CompositeOptions)
+    cache: Annotated[
+        Path | None,
+        Option("Folder for features, pairs and alignments, to reuse in later runs; made if missing.", "DIR"),
+    ] = None
+    seed: Seed = 0
+    workers: Workers = 0
+    scheduler: Annotated[
+        str | None,
+        Option(
+            "Run on a Dask cluster that shares the images and the folder of --cache; local starts one here.",
+            "ADDRESS|local",
+        ),
+    ] = None
+    overwrite: Overwrite = False
+    strict: Strict = False
+    force: Annotated[bool, Option("Write the result even when it fails its own checks.")] = False
+    save_camera: Annotated[Path | None, Option("Write the estimated camera.", "FILE")] = None
+    camera_format: Annotated[
+        CameraFormat,
+        Option(
+            "Format of the camera file written. auto: by its name, .json (rdstitch), .yml (OpenCV), .fisheye.yml, "
+            ".pto (Hugin), .xml (lensfun), cameras.json (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS), "
+            "camchain.yaml (Kalibr).",
+        ),
+    ] = "auto"
+    dry_run: DryRun = False
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if isinstance(file := getattr(self, "camera"), str | Path):  # noqa: B009 - by its type it is a camera
+            from rdstitch.inputs.rosbag import camera_in
+
+            object.__setattr__(self, "camera", camera_in(file))
+        if self.lens != "auto" and self.known_distortion is not None:
+            raise ArgumentError("the lens is known: leave out lens, or the known lens")
+        if self.solver == "two_point" and self.tilt is None and (self.attitude is None or self.attitude_std > 0.0):
+            raise ArgumentError("the two_point solver needs the tilt, or exact attitudes")
+        if self.solver != "auto" and self.known_distortion is not None:
+            raise ArgumentError("with a known λ no solver can be chosen")
+        if self.scheduler not in (None, "local") and self.cache is None:
+            raise ArgumentError("a cluster needs a folder for features that all its machines see: give --cache too")
+        if self.composite.measured and self.reference is None:
+            raise ArgumentError("rectangle and lines are pixels of the reference image: say which, give reference too")
+
+    def for_images(self, count: int) -> Self:
+        """The same with numbers for what depends on how many images there are."""
+        return replace(self, features=self.features.for_images(count))
+
+    @property
+    def known_distortion(self) -> float | None:
+        """λ where the user gave it, alone or with the camera; of a richer lens, the nearest one-parameter λ."""
+        if self.distortion is not None or self.camera is None:
+            return self.distortion
+        return self.camera.nearest_distortion
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that are read besides the images, none of which may be written over."""
+        named = (
+            self.mask,
+            self.attitude,
+            self.timestamps,
+            self.positions,
+            self.gcp,
+            self.check_points,
+            self.lightglue_model,
+            self.features.aliked_model,
+            self.composite.like,
+        )
+        given = [Path(file) for file in named if file is not None]
+        return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
+
+    @property
+    def estimation(self) -> EstimationOptions:
+        """How pairs are estimated."""
+        return EstimationOptions(
+            self.solver,
+            self.known_distortion,
+            self.threshold,
+            self.confidence,
+            self.max_iterations,
+            self.seed,
+            _SELECT_MODEL_BELOW,
+        )
+
+    def executor(self, images: int) -> Executor:
+        """Give where the tasks of a set of so many images are computed; to be used in a ``with`` block."""
+        from rdstitch.executors import open_executor
+
+        return open_executor(self.threads, images, scheduler=self.scheduler, store=self.cache)
+
+    @property
+    def threads(self) -> int:
+        """Number of images or pairs to work on at the same time."""
+        return self.workers or processor_count()

@@ -1,0 +1,94 @@
+"""Options of putting tiles together."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from rdstitch.choices import Origin, ScanOrder, ZPlane
+from rdstitch.errors import ArgumentError
+from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.options.option import Option, check_options, documented
+from rdstitch.options.shared_options import DryRun, FlatField, Overwrite, Strict, Topic, Workers
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+
+def measured_samples() -> CompositeOptions:
+    """Composition that keeps samples: each pixel of the output is one tile's."""
+    return CompositeOptions(exposure="none", seam="none", blend="none")
+
+
+@documented
+@dataclass(frozen=True, eq=False)
+class TileOptions:
+    """Options of :func:`rdstitch.tiles`; the command line has the same names and defaults.
+
+    Besides a file, ``positions`` may be, of each tile in the order given, an array (N, 2) of x and y in pixels, or a
+    dict or data frame with x, y or x_um, y_um. By default (``composite``) each sample of the image is one of a tile.
+    """
+
+    positions: Annotated[
+        "str | Path | ArrayLike | Mapping[str, ArrayLike] | None",
+        Option(
+            "CSV with name,x,y (pixels) or name,x_um,y_um, or Fiji's TileConfiguration.txt; otherwise what OME-TIFF "
+            "or Micro-Manager say.",
+            "FILE",
+            entered=Path | None,
+        ),
+    ] = None
+    grid: Annotated[
+        str | None,
+        Option(
+            "Part of the file names, with {row} and {col} for numbers and * for anything, such as 'r{row}c{col}'; "
+            "'{letter}{col}' for A01; 'img_{number}' for running numbers.",
+            "PATTERN",
+        ),
+    ] = None
+    columns: Annotated[int | None, Option("With {number}: tiles in a row.", least=1)] = None
+    order: Annotated[ScanOrder, Option("With {number}: how tiles follow each other; snake: to and fro.")] = "rows"
+    origin: Annotated[Origin, Option("With --grid: where the first tile is.")] = "top-left"
+    overlap: Annotated[
+        float, Option("With --grid: overlap of neighbouring tiles.", "PERCENT", least=0.0, below=100.0)
+    ] = 10.0
+    pixel_size: Annotated[float | None, Option("Pixel size, micrometres, if no file states it.", "UM", above=0.0)] = (
+        None
+    )
+    search: Annotated[
+        float | None,
+        Option(
+            "Search radius around the nominal offset of neighbours.", "PX", above=0.0, default="5 % of a tile's side"
+        ),
+    ] = None
+    channel: Annotated[
+        int | None, Option("Register this channel, from 0; otherwise the mean of all. All are composed.", least=0)
+    ] = None
+    z: Annotated[
+        ZPlane | None,
+        Option("Plane of z stacks, from 0; otherwise the brightest sample of all planes.", "max|N", least=0),
+    ] = None
+    time: Annotated[int | None, Option("Time of a series, from 0; otherwise the first.", least=0)] = None
+    flat_field: FlatField = "auto"
+    save_flat_field: Annotated[
+        str | Path | None, Option("Write flat field and dark field to this TIFF file.", "FILE")
+    ] = None
+    distortion: Annotated[
+        float | Literal["auto"] | None,
+        Option(
+            "Known λ (half-diagonal frame), or auto: estimate it; otherwise 0 unless all overlaps show it.",
+            "L|auto",
+            "--lambda",
+        ),
+    ] = None
+    composite: CompositeOptions = field(default_factory=measured_samples)
+    overwrite: Overwrite = False
+    strict: Strict = False
+    dry_run: DryRun = False
+    workers: Workers = 0
+    topic: Topic = None
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.positions is not None and self.grid is not None:
+            raise ArgumentError("positions and grid both say where the tiles are; leave one of them out")

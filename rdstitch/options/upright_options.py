@@ -1,0 +1,57 @@
+"""How the output is turned between registration and canvas."""
+
+from dataclasses import dataclass, fields
+from typing import Annotated, Literal
+
+from rdstitch.errors import ArgumentError
+from rdstitch.options.option import Option, check_options
+
+Segment = tuple[float, float, float, float]
+Corners = tuple[float, float, float, float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class UprightOptions:
+    """How the output is turned."""
+
+    yaw: Annotated[float, Option("Turn the view of a panorama to the right, before it is projected.", "DEG")] = 0.0
+    pitch: Annotated[float, Option("Turn the view of a panorama up, before it is projected.", "DEG")] = 0.0
+    roll: Annotated[float, Option("Turn the view of a panorama clockwise, before it is projected.", "DEG")] = 0.0
+    rectangle: Annotated[
+        Corners | None,
+        Option(
+            "Four corners, pixels of the reference image as it is read, clockwise: they become an upright rectangle "
+            "of its true aspect ratio, the first one its top left corner.",
+            "X1,Y1,…,X4,Y4",
+        ),
+    ] = None
+    straighten: Annotated[
+        Literal["off", "auto"] | tuple[Segment, ...],
+        Option(
+            "Make horizontal and vertical edges of the scene so in the output. auto: edges detected in the images; "
+            "LINES: 'x1,y1,x2,y2;…', ends in pixels of the reference image as it is read.",
+            "off|auto|LINES",
+        ),
+    ] = "off"
+    level: Annotated[bool, Option("Level the output by gravity (XMP, --attitude), otherwise by most images.")] = False
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if (self.rectangle is not None) + (self.straighten != "off") + self.level > 1:
+            raise ArgumentError("rectangle, straighten and level each turn the output; give one of them")
+        if not isinstance(self.straighten, str) and any(line[:2] == line[2:] for line in self.straighten):
+            raise ArgumentError("straighten: a line needs two different ends")
+
+    @property
+    def measured(self) -> bool:
+        """Whether places in the reference image are given."""
+        return self.rectangle is not None or not isinstance(self.straighten, str)
+
+    @property
+    def upright(self) -> bool:
+        """Whether something in the scene shall be upright, whatever else the frame of the output would be."""
+        return self.measured or self.straighten == "auto" or self.level
+
+    def same_turn(self, other: "UprightOptions") -> bool:
+        """Whether other options turn the output alike."""
+        return all(getattr(self, f.name) == getattr(other, f.name) for f in fields(UprightOptions))

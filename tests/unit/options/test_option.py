@@ -1,0 +1,74 @@
+"""What is declared once of an option is what is checked."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pytest
+
+from rdstitch.errors import ArgumentError
+from rdstitch.options.option import Option, check_options, documented
+
+
+@documented
+@dataclass(frozen=True)
+class _Options:
+    """Some."""
+
+    number: Annotated[float, Option("A number.", above=0.0, most=10.0)] = 1.0
+    count: Annotated[int | Literal["auto"] | None, Option("How many.", least=2)] = None
+    word: Annotated[Literal["one", "two", "three"], Option("A word.")] = "one"
+    sides: Annotated[tuple[float, float] | None, Option("Two sides.")] = None
+    lines: Annotated[Literal["off"] | tuple[tuple[float, float], ...], Option("Lines.")] = "off"
+    names: Annotated[tuple[str, ...], Option("Names.")] = ()
+    file: Annotated[Path | None, Option("A file.")] = None
+    switch: Annotated[bool, Option("On or off.")] = False
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"number": 10},
+        {"number": np.float32(0.5), "count": np.int64(2)},
+        {"count": "auto", "word": "three"},
+        {"sides": (1.0, -1.0), "lines": ((0.0, 1.0), (2.0, 3.0)), "names": ("a", "b")},
+    ],
+)
+def test_what_fits_is_taken(given: dict[str, Any]) -> None:
+    options = _Options(**given)
+    assert {name: getattr(options, name) for name in given} == given
+
+
+def test_texts_become_paths_and_lists_tuples() -> None:
+    given: Any = {"file": "a/b", "sides": [1.0, 2.0], "lines": [[0.0, 1.0]], "names": ["a"]}
+    assert _Options(**given) == _Options(file=Path("a/b"), sides=(1.0, 2.0), lines=((0.0, 1.0),), names=("a",))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("number", 0.0, "a number above 0 and of at most 10"),
+        *(("number", value, "a number") for value in (10.1, math.nan, math.inf, "3", True, None)),
+        *(("count", value, "auto or a whole number of at least 2") for value in (1, 2.0, "2", False)),
+        *(("word", value, "one of one, two, three") for value in ("four", None, 1)),
+        *(("sides", value, "2 numbers") for value in ((1.0,), (1.0, 2.0, 3.0), (1.0, math.nan), "12", 5.0, [1.0])),
+        *(("lines", value, "off") for value in (((0.0,),), "on", [[0.0, "x"]])),
+        *(("names", value, "a list") for value in ("a", (1,))),
+        ("file", 3, "a file"),
+        ("switch", "yes", "true or false"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name(name: str, value: Any, expected: str) -> None:
+    with pytest.raises(ArgumentError) as caught:
+        _Options(**{name: value})
+    assert str(caught.value).startswith(f"{name} must be {expected}")
+    assert str(caught.value).endswith(f", not {value!r}") or isinstance(value, list)
+
+
+def test_the_class_says_what_its_options_are() -> None:
+    assert "number\n    A number." in (_Options.__doc__ or "")
