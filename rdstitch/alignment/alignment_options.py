@@ -33,7 +33,7 @@ class AlignmentOptions:
     positions_std: ArrayLike | None = None  # standard deviation (N,) of one coordinate of these, m; NaN where unknown
     control: tuple[Sighting, ...] = ()  # ground control points in the images; a prior where there are three or more
     lens: str = "auto"  # one of :data:`rdstitch.choices.LensName`; "auto": the simplest that the data allow
-    purpose: Purpose = "mosaic"
+    purpose: Purpose = Purpose.MOSAIC
     pose_covariance: bool = False  # its time grows with the square of the number of images
     most: int = 250  # correspondences used of each link; fewer where there are thousands of links
 
@@ -72,16 +72,6 @@ class AlignmentOptions:
             positions_std=np.full(count, np.nan) if self.positions_std is None else np.asarray(self.positions_std),
             control=ControlPoints.of(self.control, cameras),
         )
-
-    @property
-    def prefer_turn(self) -> bool:
-        """Whether a turn on the spot is taken where a plane explains the images as well."""
-        return self.purpose == "pano"
-
-    @property
-    def layout_matters(self) -> bool:
-        """Whether images are to be laid out on the plane, so that an absurd layout rules a model out."""
-        return self.purpose in ("pano", "mosaic")
 
     @property
     def lenses(self) -> list[str]:

@@ -136,7 +136,7 @@ def _decided(task: _Task, progress: ShareProgress) -> Decisions:
     messages: list[Message] = []
     method = options.exposure
     if method == "auto":
-        method = "exif" if are_measurements(*task.reader.samples) else "balanced"
+        method = "exif" if are_measurements(images, *task.reader.samples) else "balanced"
     joined = len(images) > 1 and (options.exposure != "none" or options.seam != "none")
     whole = task.turn or (0, 0, *canvas.size)
     if not joined and options.crop != "auto":

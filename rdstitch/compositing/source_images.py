@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
+from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import block_mean, fitting_reduction, reduced_size
 
@@ -41,6 +42,7 @@ class PlacedImage:
     # what local alignment adds to its measured pixels; see :class:`rdstitch.compositing.warp.Warp`
     displacement: Displacement | None = None
     path: str = ""  # what messages call it; its number if empty
+    radiometry: Radiometry | None = None  # of samples that are measurements
     coloured: bool = False  # whether its file says that it has colours, so that grey ones beside it get them
 
 

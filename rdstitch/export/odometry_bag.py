@@ -23,7 +23,7 @@ def check_bag(file: Path, *, overwrite: bool) -> None:
     try:
         import rosbags.rosbag1  # noqa: F401
     except ImportError:
-        raise OutputError(f'{file}: writing ROS bags needs the extra ros: pip install "rdstitch[ros]"') from None
+        raise OutputError(f"{file}: writing ROS bags needs rosbags: pip install rosbags") from None
     if file.is_dir() and overwrite:
         others = [item.name for item in file.iterdir() if item.suffix not in (".mcap", ".db3", ".yaml")]
         if others or not (file / "metadata.yaml").is_file():

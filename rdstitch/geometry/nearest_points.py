@@ -12,18 +12,8 @@ _EXACT: dict[str, bool | int | float | str] = {"checks": -1}
 def nearest_points(points: FloatArray, queries: FloatArray, count: int) -> tuple[FloatArray, IntArray]:
     """The nearest points of each query.
 
-    Parameters
-    ----------
-    points : ndarray of shape (N, D)
-        At least one.
-    queries : ndarray of shape (M, D)
-    count : int
-
-    Returns
-    -------
-    distances : ndarray of shape (M, K)
-        Ascending; ``K`` is the smaller of ``count`` and ``N``.
-    indices : ndarray of shape (M, K), intp
+    Of ``points`` (N, D), at least one, and ``queries`` (M, D): distances, ascending, and indices, both (M, K),
+    where K is the smaller of ``count`` and N.
     """
     centre = points.mean(axis=0)  # of coordinates far from 0 float32 keeps little
     tree = cv2.flann.Index(np.ascontiguousarray(points - centre, np.float32), _SINGLE_TREE)

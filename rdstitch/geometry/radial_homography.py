@@ -56,11 +56,8 @@ def project(homogeneous: FloatArray) -> FloatArray:
 def to_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
     """Give where measured points of an image, pixels (N, 2), lie on the plane; NaN at and beyond the horizon.
 
-    Parameters
-    ----------
-    homography : ndarray of shape (3, 3)
-        From undistorted normalized coordinates to the plane, with positive third coordinates in front of the camera.
-    points : array_like of shape (N, 2)
+    ``homography`` (3, 3) leads from undistorted normalized coordinates to the plane, with positive third
+    coordinates in front of the camera.
     """
     return _mapped(homography, camera.normalize(camera.undistort(points)))
 
@@ -96,21 +93,9 @@ def transfer(
 ) -> FloatArray:
     """Give where measured points of image 1 are measured in image 2: undistort, apply H, distort.
 
-    Parameters
-    ----------
-    homography : array_like of shape (..., 3, 3)
-        From image 1 to image 2, with positive third coordinates in front of the camera.
-    distortion : array_like of shape (...)
-        λ in the frame of the points.
-    points : array_like of shape (N, 2)
-        Normalized.
-    higher : sequence of float
-        μ and ν in the frame of the points, where λ is one number.
-
-    Returns
-    -------
-    ndarray of shape (..., N, 2)
-        Normalized; NaN for a point that comes to lie behind the camera or beyond the lens model.
+    Of homographies (..., 3, 3), from image 1 to image 2 with positive third coordinates in front of the camera, λ
+    (...) in the frame of the points, and normalized points (N, 2): (..., N, 2), NaN for a point that comes to lie
+    behind the camera or beyond the lens model. ``higher`` are μ and ν, where λ is one number.
     """
     h = np.asarray(homography, dtype=np.float64)
     lam = np.asarray(distortion, dtype=np.float64)[..., None]
@@ -175,20 +160,10 @@ def transfer_jacobian(
 ) -> TransferJacobian:
     """:func:`transfer` with its analytic derivatives.
 
-    With ``z = H p``, ``u = z_xy / z_w`` and d the distorted point, ``g`` of ``q = |d|²``: since ``u = d / g``,
-    ``du/dd = (I - α d d') / g`` with ``α = 2 g'/g``, whose inverse is ``dd/du = g (I + α d d' / (1 - αq))``; and at
-    fixed u ``dd/dλ = d q / (g (1 - αq))``, for μ and ν with the next powers of q.
-
-    Parameters
-    ----------
-    homography : ndarray of shape (3, 3) or (N, 3, 3)
-        One for all points, or one a point.
-    distortion : float
-        λ in the frame of the points.
-    points : ndarray of shape (N, 2)
-        Points of image 1, normalized. Points that cannot be transferred give NaN everywhere.
-    higher : sequence of float
-        μ and ν in the frame of the points.
+    With ``z = H p``, ``u = z_xy / z_w`` and d the distorted point, ``g`` of ``q = |d|²``: since ``u = d / g``, ``du/dd
+    = (I - α d d') / g`` with ``α = 2 g'/g``, whose inverse is ``dd/du = g (I + α d d' / (1 - αq))``; and at fixed u
+    ``dd/dλ = d q / (g (1 - αq))``, for μ and ν with the next powers of q. There is one homography for all points (N,
+    2), or one a point, (N, 3, 3); points that cannot be transferred give NaN everywhere.
     """
     # Coordinates first, points last: so every operation runs along the points, which are many.
     lifted, w, d = transfer_points(homography, distortion, points.T, higher)
@@ -214,17 +189,11 @@ def transfer_jacobian(
 def measurement_whitening(by_point: FloatArray, common: FloatArray | None = None) -> FloatArray:
     """Whitening of a transfer error whose noise comes from both images (Sampson's weighting).
 
-    A point measured with the same noise in both images is transferred with covariance ``I + J J'``,
-    ``J`` = ``by_point``. The returned upper triangular ``W`` has ``W'W = ((I + J J') / 2)⁻¹``, so that the whitened
-    error has the size of the error in one image where the two have the same scale.
-
-    Parameters
-    ----------
-    by_point : ndarray of shape (N, 2, 2)
-        Derivative of the transferred by the original point, both in pixels.
-    common : ndarray of shape (N, 2), optional
-        A random displacement of the transferred point besides, of one standard deviation, over that of the noise: its
-        square is added to the covariance.
+    A point measured with the same noise in both images is transferred with covariance ``I + J J'``, ``J`` =
+    ``by_point``. The returned upper triangular ``W`` has ``W'W = ((I + J J') / 2)⁻¹``, so that the whitened error has
+    the size of the error in one image where the two have the same scale. ``by_point`` (N, 2, 2) is the derivative of
+    the transferred by the original point, both in pixels; ``common`` (N, 2) a random displacement of the transferred
+    point besides, of one standard deviation, over that of the noise: its square is added to the covariance.
     """
     (ax, ay), (bx, by) = by_point.transpose(1, 2, 0)
     xx, yy, xy = (1.0 + ax * ax + ay * ay) / 2.0, (1.0 + bx * bx + by * by) / 2.0, (ax * bx + ay * by) / 2.0

@@ -29,6 +29,7 @@ from rdstitch.io.opening import (
     raw_exif,
     raw_size,
 )
+from rdstitch.io.radiometric_tags import Radiometry, read_radiometry
 from rdstitch.io.read_tiff import channel_count
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
@@ -36,6 +37,7 @@ from rdstitch.system.late_imports import tifffile
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
+_BLACK_LEVEL = 50714
 _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
 
 MAX_PROFILE = 2**20 - 2**10
@@ -107,6 +109,7 @@ class Metadata:
     dpi: tuple[float, float] | None = None
     # exposure time x sensitivity / f-number²: what the samples' light is proportional to, for the same scene
     exposure: float | None = None
+    radiometry: Radiometry | None = None  # of a band of a multispectral camera
     # when it was taken, s since 1970; where EXIF has no time zone, its local time is taken for UTC
     timestamp: float | None = None
     exif: bytes = b""  # EXIF block with orientation 1, without maker note and thumbnail; empty where there is none
@@ -169,7 +172,7 @@ def _tiff_metadata(file: Path, stream: BinaryIO) -> Metadata:
         tags.load_from_fp(stream, page.offset)
         exif = own_exif(tags)
     exif[_ORIENTATION] = tags.get(_ORIENTATION, 1)
-    info = {"icc_profile": tags.get(_PROFILE), "xmp": tags.get(_XMP)}
+    info = {"icc_profile": tags.get(_PROFILE), "xmp": tags.get(_XMP), "black_level": tags.get(_BLACK_LEVEL)}
     if (per := _INCHES.get(tags.get(_RESOLUTION_UNIT, 2))) and tags.get(_RESOLUTION[0]):
         info["dpi"] = tuple((finite(tags.get(tag)) or math.nan) * per for tag in _RESOLUTION)
     metadata = _metadata(exif, info, size, page.bitspersample, channels)
@@ -217,6 +220,7 @@ def _metadata(
         serial=_text(photo.get(ExifTags.Base.BodySerialNumber)) or _text(exif.get(ExifTags.Base.CameraSerialNumber)),
         dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(finite(d) for d in dpi) else None,
         exposure=_exposure(photo),
+        radiometry=read_radiometry(xmp, info.get("black_level"), bit_depth),
         timestamp=_timestamp(photo),
         exif=_clean_exif(exif, size[0]),
         icc_profile=profile,
@@ -326,8 +330,10 @@ def _gps(tags: dict[int, Any], xmp: str) -> tuple[GpsPosition | None, str]:
         return None, "its GPS position does not say whether north or south, east or west"
     altitude = finite(tags.get(ExifTags.GPS.GPSAltitude))
     below_sea = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
-    along, across, up = (xmp_number(xmp, f"RtkStd{name}") for name in ("Lat", "Lon", "Hgt"))
-    std = None if not (along and across and up) else (math.hypot(along, across) / math.sqrt(2.0), up)
+    accuracies = (("RtkStdLat", "RtkStdLon", "RtkStdHgt"), ("GPSXYAccuracy", "GPSXYAccuracy", "GPSZAccuracy"))
+    told = [[xmp_number(xmp, name) or 0.0 for name in names] for names in accuracies]
+    along, across, up = next((each for each in told if min(each) > 0.0), (0.0, 0.0, 0.0))
+    std = (math.hypot(along, across) / math.sqrt(2.0), up) if up else None
     return GpsPosition(latitude, longitude, -altitude if altitude and below_sea else altitude, std), ""
 
 

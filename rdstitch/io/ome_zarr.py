@@ -22,9 +22,7 @@ def check_zarr(path: Path) -> None:
     try:
         import zarr  # noqa: F401
     except ImportError:
-        raise OutputError(
-            f"{path}: OME-Zarr needs the package zarr; install it with: pip install 'rdstitch[zarr]'"
-        ) from None
+        raise OutputError(f"{path}: writing OME-Zarr needs zarr: pip install zarr") from None
 
 
 def write_ome_zarr(folder: Path, layout: Layout, strips: Iterable[Strip]) -> None:

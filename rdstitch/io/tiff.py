@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 from xml.sax.saxutils import escape
 
-import deflate
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, pyramid, pyramid_sizes, with_alpha
 from rdstitch.io.metadata import Metadata
-from rdstitch.system.late_imports import tifffile
+from rdstitch.system.late_imports import imagecodecs, tifffile
 
 OME_SUFFIXES = (".ome.tif", ".ome.tiff")
 _TILE = 256
@@ -186,7 +185,7 @@ def _encoded_tile(tile: NDArray[Any]) -> bytes:
 
 def _deflated(stored: NDArray[Any]) -> bytes:
     """Compressed by libdeflate, which is fast, and makes the same bytes of the same samples every time."""
-    return bytes(deflate.zlib_compress(stored, _LEVEL))
+    return bytes(imagecodecs.deflate_encode(stored.tobytes(), _LEVEL))
 
 
 def _band_names(layout: Layout) -> Iterator[ExtraTag]:

@@ -95,7 +95,7 @@ class Aligner:
         sources: Sequence[Source],
         options: StitchOptions,
         cache: Cache,
-        purpose: Purpose = "mosaic",
+        purpose: Purpose = Purpose.MOSAIC,
     ) -> Self:
         """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`."""
         paths = tuple(str(source.path) for source in sources)
@@ -245,17 +245,8 @@ def reselect_inliers(
 ) -> dict[int, PairRegistration]:
     """Select the inliers of the pairs again, by what an alignment expects of their putative matches.
 
-    Parameters
-    ----------
-    alignment : Alignment
-        Of these pairs.
-    threshold : float
-        Distance up to which a match can be an inlier, pixels; it is less where the inliers scatter less.
-
-    Returns
-    -------
-    dict of int to PairRegistration
-        The pairs that the alignment uses and fits, with their inliers, by their position in ``pairs``.
+    An inlier is within ``threshold``, pixels, or less where the inliers scatter less. Given are the pairs that the
+    alignment uses and fits, by their position in ``pairs``.
     """
     errors = {k: pair.errors(alignment.transfer) for k, pair in enumerate(pairs) if pair.images in alignment.support}
     known = [errors[k][pairs[k].relation.inliers] for k in errors]
@@ -288,7 +279,7 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
         attitudes_std=options.attitude_std,
         gravity=_gravity(sources, back),
         positions=positions_of(sources) if sources else None,
-        positions_std=[math.nan if p is None or p.std is None else p.std[0] for p in places],
+        positions_std=[math.nan if p is None or p.std is None else p.std[0] for p in places] or None,
         pose_covariance=options.pose_covariance,
     )
 

@@ -39,20 +39,9 @@ def mosaic_bands(
 ) -> tuple[StitchResult, tuple[Recomposition, ...]]:
     """Stitch the images of several bands, all on the same pixels, into one file and each into one of its own.
 
-    Parameters
-    ----------
-    inputs, options, every, progress, beside
-        As for :func:`rdstitch.mosaic`; ``beside`` is for the first band.
-    output : path
-        ``field.tif`` has all bands, with their names; ``field-NIR.tif`` and so on one each. Formats that hold no
-        number of bands have only the latter.
-    bands : mapping of str to str
-        Names of the bands, and patterns of the names of their images; the first band is registered.
-
-    Returns
-    -------
-    StitchResult, tuple of Recomposition
-        The first band, and the others, each by its own lens; see :func:`rdstitch.pipeline.apply_sidecar.apply`.
+    ``bands`` are patterns of the names of images by the names of bands, the registered one first; ``beside`` is for
+    it alone. ``field.tif`` has all bands, with their names; ``field-NIR.tif`` and so on one each. Formats that hold
+    no number of bands have only the latter. Given are the first band, and the others, each by its own lens.
     """
     options, file = options or StitchOptions(), Path(output)
     files = [file.with_name(f"{file.stem}-{name}{file.suffix}") for name in bands]

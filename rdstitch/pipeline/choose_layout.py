@@ -38,6 +38,9 @@ _MAX_MAGNIFICATION, _MAX_ASPECT = 4.0, 2.0
 _CLEARLY = 0.5
 """Share of the broken places up to which another layout is clearly better."""
 
+_MISFIT = 2.0
+"""Times the errors of the most probable layout that another one may have."""
+
 _BY_CHANCE = Message(
     "the images are no more alike where they were put together than anywhere else; take images that overlap more",
     severity="failure",
@@ -84,12 +87,7 @@ def lay_out(registration: Registration, local: LocalAlignment, options: Composit
 def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner, *, pano: bool) -> LaidOut:
     """The layout whose seams hold, or break the least.
 
-    Parameters
-    ----------
-    registration : Registration
-        In pixels of the working size.
-    pano : bool
-        Whether the output is always in the frame of an image.
+    Pixels are those of the working size; with ``pano`` the output is always in the frame of an image.
     """
 
     def laid(candidate: Registration, local: LocalAlignment | None = None) -> LaidOut:
@@ -140,19 +138,22 @@ def _others(
         names = [name for name in names if name == "pose"]
     for name in names:
         other = realigned(registration, replace(aligner, options=replace(aligner.options, model=name)))
-        if other is not None and _joins(other.alignment, alignment):
+        if other is not None and _joins(other.alignment, alignment, options.threshold):
             reason = f"{other.alignment.model_reason.removesuffix('; as requested')}; seams break less than with a "
             reason += f"{alignment.model} model"
             yield replace(other, alignment=replace(other.alignment, model_reason=reason))
     if first is None or first.layout.seams.contradicted:
         plane = plane_of_most(registration, options, aligner)
-        if plane is not None and _joins(plane.alignment, alignment):
+        if plane is not None and _joins(plane.alignment, alignment, options.threshold):
             yield plane
 
 
-def _joins(other: Alignment, alignment: Alignment) -> bool:
-    """Whether another alignment uses all images of one."""
-    return bool((other.used >= alignment.used).all())
+def _joins(other: Alignment, alignment: Alignment, threshold: float) -> bool:
+    """Whether another alignment uses all images of one, and its matches are inliers, or hardly worse than of the first.
+
+    Local alignment makes seams hold that nothing else does.
+    """
+    return bool((other.used >= alignment.used).all()) and other.rms <= max(threshold, _MISFIT * alignment.rms)
 
 
 def _is_stretched(layout: Layout) -> bool:

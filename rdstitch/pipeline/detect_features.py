@@ -54,12 +54,7 @@ def detect_features(
 ) -> DetectedFeatures:
     """Detect the features of every image, several images at a time.
 
-    Parameters
-    ----------
-    store : Cache
-        Where the features lie.
-    skip_bad : bool
-        Go on without damaged images instead of raising.
+    They lie in ``store``; with ``skip_bad`` damaged images are reported instead of raised.
     """
     results: list[StoredFeatures | InputError] = []
     run = partial(detect_batch, options=options, store=store)

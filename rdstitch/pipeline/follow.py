@@ -187,25 +187,9 @@ def follow(
 
     Poses are for watching: loops are closed, and every pair is used, only when all frames are registered together
     afterwards, by :func:`rdstitch.mosaic` or :func:`rdstitch.trajectory`. Features are fewer and from smaller images
-    than there. Memory does not grow with the number of frames.
-
-    Parameters
-    ----------
-    frames : iterable of Frame
-        See :class:`rdstitch.inputs.arrivals.Arrivals`.
-    poses : FollowedPoses, optional
-    comes_again : callable
-        Whether a frame that could not be read whole will come again, so that it need not be reported yet; see
-        :meth:`rdstitch.inputs.arrivals.Arrivals.comes_again`.
-    preview : path, optional
-        Image to write of what has been seen so far; JPEG or PNG.
-    refresh : float
-        Seconds between two versions of it at least.
-
-    Yields
-    ------
-    Pose
-        One a frame; and one more for keyframes that find their place only later.
+    than there. Memory does not grow with the number of frames. ``comes_again`` says of a frame that could not be read
+    whole whether it will come again (:class:`rdstitch.inputs.arrivals.Arrivals`); ``preview`` is written every
+    ``refresh`` seconds at most. One pose a frame, and one more for keyframes that find their place only later.
     """
     tracker = Tracker(options, poses, patient=True)
     sketch = None if preview is None else _Sketch(preview, refresh)

@@ -21,6 +21,7 @@ from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
+from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.local_alignment import LocalAlignment, Match, align_locally, no_local_alignment
@@ -34,12 +35,7 @@ _COMPARED, _COMPARED_SIDE = 8, 400
 def align_registration_locally(registration: Registration, choice: LocalAlignmentMode) -> LocalAlignment:
     """Displacement fields of the images that are used, in their order, from the matches of all their pairs.
 
-    Parameters
-    ----------
-    registration : Registration
-        In pixels of the images.
-    choice : "auto", "off" or int
-        See :func:`rdstitch.local_alignment.align_locally`.
+    The registration is in pixels of the images.
     """
     if choice == "off":
         return no_local_alignment("switched off")
@@ -156,6 +152,7 @@ class PlacedImages:
                 partial(_read_moving, reader, self.static) if camera.image_size == common else reader
                 for reader, camera in zip(read, self.cameras, strict=True)
             ]
+        located = self.place is not None
         return [
             PlacedImage(
                 reader,
@@ -165,6 +162,7 @@ class PlacedImages:
                 source.metadata.exposure,
                 displacement,
                 str(source.path),
+                source.metadata.radiometry or (Radiometry() if located or source.metadata.gps else None),
                 source.metadata.channels in (3, 4),
             )
             for reader, camera, matrix, source, displacement in zip(

@@ -274,7 +274,7 @@ def _stitch_found(
     sources, unread = read_inputs(frames, options, skip_bad=not pano)
     check_world_files(images, sources, options.overwrite)
     check_map(sources, options.composite)
-    purpose: Purpose = "pano" if pano else "mosaic"
+    purpose = Purpose.PANO if pano else Purpose.MOSAIC
     with options.executor(len(sources)) as executor:
         known = [*unread, *listed.messages]
         accepted = _accepted(sources, known, options, executor, progress, purpose, beside)
@@ -316,7 +316,7 @@ def calibrate(
         sources, unread = read_inputs(with_times(listed.frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages]
-            accepted = _accepted(sources, known, options, executor, progress, "calibrate", beside)
+            accepted = _accepted(sources, known, options, executor, progress, Purpose.CALIBRATE, beside)
             result = _finished(at_full_size(accepted))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
@@ -380,7 +380,7 @@ def trajectory(
         sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages, *notes]
-            registration = at_full_size(_accepted(sources, known, options, executor, progress, "trajectory"))
+            registration = at_full_size(_accepted(sources, known, options, executor, progress, Purpose.TRAJECTORY))
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])

@@ -40,7 +40,7 @@ def register(
     options: StitchOptions,
     executor: Executor,
     *,
-    purpose: Purpose = "mosaic",
+    purpose: Purpose = Purpose.MOSAIC,
     progress: Progress = silent,
 ) -> Registration:
     """Detect features, register pairs, and align all images as one.
@@ -48,13 +48,6 @@ def register(
     Once there are poses, images that these put beside each other are tried too (loop closures), and every pair of an
     image that found no place. Where the images come from two lenses, those of one are aligned. All pixels in the
     result are those of the size that features are detected at, see :mod:`rdstitch.pipeline.working_size`.
-
-    Parameters
-    ----------
-    executor : concurrent.futures.Executor
-        Where features are detected and pairs are registered; see :func:`rdstitch.executors.open_executor`.
-    purpose : str
-        See :data:`rdstitch.choices.Purpose`.
     """
     options = options.for_images(len(sources))
     cache = Cache.at(options.cache)
@@ -62,7 +55,7 @@ def register(
         sources = with_image_circle(sources, executor, cache, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, purpose)
     store = cache if options.cache is not None else Cache.for_this_run()
-    skip_bad = purpose != "pano"
+    skip_bad = purpose is not Purpose.PANO
     detected = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
@@ -84,16 +77,16 @@ def register(
     pairs = pairing.estimate_candidates(candidates)
     moving = pairing.without_static_background(pairs, candidates)
     pairing, pairs = moving or (pairing, pairs)
-    pairs = pairing.match_repeated_patterns(pairs) if purpose == "calibrate" else pairs
+    pairs = pairing.match_repeated_patterns(pairs) if purpose.lens_only else pairs
     mixed, other_lens = separate_lenses(aligner.cameras, pairs, options.threshold, options.known_distortion)
     aligned = aligner.draft([pair for pair in pairs if not {*pair.images} & other_lens.keys()])
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
     aligned = close_loops(aligner, pairing, aligned, candidates)
-    if purpose == "trajectory":
+    if purpose.poses:
         aligner = replace(aligner, needs_poses=True)
         aligned = aligner.metric(aligned)
     aligned = aligner.completed(aligned)
-    settle = match_crossings if purpose == "calibrate" else settle_repeated_pattern
+    settle = match_crossings if purpose.lens_only else settle_repeated_pattern
     aligned, undecided = settle(aligner, pairing, aligned, sources, detected.stretch, options.threads)
     unplaced = {**other_lens, **detected.damaged, **undecided}
     return Registration(
@@ -116,13 +109,8 @@ def register(
 def with_frontal_reference(registration: Registration, options: StitchOptions, *, always: bool) -> Registration:
     """The same registration with an undistorted image as its plane; directions of a turn on the spot stay.
 
-    That is the reference image, unless another one crosses its horizon and nobody named it: then one that, if
-    possible, no image crosses the horizon of.
-
-    Parameters
-    ----------
-    always : bool
-        Whether a rectified plane, that of one camera's poses, gives way too.
+    That is the reference image, unless another one crosses its horizon and nobody named it: then one that, if possible,
+    no image crosses the horizon of. With ``always`` a rectified plane, that of one camera's poses, gives way too.
     """
     alignment = registration.alignment
     if alignment.on_sphere or (not always and alignment.poses is not None):

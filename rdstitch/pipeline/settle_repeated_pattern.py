@@ -44,23 +44,11 @@ def settle_repeated_pattern(
 ) -> tuple[AlignedPairs, dict[int, str]]:
     """Move images of a repeated pattern by whole periods, to where dirt, marks and objects in them agree.
 
-    Matches of such images agree as well some periods away, above all where the images share the most. Pairs that
-    look as much alike elsewhere, and of which nothing unique decides where they lie, are taken for unregistered then,
-    so that no place rests on them; those that look alike here alone stay as they are, marked parking beside a meadow
-    for one. Where too few are left, or the plane is not metric, everything stays as it was: the checks judge that.
-
-    Parameters
-    ----------
-    stretch : (float, float) or None
-        Grey levels of black and white, see :class:`rdstitch.results.registration.Registration`.
-    workers : int
-        Images that are read and compared at the same time.
-
-    Returns
-    -------
-    AlignedPairs
-    dict of int to str
-        Why images have no place any more, by their index.
+    Matches of such images agree as well some periods away, above all where the images share the most. Pairs that look
+    as much alike elsewhere, and of which nothing unique decides where they lie, are taken for unregistered then, so
+    that no place rests on them; those that look alike here alone stay as they are, marked parking beside a meadow for
+    one. Where too few are left, or the plane is not metric, everything stays as it was: the checks judge that. Besides
+    the pairs: why images have no place any more, by their index.
     """
     alignment = aligned.alignment
     if alignment.poses is None or len(sources) > _MAX_IMAGES or not pairing.shows_repeated_pattern:
@@ -119,21 +107,8 @@ def match_crossings(
     The keypoints of a chessboard are the middles of its squares, which perspective and lens move by up to pixels, and
     places near their corners, which depend on the scale. Of rendered boards through a fisheye of 140 degrees, corners
     were 1.8 times as far off straight lines as with OpenCV's rational model from the corners; by crossings, 1.0 times.
-
-    Parameters
-    ----------
-    aligned : AlignedPairs
-        By keypoints; right to less than a period of the pattern.
-    stretch : (float, float) or None
-        Grey levels of black and white, see :class:`rdstitch.results.registration.Registration`.
-    workers : int
-        Images that are read at the same time.
-
-    Returns
-    -------
-    AlignedPairs
-    dict of int to str
-        Why images have no place any more: none, as in :func:`settle_repeated_pattern`, whose place this takes.
+    ``aligned``, by keypoints, is right to less than a period of the pattern. Given is the same as by
+    :func:`settle_repeated_pattern`, whose place this takes.
     """
     if not pairing.shows_repeated_pattern:
         return aligned, {}
@@ -171,12 +146,7 @@ def _matched(
 ) -> PairRegistration:
     """A pair by the crossings that lie where the alignment expects them, and no others near; as it was if they are few.
 
-    Parameters
-    ----------
-    crossings : mapping of int to ndarray of shape (N, 2)
-        Of each image, pixels.
-    threshold : float
-        Pixels between a crossing and where it is expected.
+    Crossings are (N, 2) in pixels, as the threshold.
     """
     first, second = crossings[pair.image1], crossings[pair.image2]
     expected = alignment.transfer(pair.image1, pair.image2, first)

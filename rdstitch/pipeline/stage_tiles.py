@@ -14,7 +14,7 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from rdstitch.alignment import Alignment
-from rdstitch.alignment.result import LinkFit, ReliefTest
+from rdstitch.alignment.result import LinkFit, ReliefTest, Unused
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Correspondences
@@ -402,7 +402,7 @@ def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registr
             relation, cameras[first], cameras[second], agreeing, model="rigid", rms=rms, reason="correlation"
         )
         pairs.append(PairRegistration(first, second, StoredMatches.of(matches), pair))
-        reason = "" if used else "contradicts the other links"
+        reason = Unused.NO if used else Unused.CONTRADICTS
         fits.append(LinkFit(first, second, len(errors), int(agreeing.sum()), rms if used else math.nan, used, reason))
     used_pairs = [fit for fit in fits if fit.used]
     rms = math.sqrt(float(np.mean([fit.rms**2 for fit in used_pairs if fit.inliers] or [math.nan])))

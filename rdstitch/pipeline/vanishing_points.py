@@ -57,10 +57,8 @@ class Upright:
     def matrix(self, frame: FloatArray, *, turned: bool) -> FloatArray:
         """What takes the images to the output.
 
-        Parameters
-        ----------
-        frame : ndarray of shape (3, 3)
-            From ``x`` of the reference image to the plane, or to directions where the camera ``turned``.
+        ``frame`` (3, 3) leads from ``x`` of the reference image to the plane, or to directions where the camera
+        ``turned``.
         """
         basis = np.column_stack([*self.axes, np.cross(*self.axes)])
         if turned:
@@ -78,18 +76,9 @@ def to_axes(frame: FloatArray, focal: float) -> FloatArray:
 def of_rectangle(corners: FloatArray, focal: Focal, pixel: float) -> tuple[Upright, float, float]:
     """From the corners of a rectangle in space, as Zhang and He (2007) do.
 
-    Parameters
-    ----------
-    corners : ndarray of shape (4, 2)
-        ``x``, clockwise.
-    pixel : float
-        One pixel in half diagonals.
-
-    Returns
-    -------
-    Upright, float, float
-        With the focal length by which the sides are also orthogonal; the aspect ratio, width by height, and its
-        relative standard deviation, where corners are a pixel off.
+    ``corners`` (4, 2) are ``x``, clockwise; ``pixel`` is one in half diagonals. The focal length is the one by
+    which the sides are also orthogonal; then come the aspect ratio, width by height, and its relative standard
+    deviation where corners are a pixel off.
     """
     sides = _sides(corners)
     if sides is None or np.cross(sides[0], sides[1])[2] <= 0.0:
@@ -181,14 +170,8 @@ class Edges:
 def of_edges(edges: Edges, axis: IntArray, start: FloatArray, focal: Focal, first_focal: float) -> Upright:
     """The least rotation by which edges become horizontal and vertical, as least squares have it.
 
-    Parameters
-    ----------
-    axis : ndarray of shape (N,)
-        0 for edges that shall be horizontal, 1 for vertical ones, 2 for those that lead straight away.
-    start : ndarray of shape (3, 3)
-        Directions to the right, down and ahead to begin with.
-    first_focal : float
-        Focal length to begin with.
+    ``axis`` (N,) is 0 for edges that shall be horizontal, 1 for vertical ones, 2 for those that lead straight away;
+    ``start`` (3, 3) are directions to the right, down and ahead.
     """
     axes, log_focal = start, math.log(first_focal)
     for _ in range(_MAX_STEPS):
@@ -222,20 +205,10 @@ def of_scene(edges: Edges, start: FloatArray, focal: Focal, *, depth: bool) -> t
     """The directions that most edges are parallel to: a vanishing point near the vertical, and one at right angles.
 
     Random pairs of edges give a direction, a third one the other (RANSAC). A direction counts if so many edges would
-    not lead to one point by chance, as a contrario methods have it (Almansa, Desolneux and Vamech 2003).
-
-    Parameters
-    ----------
-    start : ndarray of shape (3, 3)
-        Directions to the right, down and ahead of the output without it; no direction is farther than 45 degrees
-        from its own.
-    depth : bool
-        Whether the scene has edges that lead away, besides those of a plane.
-
-    Returns
-    -------
-    Upright, int, int, or None
-        With the numbers of edges that are horizontal and vertical by it; None where no direction counts.
+    not lead to one point by chance, as a contrario methods have it (Almansa, Desolneux and Vamech 2003). ``start`` (3,
+    3) are directions to the right, down and ahead of the output without it; none is farther than 45 degrees from its
+    own. ``depth`` says whether edges lead away, besides those of a plane. Then come the numbers of edges that are
+    horizontal and vertical by it; None where no direction counts.
     """
     edges = edges.chosen(np.argsort(edges.error, kind="stable")[:_MAX_EDGES])
     tried = []

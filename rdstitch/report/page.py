@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.errors import InputError
 from rdstitch.io.preview import read_preview
 from rdstitch.report.lens import lens_curve, votes
@@ -38,7 +39,7 @@ from rdstitch.system.outputs import Outputs
 from rdstitch.viewer import viewer_path
 
 _THUMBNAIL, _MOSAIC_SIDE = 200, 1200  # pixels of the longer side
-_MAX_NAMES, _MAX_ROWS = 12, 20
+_MAX_NAMES, _MAX_ROWS, _MAX_DOTS = 12, 20, 5000
 _OUTLINED = {"stroke_width": 3.0, "paint_order": "stroke"}
 _VIEWPORT = "width=device-width, initial-scale=1"
 _STYLE = """
@@ -190,9 +191,9 @@ def _left_out(registration: Registration) -> str:
 
 def _lambda(registration: Registration) -> str:
     alignment = registration.alignment
-    if not math.isfinite(alignment.distortion_std):
+    if not alignment.lens_observable:
         return "not observable"
-    given = alignment.distortion_std == 0.0
+    given = alignment.lens_given
     return f"{alignment.distortion:.6f} " + (
         f"({alignment.lens_reason})" if given else f"± {alignment.distortion_std:.6f}"
     )
@@ -227,9 +228,9 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
             x, y = min((place.mean(axis=0) for place in places), key=lambda middle: abs(middle[0] - width * scale / 2))
             style = {"fill": "white", "stroke": "black", "text_anchor": "middle", "font_size": 14}
             parts.append(label(float(x), float(y), text, **style, **_OUTLINED))
-    seams, held = result.seams, 0.35 * result.seams.spacing * scale
-    for (x, y), broken in zip((seams.places + 0.5) * scale, seams.broken, strict=True):
-        parts.append(element("circle", cx=x, cy=y, r=max(held, 1.5), fill=RED if broken else GREEN))
+    seams, radius = result.seams, max(0.35 * result.seams.spacing * scale, 1.5)
+    for x, y, broken in seam_dots(seams, scale, max(2.0 * radius, scale * math.sqrt(width * height / _MAX_DOTS))):
+        parts.append(element("circle", cx=x, cy=y, r=radius, fill=RED if broken else GREEN))
     for one in seams.breaks[:_MAX_ROWS]:
         x, y = ((value + 0.5) * scale for value in one.position)
         parts.append(label(x + 8.0, y, f"{one.length:.0f} px", fill=RED, font_size=14, stroke="white", **_OUTLINED))
@@ -239,6 +240,16 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
     text = f"{name}{width} x {height} pixels; outlines are those of the images in it, dots the places along the seams "
     text += f"that have texture on both sides: green where the seam holds, red where it is broken.{more}"
     return section("Mosaic", text, _broken_seams(result), shown)
+
+
+def seam_dots(seams: SeamQuality, scale: float, apart: float) -> list[tuple[float, float, bool]]:
+    """Places along seams, in pixels of a drawing, and whether they are broken: one in each cell of a side ``apart``, a
+    broken one where there is any.
+    """
+    at = (seams.places + 0.5) * scale
+    order = np.argsort(~seams.broken, kind="stable")
+    _, first = np.unique((at[order] // apart).astype(np.int64), axis=0, return_index=True)
+    return [(float(at[k, 0]), float(at[k, 1]), bool(seams.broken[k])) for k in np.sort(order[first])]
 
 
 def _broken_seams(result: StitchResult) -> str:

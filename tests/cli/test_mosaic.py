@@ -17,7 +17,7 @@ from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline import accept
 from rdstitch.results.messages import Message
 from rdstitch.synthetic import Sequence
-from rdstitch.verification.findings import Finding
+from rdstitch.verification.findings import Finding, Kind
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, flight, start, transfers
 from tests.sampled import sampled
 
@@ -165,7 +165,7 @@ OUTPUTS = {"pano": "out.png", "mosaic": "out.png", "calibrate": "camera.json", "
 
 
 def _pretend(monkeypatch: pytest.MonkeyPatch, *found: Message) -> None:
-    findings = tuple(Finding("pretended", severity=message.severity) for message in found)
+    findings = tuple(Finding(Kind.ERRORS, severity=message.severity) for message in found)
     monkeypatch.setattr(accept, "judge", lambda *arguments, **options: findings)
     monkeypatch.setattr(accept, "messages_of", lambda *arguments: list(found))
 

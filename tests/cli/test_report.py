@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.compositing import CompositeOptions
+from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.io import preview
 from rdstitch.io.opening import MAX_IMAGE_GB
 from rdstitch.options.stitch_options import StitchOptions
@@ -21,10 +22,11 @@ from rdstitch.pipeline import accept
 from rdstitch.pipeline.recipes import calibrate, pano
 from rdstitch.report import page as report
 from rdstitch.report import report_page, write_report
+from rdstitch.report.page import seam_dots
 from rdstitch.report.pairs import matched
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.verification.findings import Finding
+from rdstitch.verification.findings import Finding, Kind
 from tests.cli.running import CACHED, OPTIONS, Run
 
 _VOID = {"meta", "img"}
@@ -140,7 +142,7 @@ def test_what_is_refused_is_shown(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, output: str
 ) -> None:
     said = [Message("the images <disagree>", severity="failure"), Message("look at that seam")]
-    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: (Finding("errors"),))
+    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: (Finding(Kind.ERRORS),))
     monkeypatch.setattr(accept, "messages_of", lambda *arguments: said)
     report = tmp_path / "report.html"
     arguments = (command, *frames[:2], "-o", tmp_path / output, "--report", report, *CACHED)
@@ -215,3 +217,13 @@ def test_an_image_larger_than_any_cameras_is_shown_or_said_to_be_too_large(
         page = report_page(replace(pair, composite=None, output=file))
         assert ("too large to be shown here" in page) is not shown
         assert "Match graph" in page
+
+
+def test_the_dots_of_a_thousand_seams_are_as_many_as_can_be_told_apart_and_hide_no_break() -> None:
+    places = np.stack(np.meshgrid(np.arange(0, 20_000, 8.0), np.arange(0, 10_000, 100.0)), axis=-1).reshape(-1, 2)
+    broken = np.arange(len(places)) == 123_456
+    dots = seam_dots(SeamQuality(places, broken, spacing=8.0), 0.06, 12.0)
+    assert len(dots) <= 5000
+    ((x, y, _),) = [dot for dot in dots if dot[2]]
+    np.testing.assert_allclose((x, y), (places[broken][0] + 0.5) * 0.06)
+    assert seam_dots(SeamQuality(), 1.0, 3.0) == []

@@ -115,7 +115,7 @@ def _save_plot(draw: Draw, path: Path) -> str:
 
     figure = new_figure()
     if figure is None:
-        return f"skipped {path}: matplotlib is not installed (pip install 'rdstitch[examples]')"
+        return f"skipped {path}: matplotlib is not installed (pip install matplotlib)"
     draw(figure)
     figure.savefig(path, dpi=120)
     return f"wrote {path}"

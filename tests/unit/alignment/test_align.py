@@ -11,7 +11,7 @@ from examples.judging.trajectories import compare_trajectories
 from rdstitch.alignment import AlignmentOptions, align, most_matches_read
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
-from rdstitch.alignment.result import CONTRADICTS, Alignment, PlanarPoses
+from rdstitch.alignment.result import Alignment, PlanarPoses, Unused
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.choices import Purpose
@@ -21,7 +21,6 @@ from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import RadialHomography, transfer
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import SpanningTree, spanning_tree
-from rdstitch.results.messages import Severity
 from tests.alignment_scenes import Scene, aligned, grid, jittered, robot_path, scene
 from tests.sampled import sampled
 
@@ -177,7 +176,7 @@ def test_turning_on_the_spot_says_nothing_of_the_lens() -> None:
     poses[:, YAW] = np.linspace(0, 1.5, 5)
     given = scene(poses, distortion=-0.2, rng=rng)
     # A picture needs no lens, and a path only what is known of it.
-    wanted: dict[Purpose, Severity] = {"mosaic": "detail", "trajectory": "warning", "calibrate": "failure"}
+    wanted = {Purpose.MOSAIC: "detail", Purpose.TRAJECTORY: "warning", Purpose.CALIBRATE: "failure"}
     for purpose, severity in wanted.items():
         found = aligned(given, purpose=purpose)
         assert math.isinf(found.distortion_std)
@@ -330,7 +329,7 @@ def test_mistakes_of_the_caller() -> None:
 def test_an_image_that_contradicts_the_others_names_them() -> None:
     rng = np.random.default_rng(11)
     found = aligned(scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng))
-    contradicting = replace(found.links[0], image1=0, image2=2, used=False, reason=CONTRADICTS)
+    contradicting = replace(found.links[0], image1=0, image2=2, used=False, reason=Unused.CONTRADICTS)
     whole = replace(
         found, used=np.array([True, True, False]), components=((0, 1), (2,)), links=(*found.links, contradicting)
     )

@@ -9,11 +9,12 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters,
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.noise import coherence
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Prior, Priors
+from rdstitch.alignment.priors import Priors
 from rdstitch.alignment.uncertainty import sandwich_covariances
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import LENS_STD, Camera
 from rdstitch.geometry.radial_homography import project
+from rdstitch.robust.posterior import Prior
 from tests.alignment_scenes import aligned, grid, scene
 from tests.lens_scenes import SIZE, lens_scene
 

@@ -1,5 +1,6 @@
 """Breaks along seams: content that is shifted, and objects that are cut; not what a seam goes around."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -110,3 +111,14 @@ def test_images_that_are_put_anywhere_are_alike_by_chance(right: int, down: int,
     share, _ = share_alike(tiles, np.array([[1, 0]]))
     quality = SeamQuality(alike=share)
     assert (quality.by_chance, quality.contradicted) == (by_chance, by_chance)
+
+
+def test_grass_in_the_wind_is_no_break() -> None:
+    """It lies in one direction and is another in each image, but too fine for a seam through it to be seen."""
+    rng = np.random.default_rng(4)
+    blades = [cv2.GaussianBlur(rng.normal(size=SIZE[::-1]), (0, 0), 2.0, sigmaY=0.6) for _ in range(2)]
+    first, second = ((120.0 + 7.0 * one / one.std()).astype(np.float32) for one in blades)
+    labels = np.repeat((np.arange(SIZE[0]) >= 200).astype(np.int32)[None], SIZE[1], axis=0)
+    quality = measure_seams([_tile(image, (0, 0, *SIZE)) for image in (first, second)], labels, 1.0, 1.0)
+    assert len(quality.places) > 25
+    assert quality.broken.sum() <= 1

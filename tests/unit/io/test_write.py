@@ -3,8 +3,6 @@
 import itertools
 import shutil
 import subprocess
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -225,6 +223,7 @@ def test_gdal_sees_where_there_is_an_image_at_every_size(tmp_path: Path, dtype: 
         np.testing.assert_array_equal(small, alpha[2::4, 2::4])
 
 
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
 @pytest.mark.parametrize("large", [False, True])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_tiff_is_cloud_optimized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, channels: int, large: bool) -> None:
@@ -258,8 +257,8 @@ def test_tiff_is_cloud_optimized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     back = read_image(tmp_path / "a.tif")
     np.testing.assert_array_equal(back.alpha, alpha)
     assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
-    if find_spec("rio_cogeo") is not None:
-        assert import_module("rio_cogeo").cog_validate(tmp_path / "a.tif", quiet=True) == (True, [], [])
+    cogeo = pytest.importorskip("rio_cogeo.cogeo")
+    assert cogeo.cog_validate(tmp_path / "a.tif", quiet=True) == (True, [], [])
 
 
 def test_padding_of_camera_names_is_not_copied(tmp_path: Path) -> None:

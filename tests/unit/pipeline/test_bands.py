@@ -91,6 +91,9 @@ def test_all_bands_of_a_rig_at_once(rig: Path, tmp_path: Path) -> None:
         assert stack.overviews(1)
     with pytest.raises(ArgumentError, match="no image has a name like"):
         mosaic_bands([rig / "red"], tmp_path / "g.tif", bands, options)
+    cogeo = pytest.importorskip("rio_cogeo.cogeo")
+    for file in ("f.tif", "f-RED.tif", "f-NIR.tif"):
+        assert cogeo.cog_validate(tmp_path / file, quiet=True) == (True, [], [])
 
 
 def test_a_lost_image_and_one_from_elsewhere_move_no_other(rig: Path, tmp_path: Path) -> None:
