@@ -1,5 +1,6 @@
 """Words that the user chooses among, each list once: for types, for checks, and for help, which loads nothing large."""
 
+from enum import StrEnum
 from typing import Literal, get_args
 
 FeatureName = Literal["rootsift", "sift", "surf", "orb", "akaze", "aliked"]
@@ -34,8 +35,31 @@ ImageFormat = Literal["jpg", "png", "tif", "webp"]
 
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 
-Purpose = Literal["pano", "mosaic", "calibrate", "trajectory"]
-"""The recipe that a registration is for. In "pano" every image must be readable, and a turn on the spot is taken where
-a plane explains the images as well; for "calibrate" images of a repeated pattern may be off by whole periods of it, and
-doubts about their places do not matter; for "trajectory" poses must be metric, so that the freest model is that of
-planar motion with small tilts."""
+
+class Purpose(StrEnum):
+    """The recipe that a registration is for."""
+
+    PANO = "pano"  # a turn on the spot is taken where a plane explains the images as well
+    MOSAIC = "mosaic"
+    CALIBRATE = "calibrate"
+    TRAJECTORY = "trajectory"
+
+    @property
+    def picture(self) -> bool:
+        """Whether a picture is wanted, which its seams judge: it must be possible to lay it out; λ may be anything."""
+        return self in (Purpose.PANO, Purpose.MOSAIC)
+
+    @property
+    def lens_only(self) -> bool:
+        """Whether only the lens is wanted: images may be off by periods of a pattern, places do not matter."""
+        return self is Purpose.CALIBRATE
+
+    @property
+    def poses(self) -> bool:
+        """Whether poses must be metric, so that the freest model is that of planar motion with small tilts."""
+        return self is Purpose.TRAJECTORY
+
+    @property
+    def unknown_lens(self) -> Literal["detail", "warning", "failure"]:
+        """How grave it is that λ is unknown: a path can be right by what is known of the lens."""
+        return "detail" if self.picture else "failure" if self.lens_only else "warning"

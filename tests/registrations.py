@@ -56,7 +56,9 @@ def registration(
     return Registration(tuple(sources), tuple(keypoints), tuple(pairs), found, (), mixed=mixed)
 
 
-def evidence(given: Registration, purpose: Purpose = "trajectory", threshold: float = 3.0, **known: Any) -> Evidence:
+def evidence(
+    given: Registration, purpose: Purpose = Purpose.TRAJECTORY, threshold: float = 3.0, **known: Any
+) -> Evidence:
     """Everything that rules look at; what is known is not computed."""
     found = Evidence(given, threshold, purpose=purpose)
     vars(found).update(known)

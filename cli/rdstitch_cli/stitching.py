@@ -1,6 +1,5 @@
 """What the stitching commands share: from flags to options, from a result to lines."""
 
-import math
 import os
 import shlex
 import sys
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from rdstitch.results.stitch_result import StitchResult
 
 STITCHING = [
-    *flags_of(StitchOptions),
+    *flags_of(StitchOptions, without="odometry"),
     *flags_of(FeatureOptions),
     *flags_of(CompositeOptions),
     *flags(
@@ -180,7 +179,7 @@ def report_registration(
     if content is not None:
         click.echo(json_bytes(content()), nl=False)
     else:
-        click.echo(f"{alignment.distortion:.6f}" if math.isfinite(alignment.distortion_std) else "nan")
+        click.echo(f"{alignment.distortion:.6f}" if alignment.lens_observable else "nan")
 
 
 def warn_of(registration: "Registration", reporter: Reporter) -> None:

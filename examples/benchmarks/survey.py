@@ -168,7 +168,7 @@ def _places(kind: str, seeds: Several[int]) -> None:
     for seed in seeds:
         flight = Flight(kind, seed)
         with tempfile.TemporaryDirectory() as folder:
-            options = StitchOptions(composite=CompositeOptions(scale=0.2))
+            options = StitchOptions(position_accuracy=flight.std[0], composite=CompositeOptions(scale=0.2))
             try:
                 result = mosaic(flight.write(Path(folder)), options=options)
             except RdstitchError as error:

@@ -17,7 +17,7 @@ from rdstitch.alignment import align
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, FreeParameters, Parameters
 from rdstitch.alignment.motion_models import RIGID, YAW, X, Y
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Prior, Priors
+from rdstitch.alignment.priors import Priors
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
@@ -27,6 +27,7 @@ from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
+from rdstitch.robust.posterior import Prior
 
 RECIPE = "rdstitch as it is"
 

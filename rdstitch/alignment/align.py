@@ -20,9 +20,8 @@ from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_l
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
 from rdstitch.alignment.map_priors import hold_on_map
-from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, noise_of_links
+from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, independent_errors
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
@@ -34,6 +33,7 @@ from rdstitch.geometry.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTIO
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.matching.links import Link, in_alternate_directions
+from rdstitch.robust.posterior import LENS
 
 # Side of an image, beside that of the largest, below which it was reduced, and must not set the scale of the output.
 _REDUCED = 0.8
@@ -50,12 +50,9 @@ _ROUNDS = 3
 """Rounds of rejecting wrong pairs and adjusting again."""
 
 _FEW_VIEWS, _LENS_OVER_DEPTH = 3, 6.0
-"""Images from more than which depth does not look like a lens; times by which a lens must make errors of depth smaller
-to be no depth itself: in published pairs with depth λ takes the blame for up to 3 times what is left, a lens for 14."""
-
-_LITTLE_DEPTH, _LITTLE_DEPTH_PX = 0.0003, 0.3
-"""Diagonals of an image, and pixels: errors that neighbours share beside a lens, up to which there is no depth to speak
-of. Less than the noise of keypoints says nothing: published pairs with depth leave 0.6 to 2 pixels."""
+"""Images from more than which depth does not look like a lens; times by which a lens must make what neighbours share
+smaller to be no depth itself: in published pairs λ takes the blame for up to 3 times what is left of depth, and for 14
+times of what a fisheye leaves beside λ."""
 
 
 def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions | None = None) -> Alignment:
@@ -144,9 +141,8 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
         whole = replace(whole, reference=int(images[_full_size_reference(problem, [cameras[k] for k in images])]))
         problem, _ = whole.part(~wrong, images)
     # Data weigh against priors as they will in the final adjustment.
-    problem = replace(
-        problem, overdispersion=noise_of_links(problem.observations, problem.homographies, problem.lens).overdispersion
-    )
+    shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
+    problem = replace(problem, overdispersion=shared)
     if (doubt := check_attitudes(problem, options)) is not None:
         without = _chosen(cameras, links, doubt[0])
         return replace(without, messages=(doubt[1], *without.messages))
@@ -154,12 +150,11 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
         problem,
         options.models,
         chosen.refinements,
-        prefer_turn=options.prefer_turn,
-        layout_matters=options.layout_matters,
+        options.purpose,
     )
     choice, images, wrong = _drop_wrong_pairs(whole, problem, images, choice, wrong)
     problem, _ = whole.part(~wrong, images)
-    choice = choose_over_relief(problem, choice, options.models, layout_matters=options.layout_matters)
+    choice = choose_over_relief(problem, choice, options.models, options.purpose)
     free_lens = choice.fit.free_lens
     whole = replace(whole, observations=everything, free_lens=free_lens, min_gain=MIN_GAIN)
     return AdjustedImages(
@@ -187,8 +182,8 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         whole = replace(whole, observations=every)
     problem, _ = whole.part(chosen.right, chosen.images)
     # What errors share weighs the more, the more of them there are.
-    noise = noise_of_links(problem.observations, problem.homographies, problem.lens)
-    problem = replace(problem, overdispersion=max(noise.overdispersion, choice.overdispersion))
+    shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
+    problem = replace(problem, overdispersion=max(shared, choice.fit.overdispersion))
     problem, fit = adjust_over_relief(problem, choice)
     fit = from_another_start(problem, fit)
     if len(options.lenses) > 1:
@@ -296,9 +291,8 @@ def _is_depth(observations: Observations, bent: BundleAdjustmentResult, flat: Bu
     left = left_coherence(flat, observations)
     if left.correlation <= COHERENT_CORRELATION or left.relative_size <= LARGE_RELIEF:
         return False
-    with_lens = left_coherence(bent, observations).size
-    largest = max(_LITTLE_DEPTH * 2.0 * float(np.median(observations.scale2)), _LITTLE_DEPTH_PX)
-    return with_lens > largest and left.size < _LENS_OVER_DEPTH * with_lens
+    with_lens = left_coherence(bent, observations)
+    return with_lens.correlation > COHERENT_CORRELATION and left.size < _LENS_OVER_DEPTH * with_lens.size
 
 
 def _observable(apart: BundleAdjustmentResult) -> bool:

@@ -11,6 +11,7 @@ from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.plane_marks import ControlPoints, Sighting
 from rdstitch.alignment.priors import CameraPriors, known_focal
+from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
@@ -26,6 +27,7 @@ class AlignmentOptions:
     tilt: tuple[float, float] | None = None  # (ψ, θ), radians
     # (ψ, θ) of each image (N, 2), radians, by an IMU or a gimbal; ``tilt`` is then how the camera is mounted on that
     attitudes: ArrayLike | None = None
+    delayed_attitudes: FloatArray | None = None  # (N, S, 2): the same if their times are late by sensor_streams.DELAYS
     attitudes_std: float = 0.0  # radians; 0: exact
     # direction down (N, 3) in the axes of each camera (right, down, ahead); NaN where unknown; it levels panoramas
     gravity: ArrayLike | None = None
@@ -33,7 +35,7 @@ class AlignmentOptions:
     positions_std: ArrayLike | None = None  # standard deviation (N,) of one coordinate of these, m; NaN where unknown
     control: tuple[Sighting, ...] = ()  # ground control points in the images; a prior where there are three or more
     lens: str = "auto"  # one of :data:`rdstitch.choices.LensName`; "auto": the simplest that the data allow
-    purpose: Purpose = "mosaic"
+    purpose: Purpose = Purpose.MOSAIC
     pose_covariance: bool = False  # its time grows with the square of the number of images
     most: int = 250  # correspondences used of each link; fewer where there are thousands of links
 
@@ -69,19 +71,10 @@ class AlignmentOptions:
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
             positions=positions,
+            delayed_attitudes=self.delayed_attitudes,
             positions_std=np.full(count, np.nan) if self.positions_std is None else np.asarray(self.positions_std),
             control=ControlPoints.of(self.control, cameras),
         )
-
-    @property
-    def prefer_turn(self) -> bool:
-        """Whether a turn on the spot is taken where a plane explains the images as well."""
-        return self.purpose == "pano"
-
-    @property
-    def layout_matters(self) -> bool:
-        """Whether images are to be laid out on the plane, so that an absurd layout rules a model out."""
-        return self.purpose in ("pano", "mosaic")
 
     @property
     def lenses(self) -> list[str]:
@@ -95,7 +88,8 @@ class AlignmentOptions:
         """Models to be tried, from the least to the most free."""
         if self.model != "auto":
             return [self.model]
-        # Measured attitudes are a prior of the tilts; exact ones leave nothing of the tilts free.
+        # Measured attitudes are a prior of the tilts, which are free within it; exact ones leave nothing of them free.
         measured, exact = self.attitudes is not None, self.attitudes is not None and self.attitudes_std == 0.0
-        without = {"tilting": exact, "pose": measured}
+        inexact = measured and not exact
+        without = {"rigid": inexact, "similarity": inexact, "tilting": exact, "pose": measured}
         return [name for name in MODELS if not without.get(name, False)]

@@ -15,13 +15,12 @@ from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
-from rdstitch.alignment.noise import EXACTNESS, coherence, judge_relief
-from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
+from rdstitch.alignment.noise import coherence, judge_relief
+from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, ShapeTest, Unused
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.alignment.uncertainty import considered_covariance, pose_covariances
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.choices import Purpose
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane
@@ -30,6 +29,7 @@ from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.results.messages import Message, Severity
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
+from rdstitch.robust.posterior import EXACTNESS
 
 _STEP = 1e-5
 """Of differences of λ, μ and ν."""
@@ -45,15 +45,6 @@ _WORTH_SAYING = 1.0
 
 _CONFIDENT = 2.0
 """Standard deviations within which the lens is taken to be known: 95 %."""
-
-
-_SEVERITY_OF_NUMBERS: dict[Purpose, Severity] = {
-    "pano": "detail",
-    "mosaic": "detail",
-    "trajectory": "warning",
-    "calibrate": "failure",
-}
-"""Of what makes λ unknown, by what is wanted."""
 
 
 @dataclass(frozen=True)
@@ -267,7 +258,7 @@ def _link_fits(adjustment: AdjustedImages, squared: FloatArray, agreeing: BoolAr
     for link, right in zip(adjustment.links, adjustment.right, strict=True):
         row = rows.get(frozenset((link.image1, link.image2)))
         if row is None or not right:
-            why = "belongs to another group of images" if right else CONTRADICTS
+            why = Unused.ELSEWHERE if right else Unused.CONTRADICTS
             result.append(LinkFit(link.image1, link.image2, len(link), 0, math.nan, False, why))
             continue
         rows_of_link = slice(observations.start[row], observations.start[row + 1])
@@ -294,14 +285,14 @@ def _warnings(adjustment: AdjustedImages, camera: Camera, considered: FloatArray
     """What the user should know of the whole, with the covariance (5, 5) of all parameters of a lens."""
     result: list[Message] = []
     # An image can be right whatever the lens is, and a path by what is known of the lens.
-    image_only, severity = adjustment.options.layout_matters, _SEVERITY_OF_NUMBERS[adjustment.options.purpose]
+    image_only, severity = adjustment.options.purpose.picture, adjustment.options.purpose.unknown_lens
     if adjustment.depth or not adjustment.observable:
         cause, remedy = "the images hardly move, or only turn about the optical axis", "images that overlap by less"
         if adjustment.depth:
             cause, remedy = "what the images show has depth, which looks like a lens in so few of them", "more images"
         text = f"λ is not observable: {cause}; give λ, a camera file, or {remedy}"
-        severity = "failure" if adjustment.depth and not image_only else severity
-        result.append(Message(text, severity=severity, code="lambda-not-observable"))
+        grave: Severity = "failure" if adjustment.depth and not image_only else severity
+        result.append(Message(text, severity=grave, code="lambda-not-observable"))
     elif len(adjustment.images) < ENOUGH_IMAGES and adjustment.problem.free_lens.any():
         every = replace(camera, lens_covariance=tuple(map(tuple, considered.tolist())))
         off = _CONFIDENT * float(radius_std(every, _RADII)[-1])

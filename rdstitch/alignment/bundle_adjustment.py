@@ -22,11 +22,12 @@ from rdstitch.alignment.link_equations import (
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel
 from rdstitch.alignment.normal_equations import ImageEquations, PoseBlocks, SparseNormalEquations, chain
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Priors, costs, curvatures, slopes
+from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
+from rdstitch.robust.posterior import costs, curvatures, slopes
 
 MIN_GAIN = 1e-5
 """Expected relative fall of the loss that is worth another step: a hundredth of the noise."""

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.alignment.result import Alignment, PlanarPoses
-from rdstitch.alignment.select import MAX_STRETCH
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.exif_orientation import inverse, turning_matrix
@@ -124,6 +123,9 @@ def stored(orientations: Sequence[int]) -> tuple[int, ...]:
 _POINTS_PER_SIDE = 8
 _REFERENCES_AT_ONCE = 32
 
+_MAX_STRETCH = 10.0
+"""Ratio of areas of what an image shows; seen from above a plane has up to 7."""
+
 
 def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
     """The same alignment with the undistorted image ``reference`` as its plane, and its height as unit of poses."""
@@ -139,7 +141,7 @@ def frontal_reference(alignment: Alignment) -> int:
     used = np.flatnonzero(alignment.used)
     borders = np.stack([_border_on_plane(alignment, int(k)) for k in used])
     present = _nearest_to_horizon(borders, alignment.homographies[[alignment.reference]])
-    if present.min() > MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
+    if present.min() > _MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
         return alignment.reference
     crossing, least = np.empty(len(used)), np.empty(len(used))
     for start in range(0, len(used), _REFERENCES_AT_ONCE):

@@ -33,9 +33,9 @@ def describe_lens(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
 
     ``camera`` is that of the reference image, upright or as it is stored.
     """
-    if not math.isfinite(alignment.distortion_std):
+    if not alignment.lens_observable:
         return ("λ is not observable",)
-    if alignment.distortion_std == 0.0 and camera.lens_covariance is None:
+    if alignment.lens_given and camera.lens_covariance is None:
         return (f"λ = {alignment.distortion:.6f}, given",)
     std, free = _std(camera), np.array([name in alignment.parameters for name in LENS_PARAMETERS])
     first = f"λ = {alignment.distortion:.6f} ± {alignment.distortion_std:.6f}"

@@ -1,13 +1,10 @@
 """The simplest lens that the images allow: λ; λ and the distortion centre; μ besides; ν besides.
 
 The lenses are compared where nothing else is assumed: every link on its own with a homography, and one lens for all.
-What a richer lens gains there is no irregular motion that it takes the blame for. A lens is preferred when its robust
-likelihood pays for its parameters (Schwarz's criterion, with as many independent observations as the agreement of
-neighbouring residuals leaves), and when the links share the gain: a lens bends every image alike, whereas relief
-bends each differently.
+What a richer lens gains there is no irregular motion that it takes the blame for. They are compared by their posterior
+(:mod:`rdstitch.robust.posterior`).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
@@ -17,12 +14,13 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem, homography_apart
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.link_equations import whitened_errors
-from rdstitch.alignment.noise import Coherence, NoiseModel, coherence, noise_of_links
+from rdstitch.alignment.noise import Coherence, coherence, evidence_of
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.geometry.camera import LENS_PARAMETERS
+from rdstitch.arrays import BoolArray
+from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
+from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, costs
 
 LENSES: dict[str, tuple[str, ...]] = {
     "division": ("distortion",),
@@ -35,30 +33,13 @@ LENSES: dict[str, tuple[str, ...]] = {
 CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
 """Which of :data:`rdstitch.geometry.camera.LENS_PARAMETERS` are the distortion centre, shape (5,)."""
 
-_FARTHEST_CENTER, _FARTHEST_CENTER_OF_CROPS = 0.08, 0.25
-"""Half diagonals: a distortion centre farther off than the first is no lens, but something else that it takes the blame
-for, or the centre of images that were cropped; one farther off than the second is neither."""
-
 NO_COHERENCE = 0.3
 """Correlation of the errors of neighbours up to which nothing else can be to blame: relief leaves more."""
-
-_SHARED_GAIN, _SHARED_GAIN_OF_SERIES = 2.5, 1.0
-"""Standard deviations of the mean gain of the parts that the observations fall into, by which it must exceed 0; and
-where μ is needed already, so that it is certain that λ alone does not describe the lens."""
-
-_FISHEYE = -0.4
-"""λ below which only fisheyes are: their projections are series; an equidistant one has it from 120 degrees on."""
-
-_CELLS = 4
-"""Cells per side of a link's overlap, each of which is a part where there are few links."""
 
 ENOUGH_IMAGES, _ENOUGH_IMAGES_OF_A_MOTION = 4, 3
 """Images from which on the distortion centre is freed: where every link is on its own, and where one camera explains
 all of them. In fewer a tilt and a change of height stand for it, and pairs like those of ``examples.paper figure5`` are
 registered worse with it free."""
-
-_SUFFICIENT_LINKS = 8
-"""Links from which on each is a part."""
 
 _ENOUGH_LINKS = 2000
 """Of more links, evenly chosen ones say which lens it is: all of them determine it many times over, and each of the
@@ -118,11 +99,10 @@ def choose_lens(
         if name == "division3" and names[best] != "division2":
             break  # the next term of a series that is not needed
         fits.append(fit(free[index], fits[-1]))
-        noise = noise_of_links(observations, fits[-1].homographies, fits[-1].parameters.lens)
-        judge = _Judge(noise, _parts(observations))
-        added = int(free[index].sum() - free[best].sum())
-        gains = judge.prefers(fits[index], fits[best], added, names[best])
-        if gains and has_plausible_center(fits[index], observations):
+        errors = whitened_errors(observations, fits[-1].homographies, fits[-1].parameters.lens)
+        evidence = evidence_of(observations, errors)
+        rarer = 0.0 if names[best] == "division2" else TWENTY_TO_ONE  # a series that was cut off has a next term
+        if _score(evidence, observations, fits[index]) + rarer < _score(evidence, observations, fits[best]):
             best = index
     reason = _reason(names, fits, best)
     if few:
@@ -146,23 +126,6 @@ def _choose_by_some(
 
 def _images(observations: Observations) -> int:
     return len(np.unique(np.concatenate([observations.image1, observations.image2])))
-
-
-def has_plausible_center(adjusted: BundleAdjustmentResult, observations: Observations) -> bool:
-    """Whether the distortion centre is where lenses have it; or farther off, and explains the errors altogether."""
-    farthest = float(np.abs(adjusted.parameters.lens[CENTER]).max())
-    if farthest < _FARTHEST_CENTER:
-        return True
-    return farthest < _FARTHEST_CENTER_OF_CROPS and leaves_noise(adjusted, observations)
-
-
-def shows_center(adjusted: BundleAdjustmentResult, observations: Observations) -> bool:
-    """Whether one camera shows its distortion centre: the errors are noise, so that nothing else moved it.
-
-    Over rough ground a centre that is off, with an odd focal length, bends the whole as the ground bends the images.
-    """
-    off = float(np.abs(adjusted.parameters.lens[CENTER]).max())
-    return off < _FARTHEST_CENTER_OF_CROPS and leaves_noise(adjusted, observations)
 
 
 def leaves_noise(adjusted: BundleAdjustmentResult, observations: Observations) -> bool:
@@ -189,54 +152,21 @@ def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
         return problem, fit
     if not leaves_noise(adjusted, observations):
         return problem, fit
-    wider = problem.extend(fit, finer)
-    if not has_plausible_center(wider.adjusted, observations):
-        return problem, fit
-    return replace(problem, free_lens=finer), wider
+    return replace(problem, free_lens=finer), problem.extend(fit, finer)
 
 
-@dataclass(frozen=True)
-class _Judge:
-    """What the lenses are compared by."""
+def _score(evidence: Evidence, observations: Observations, fit: BundleAdjustmentResult) -> float:
+    """-2 log of the posterior of a lens, up to a constant.
 
-    noise: NoiseModel  # of the errors that the richer lens leaves
-    part: IntArray  # (M,): the part of the observations that each correspondence falls into: its link, or a cell of it
-
-    def prefers(
-        self, richer: BundleAdjustmentResult, simpler: BundleAdjustmentResult, added: int, simpler_name: str
-    ) -> bool:
-        """Whether a richer lens gains more than its parameters cost, and all over the images.
-
-        A lens that λ does not describe, such as most fisheyes, is a series that has been cut off: beyond, a parameter
-        costs what Akaike's criterion takes for it, not Schwarz's, which takes the simpler lens for the true one.
-        """
-        gain = self.noise.misfit(simpler.squared) - self.noise.misfit(richer.squared)
-        series = simpler_name == "division2" or float(simpler.parameters.lens[0]) < _FISHEYE
-        each, shared = (2.0, _SHARED_GAIN_OF_SERIES) if series else (self.noise.price, _SHARED_GAIN)
-        return float(gain.sum()) > added * each and self.significance(gain) > shared
-
-    def significance(self, gain: FloatArray) -> float:
-        """Mean gain of the parts in its standard deviations."""
-        part = self.part[self.noise.counted]
-        sums = np.bincount(part, gain)[np.unique(part)]
-        if len(sums) < 2:
-            return 0.0
-        return float(sums.mean() / max(sums.std(ddof=1) / math.sqrt(len(sums)), 1e-12))
-
-
-def _parts(observations: Observations) -> IntArray:
-    """Which part each correspondence falls into, shape (M,)."""
-    link = observations.link
-    if len(observations) >= _SUFFICIENT_LINKS:
-        return link
-    cell = np.zeros(len(link), dtype=np.intp)
-    for number in range(len(observations)):
-        rows = slice(observations.start[number], observations.start[number + 1])
-        points = observations.points1[rows]
-        for axis in range(2):
-            rank = np.argsort(np.argsort(points[:, axis]))
-            cell[rows] = cell[rows] * _CELLS + rank * _CELLS // max(len(points), 1)
-    return link * _CELLS**2 + cell
+    A parameter costs what Laplace says, by how much narrower it is than its prior: one that is hardly seen, such as the
+    next term of a series, costs next to nothing.
+    """
+    lens, free = fit.parameters.lens, fit.adjuster.free.lens
+    seen = evidence.cost(whitened_errors(observations, fit.homographies, lens))
+    shared = 2.0 * len(observations.points1) / float(seen.count[0])
+    relative = fit.covariance * shared / np.outer(LENS_STD[free], LENS_STD[free])
+    narrowed = -np.linalg.slogdet(relative)[1]
+    return float(seen.cost[0]) + costs(LENS, lens) + float(narrowed)
 
 
 def _reason(names: Sequence[str], fits: Sequence[BundleAdjustmentResult], best: int) -> str:

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster
 from rdstitch.alignment.motion_models import PlanarModel, X, Y
-from rdstitch.alignment.noise import EXACTNESS
 from rdstitch.alignment.plane_marks import PlaneMarks
 from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
+from rdstitch.robust.posterior import EXACTNESS
 from rdstitch.robust.similarity_fit import OUTLYING, SimilarityFit, fit_similarity
 
 POSITION_STD = 3.0

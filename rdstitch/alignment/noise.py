@@ -2,8 +2,7 @@
 
 Noise differs from point to point; a hill moves all its points together. So residuals that agree between neighbours
 come from something that the model does not describe: relief, a lens of another kind, a moving object. The same
-correlation gives the number of independent observations, which is smaller than that of correspondences. And no lens or
-plane is exact to better than about a tenth of a pixel, which therefore counts as noise.
+correlation gives the number of independent observations, which is smaller than that of correspondences.
 """
 
 import math
@@ -19,6 +18,7 @@ from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
+from rdstitch.robust.posterior import Evidence
 
 _CELLS = (2, 3, 4)
 """Cells per side of a link's overlap within which errors are added up; the worst counts."""
@@ -150,45 +150,30 @@ def judge_relief(left: Coherence, model: str, links: int) -> ReliefTest:
     return ReliefTest(relief, left.correlation, left.size, text)
 
 
-EXACTNESS = 0.1
-"""Pixels: how exactly a lens and a plane can be described at all."""
-
-_MAX_ERROR2 = 1e12  # px²: what cannot be transferred counts as this
-
-
-@dataclass(frozen=True)
-class NoiseModel:
-    """The noise of a set of errors."""
-
-    noise: float  # standard deviation of an error's coordinate when the model is right, pixels
-    overdispersion: float  # see Coherence
-    counted: BoolArray  # (M,): correspondences of links that fit
-    effective: float  # independent observations
-
-    @classmethod
-    def of_errors(cls, observations: Observations, errors: FloatArray, freedom: float = 1.0) -> "NoiseModel":
-        """From whitened errors (M, 2); ``freedom`` is the share of them that the parameters have not absorbed."""
-        squared = squared_lengths(errors)
-        sigma = sigma_of(squared[observations.scale_inliers_mask])
-        inliers = squared <= (ALIGNMENT_WIDTH * sigma) ** 2
-        overdispersion = shared_variance(observations, errors, inliers)
-        counted = ~misfitting_links(squared, observations)[observations.link]
-        effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
-        return cls(math.hypot(sigma / math.sqrt(freedom), EXACTNESS), overdispersion, counted, effective)
-
-    @property
-    def price(self) -> float:
-        """What a parameter must gain (Schwarz's criterion)."""
-        return math.log(self.effective)
-
-    def misfit(self, squared: FloatArray) -> FloatArray:
-        """Robust squares of the errors that count, in units of the noise, from the squares of all (M,)."""
-        ratio = np.minimum(squared[self.counted], _MAX_ERROR2) / self.noise**2
-        misfit: FloatArray = ALIGNMENT_WIDTH**2 * np.log1p(ratio / ALIGNMENT_WIDTH**2) / self.overdispersion
-        return misfit
+def evidence_of(observations: Observations, errors: FloatArray) -> Evidence:
+    """What hypotheses on all links are compared by; the errors (M, 2), pixels, are those of links on their own."""
+    squared = squared_lengths(errors)
+    inliers = squared <= (ALIGNMENT_WIDTH * sigma_of(squared[observations.scale_inliers_mask])) ** 2
+    shared = min(max(coherence(observations, errors, inliers).correlation, 0.0), 0.9)
+    power = float(squared[inliers].mean()) / 2.0 if inliers.any() else 0.0
+    images, links = len(np.unique([observations.image1, observations.image2])), max(len(observations), 1)
+    return Evidence.of(
+        observations.link,
+        observations.points1,
+        np.zeros(len(observations), dtype=np.intp),
+        np.array([math.sqrt(power * (1.0 - shared))]),
+        np.array([float(np.median(observations.scale2))]),
+        np.array([min(1.0, (images - 1) / links)]),
+    )
 
 
-def noise_of_links(observations: Observations, homographies: FloatArray, lens: FloatArray) -> NoiseModel:
-    """The noise that every link leaves on its own, with its homography (L, 3, 3)."""
+def independent_errors(observations: Observations, homographies: FloatArray, lens: FloatArray) -> tuple[float, float]:
+    """The overdispersion of the errors that every link leaves with its homography (L, 3, 3), and how many coordinates
+    of the inliers of links that fit are independent.
+    """
     errors = whitened_errors(observations, homographies, lens)
-    return NoiseModel.of_errors(observations, errors, max(1.0 - 4.0 * len(observations) / max(len(errors), 1), 0.1))
+    squared = squared_lengths(errors)
+    inliers = squared <= (ALIGNMENT_WIDTH * sigma_of(squared[observations.scale_inliers_mask])) ** 2
+    overdispersion = shared_variance(observations, errors, inliers)
+    counted = inliers & ~misfitting_links(squared, observations)[observations.link]
+    return overdispersion, max(2.0 * float(counted.sum()) / overdispersion, 2.0)

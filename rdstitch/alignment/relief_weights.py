@@ -16,10 +16,11 @@ from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.lens_selection import left_coherence
 from rdstitch.alignment.link_equations import linearized_errors
 from rdstitch.alignment.motion_models import SIMILARITY, TILTING, PlanarModel
-from rdstitch.alignment.noise import judge_relief, noise_of_links
+from rdstitch.alignment.noise import independent_errors, judge_relief
 from rdstitch.alignment.relief_field import Parallax
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import Purpose
 
 _FEWEST = 3
 """Images: of two, tilts do what heights do, and the errors do not show which."""
@@ -36,16 +37,14 @@ _SIGNIFICANT = 3.0
 """Standard deviations of the logarithm of their ratio by which errors along the parallax must exceed those across."""
 
 
-def choose_over_relief(
-    problem: Problem, choice: ModelChoice, names: Sequence[str], *, layout_matters: bool
-) -> ModelChoice:
+def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[str], purpose: Purpose) -> ModelChoice:
     """The model of one camera chosen again, with heights that account for errors, where such heights show.
 
     Without a free distortion centre, which over rough ground bends the whole as the ground bends the images.
     """
     if not _is_rough(problem, choice.fit) or weighted_by_relief(problem, choice.fit) is problem:
         return choice
-    problem = replace(problem, overdispersion=choice.overdispersion)
+    problem = replace(problem, overdispersion=choice.fit.overdispersion)
     fits: list[Fit] = []
     # From the least free one: a camera that is free to tilt has already followed the hills.
     for model in (SIMILARITY, TILTING):
@@ -56,7 +55,7 @@ def choose_over_relief(
     if not fits:
         return replace(choice, fit=_settled(problem, choice.fit)[1], over_relief=True)
     refined = [_refined(problem, fit) for fit in fits]
-    best = best_of(problem, refined, requested=len(names) == 1, layout_matters=layout_matters)
+    best = best_of(problem, refined, purpose, requested=len(names) == 1)
     return choice if best is None else replace(best, over_relief=True)
 
 
@@ -83,7 +82,7 @@ def weighted_by_relief(problem: Problem, fit: Fit) -> Problem:
         seen = part.by_point2[:, 0, 0] != 0.0
         # Without the whitening, in half diagonals of the second image.
         moved[part.rows][seen] = np.linalg.solve(-part.by_point2[seen], parallax[part.rows][seen, :, None])[:, :, 0]
-    scatter = _scatter(errors, parallax, noise_of_links(o, plain.homographies, plain.lens).effective)
+    scatter = _scatter(errors, parallax, independent_errors(o, plain.homographies, plain.lens)[1])
     if scatter == 0.0:
         return problem if problem.observations.relief is None else plain
     return replace(problem, observations=replace(o, relief=scatter * moved * o.scale2[o.link, None]))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from enum import StrEnum
 from functools import cached_property
 from typing import Self
 
@@ -14,8 +15,13 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.results.messages import Message
 
-CONTRADICTS = "contradicts the other links"
-"""Why a link was not used although it fits well on its own."""
+
+class Unused(StrEnum):
+    """Why a link was not used although it fits well on its own."""
+
+    NO = ""
+    CONTRADICTS = "contradicts the other links"
+    ELSEWHERE = "belongs to another group of images"
 
 
 @dataclass(frozen=True)
@@ -33,8 +39,8 @@ class LinkFit:
     rms : float
         Root mean square error of those, pixels; NaN where the link was not used.
     used : bool
-    reason : str
-        Why the link was not used; empty otherwise.
+    reason : Unused
+        Why the link was not used.
     """
 
     image1: int
@@ -43,7 +49,7 @@ class LinkFit:
     inliers: int
     rms: float
     used: bool
-    reason: str = ""
+    reason: Unused = Unused.NO
 
     @property
     def images(self) -> tuple[int, int]:
@@ -269,6 +275,16 @@ class Alignment:
         """Homography (3, 3) from undistorted normalized coordinates of one image to those of another."""
         product: FloatArray = np.linalg.solve(self.homographies[image2], self.homographies[image1])
         return product
+
+    @property
+    def lens_given(self) -> bool:
+        """Whether λ was given, not estimated."""
+        return self.distortion_std == 0.0
+
+    @property
+    def lens_observable(self) -> bool:
+        """Whether λ was given, or the images show it."""
+        return math.isfinite(self.distortion_std)
 
     @property
     def on_sphere(self) -> bool:

@@ -1,9 +1,6 @@
 """Which motion the images show: one posterior score for all hypotheses.
 
-``score = -2 log L(errors) + k log n + priors``: how likely the errors are
-(:mod:`rdstitch.alignment.residual_likelihood`), Schwarz's approximation of what ``k`` parameters cost, and what the
-camera is off from what cameras are (:mod:`rdstitch.alignment.priors`). No score makes up for errors that everybody
-sees, nor for a layout that nobody would keep (:mod:`rdstitch.alignment.select`).
+The score is that of :mod:`rdstitch.robust.posterior`; a layout that nobody would keep has none.
 
 A camera that stays where it is sees the same of a plane as of anything else: where a turn explains the images, models
 over a plane do so too, with more parameters, so that the turn is taken where it fits, and a plane where there is
@@ -19,13 +16,15 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
-from rdstitch.alignment.lens_selection import shows_center
+from rdstitch.alignment.lens_selection import leaves_noise
 from rdstitch.alignment.link_equations import split_lens, whitened_errors
 from rdstitch.alignment.motion_models import MODELS, MotionModel
-from rdstitch.alignment.residual_likelihood import ErrorCost, Evidence
+from rdstitch.alignment.noise import evidence_of
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.choices import Purpose
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import inverses
+from rdstitch.robust.posterior import TWENTY_TO_ONE, ErrorCost, Evidence, freedom_cost
 
 _GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
 """Half diagonals: points of an image of usual proportions, out to the corners."""
@@ -33,12 +32,9 @@ _GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).resha
 _FRAMES = 12
 """Images that are tried as the frame of a plane without a metric."""
 
-MAX_STRETCH = 10.0
-"""Ratio of areas from which on a turn about the centre that joins the images is what a person would rather see. A plane
-seen from above has up to 7, one seen under 35 degrees 6 to 15, by the focal length, and no turn joins such images."""
-
-_REFUSED = 100.0
-"""The same from which on the compositor draws no image, so that any other layout is better."""
+_MAX_STRETCH = 10.0
+"""Ratio of areas from which on a layout is not believed. A plane seen from above has up to 7, one seen under 35 degrees
+6 to 15, by the focal length."""
 
 
 def stretch(fit: Fit) -> float:
@@ -72,20 +68,11 @@ _MIN_RATIO = 3.0
 """Times by which the errors of one camera must exceed those of free homographies, one an image: these fit relief better
 than any camera does, by up to 2.2 times over strips of rendered relief, and their chains drift projectively."""
 
-_FOCAL_LIMITS = 0.2, 50.0
-"""Half diagonals: focal lengths that a model may ask for; the widest fisheyes have 0.3."""
-
 _TYPICAL_TILT_SPREAD = math.radians(3.0)
 """Spread of tilts from which on a wider one costs: Occam's factor of the hierarchical prior on the tilts."""
 
 _TOLERABLE = 0.25
 """Of what an error counts at most: shared errors, besides the noise, that local alignment and seams can hide."""
-
-_PREFERENCE = 6.0
-"""What the user's command says: odds of twenty to one for a turn by ``pano``, and for a plane by ``mosaic``."""
-
-_POSSIBLE, _PARALLAX = 4.0, 0.005
-"""Times the noise, and diagonals of an image, that pairs may be off from a turn for it to be tried on all of them."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +81,6 @@ class ModelChoice:
 
     fit: Fit
     others: str  # how it compares with other models
-    overdispersion: float
     over_relief: bool = False
 
     @property
@@ -112,12 +98,12 @@ class Hypothesis:
     fit: Fit
     score: float  # -2 log of the posterior, up to a constant of the problem
     field: float  # size of what the errors of neighbours share, pixels of a coordinate
-    stretch: float  # of its layout: the ratio of areas, inf where images are folded; 1 where no layout is asked for
+    stretch: float  # of its layout: the ratio of areas, inf where images are folded; 1 where it is not asked for
 
     @property
-    def absurd(self) -> bool:
-        """Whether nobody would keep its layout."""
-        return not self.stretch <= MAX_STRETCH
+    def implausible(self) -> bool:
+        """Whether a turn is what a person would rather see."""
+        return not self.stretch <= _MAX_STRETCH
 
 
 @dataclass(frozen=True)
@@ -125,8 +111,7 @@ class Posterior:
     """Compares fits of one problem."""
 
     problem: Problem
-    prefer_turn: bool = False
-    layout_matters: bool = True
+    purpose: Purpose = Purpose.MOSAIC
 
     @cached_property
     def link_errors(self) -> FloatArray:
@@ -136,23 +121,12 @@ class Posterior:
     @cached_property
     def evidence(self) -> Evidence:
         """The cells that errors are compared by."""
-        return Evidence.of(self.problem.observations, self.link_errors)
+        return evidence_of(self.problem.observations, self.link_errors)
 
     @cached_property
     def least(self) -> ErrorCost:
         """What the errors of links on their own say, which those of no model undercut by much."""
         return self.evidence.cost(self.link_errors)
-
-    @property
-    def largest_trial(self) -> float:
-        """Error that a few pairs may have as a turn for that to be tried on all, pixels."""
-        diagonal = 2.0 * float(np.median(self.problem.observations.scale2))
-        return max(_POSSIBLE * self.evidence.noise, _PARALLAX * diagonal)
-
-    @property
-    def tolerable(self) -> float:
-        """Shared errors up to which another model is taken in place of one with an absurd layout, pixels."""
-        return math.hypot(_TOLERABLE * self.evidence.farthest, self.evidence.noise)
 
     def cost(self, adjusted: BundleAdjustmentResult) -> ErrorCost:
         """What the errors say that an adjustment leaves."""
@@ -161,83 +135,77 @@ class Posterior:
 
     def of(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
-        errors_cost = self.cost(fit.adjusted)
+        errors = self.cost(fit.adjusted)
+        layout = stretch(fit) if self.purpose.picture else 1.0
         wide = 0.0
         if fit.tilt_spread > 0.0:
             wide = 4.0 * self.problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
         priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
-        score = errors_cost.cost + self.price(fit.model, fit.free_lens, errors_cost.count) + wide + priors
-        if fit.model.on_sphere != self.prefer_turn:
-            score += _PREFERENCE
-        layout = stretch(fit) if self.layout_matters else 1.0
-        return Hypothesis(fit, score if has_plausible_focal(fit) else math.inf, errors_cost.field, layout)
+        score = self.bound(fit.model, errors, fit.free_lens) + wide + priors
+        return Hypothesis(fit, score, float(errors.field[0]), layout)
+
+    def bound(self, model: MotionModel, errors: ErrorCost, free_lens: BoolArray | None = None) -> float:
+        """The score of a model that leaves such errors, of a camera that is as cameras are."""
+        free = parameter_count(self.problem, model, self.problem.free_lens if free_lens is None else free_lens)
+        preference = TWENTY_TO_ONE if model.on_sphere != (self.purpose is Purpose.PANO) else 0.0
+        return float((errors.cost + freedom_cost(free, errors.count))[0]) + preference
 
     def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
-        if not model.one_camera and not _is_beyond_one_camera(self, best, self.least.field):
+        if not model.one_camera and not _is_beyond_one_camera(self, best, float(self.least.field[0])):
             return True
-        return not best.absurd and not self.could_win(best, model, self.least)
-
-    def could_win(self, best: Hypothesis, model: MotionModel, least: ErrorCost) -> bool:
-        """Whether a model could have the better score, if it left errors that say no more than the ``least``."""
-        return best.score > least.cost + self.price(model, self.problem.free_lens, least.count)
-
-    def price(self, model: MotionModel, free_lens: BoolArray, count: float) -> float:
-        """What the parameters of a model cost, by so many independent observations (Schwarz's criterion)."""
-        return parameter_count(self.problem, model, free_lens) * math.log(count)
+        return not best.implausible and best.score <= self.bound(model, self.least)
 
 
 def select_model(
     problem: Problem,
     names: Sequence[str],
     lenses: Sequence[BoolArray] = (),
-    *,
-    prefer_turn: bool = False,
-    layout_matters: bool = True,
+    purpose: Purpose = Purpose.MOSAIC,
 ) -> ModelChoice:
     """Adjust hypotheses from the least to the most free, and take the one with the best score.
 
     Models are no longer tried that could not pay for their freedom even with the errors that links leave on their own;
-    so a turn that pairs do not look like is tried last, by the errors of links that are turns on their own.
+    nor is a turn that could not with those of links that are turns on their own.
     The best two and the least free one are then tried with more of the lens free: an off-centre lens acts like less
     regular motion. Free homographies are a model of another kind, taken only for what one camera cannot explain.
     """
-    posterior = Posterior(problem, prefer_turn, layout_matters)
+    posterior = Posterior(problem, purpose)
     tried: list[Hypothesis] = []
-    doubtful: list[tuple[MotionModel, BundleAdjustmentResult]] = []
+    later: list[tuple[float, MotionModel, FloatArray]] = []
     wide = replace(problem, free_lens=np.logical_or.reduce([problem.free_lens, *lenses]))
+    planar = [MODELS[name] for name in names if not MODELS[name].on_sphere]
     for turn in [MODELS[name] for name in names if MODELS[name].on_sphere]:
         if len(problem.observations) == 1:  # a trial is the whole
             tried.append(posterior.of(problem.fit(turn)))
             continue
         trial = wide.trial(turn)
-        if len(names) == 1 or trial.sigma <= _POSSIBLE * posterior.evidence.noise:
-            tried.append(posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
+        bound, shared = posterior.bound(turn, posterior.cost(wide.apart(turn, trial))), trial.parameters.shared
+        if not planar or bound < posterior.bound(planar[0], posterior.least):
+            tried.append(posterior.of(problem.fit(turn, shared=shared)))
         else:
-            doubtful.append((turn, trial))
-    for model in [MODELS[name] for name in names if not MODELS[name].on_sphere]:
+            later.append((bound, turn, shared))
+    for model in planar:
         if problem.count == 2 and model.free_tilts and not all(MODELS[name].one_camera for name in names):
             continue  # with two images, one camera that tilts is a homography
         if tried and posterior.suffices(min(tried, key=_score), model):
             break
         planes = [one.fit for one in tried if not one.fit.model.on_sphere]
         tried.append(posterior.of(problem.fit(model, planes[-1:])))
-    for turn, trial in doubtful:
-        best = min(tried, key=_score)
-        if not best.absurd and trial.sigma > posterior.largest_trial:
-            continue
-        least = posterior.cost(wide.apart(turn, trial))
-        if posterior.could_win(best, turn, least) or (best.absurd and least.field < posterior.tolerable):
-            tried.insert(0, posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
+    for bound, turn, shared in later:
+        best = min((one for one in tried if one.fit.model.one_camera), key=_score)
+        if best.implausible or bound < best.score:
+            tried.insert(0, posterior.of(problem.fit(turn, shared=shared)))
     tried = _with_wider_lenses(posterior, tried, lenses)
     return _choice(tried, _best(posterior, tried), requested=len(names) == 1)
 
 
-def best_of(problem: Problem, fits: Sequence[Fit], *, requested: bool, layout_matters: bool) -> ModelChoice | None:
-    """Take the best of some fits of the problem; None where each has an absurd layout or focal length."""
-    posterior = Posterior(problem, layout_matters=layout_matters)
-    tried = [one for one in map(posterior.of, fits) if math.isfinite(one.score) and not one.absurd]
-    return _choice(tried, min(tried, key=_score), requested=requested) if tried else None
+def best_of(problem: Problem, fits: Sequence[Fit], purpose: Purpose, *, requested: bool) -> ModelChoice | None:
+    """Take the best of some fits of the problem; None where nobody would keep the layout of any."""
+    posterior = Posterior(problem, purpose)
+    tried = [posterior.of(fit) for fit in fits]
+    tried = [one for one in tried if not one.implausible]
+    return _choice(tried, _best(posterior, tried), requested=requested) if tried else None
 
 
 def _with_wider_lenses(
@@ -251,21 +219,27 @@ def _with_wider_lenses(
             fit = tried[index].fit
             wider = posterior.of(posterior.problem.extend(fit, lens | fit.free_lens))
             # A centre that is off bends a plane as rough ground bends the images; directions it does not bend.
-            shown = fit.model.on_sphere or shows_center(wider.fit.adjusted, posterior.problem.observations)
+            shown = fit.model.on_sphere or leaves_noise(wider.fit.adjusted, posterior.problem.observations)
             if wider.score < tried[index].score and shown:
                 tried[index] = wider
     return tried
 
 
 def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
-    """The one with the best score; where its layout is absurd, a turn that joins the images; if refused, any other."""
-    cameras = [one for one in tried if one.fit.model.one_camera]
+    """The one with the best score; free homographies only of what one camera does not explain.
+
+    Where a plane that nobody would lay out explains the images, so do free homographies: a turn whose errors seams can
+    hide is taken instead.
+    """
+    cameras = [one for one in tried if one.fit.model.one_camera] or tried
+    best, evidence = min(cameras, key=_score), posterior.evidence
+    if best.implausible:
+        tolerable = math.hypot(_TOLERABLE * float(evidence.farthest[0]), float(evidence.noise[0]))
+        kept = [one for one in tried if one.field < tolerable and not one.implausible]
+        kept = [one for one in kept if one.fit.model.on_sphere] or (kept if math.isinf(best.stretch) else [])
+        if kept:
+            return min(kept, key=_score)
     free = [one for one in tried if not one.fit.model.one_camera]
-    best = min(cameras or free, key=_score)
-    kept = [one for one in tried if not one.absurd and one.field < posterior.tolerable]
-    turns = [one for one in kept if one.fit.model.on_sphere]
-    if best.absurd and (turns or (kept and best.stretch > _REFUSED)):
-        return min(turns or kept, key=_score)
     return min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
 
 
@@ -275,7 +249,7 @@ def _score(one: Hypothesis) -> float:
 
 def _is_beyond_one_camera(posterior: Posterior, best: Hypothesis, free: float) -> bool:
     """Whether free homographies with such a field compete; two images need no more than one."""
-    return posterior.problem.count == 2 or best.absurd or best.field > _MIN_RATIO * free
+    return posterior.problem.count == 2 or best.implausible or best.field > _MIN_RATIO * free
 
 
 def parameter_count(problem: Problem, model: MotionModel, free_lens: BoolArray) -> int:
@@ -284,22 +258,14 @@ def parameter_count(problem: Problem, model: MotionModel, free_lens: BoolArray) 
     return poses + len(model.shared_names) + int(free_lens.sum()) - (2 if model.any_tilt else 0)
 
 
-def has_plausible_focal(fit: Fit) -> bool:
-    """Whether a lens can have the focal length of a fit: over relief, small tilts may ask for any."""
-    if not fit.model.one_camera:
-        return True
-    focal = math.exp(float(fit.model.physical_parameters(fit.adjusted.parameters.shared)[0][-1]))
-    return _FOCAL_LIMITS[0] < focal < _FOCAL_LIMITS[1]
-
-
 def _choice(tried: Sequence[Hypothesis], best: Hypothesis, *, requested: bool) -> ModelChoice:
     if requested:
-        return ModelChoice(best.fit, "; as requested", best.fit.overdispersion)
+        return ModelChoice(best.fit, "; as requested")
     listed = [
         f"{one.fit.model.name} {one.fit.adjusted.sigma:.2f} pixels"
-        + (", an impossible layout" if one.absurd else f", {one.score - best.score:+.0f}")
+        + (", an impossible layout" if one.implausible else f", {one.score - best.score:+.0f}")
         for one in tried
         if one is not best
     ]
     others = f" (others: {'; '.join(listed)})" if listed else ""
-    return ModelChoice(best.fit, others, best.fit.overdispersion)
+    return ModelChoice(best.fit, others)

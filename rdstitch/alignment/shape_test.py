@@ -31,7 +31,6 @@ from rdstitch.alignment.lens_selection import CENTER
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors, split_lens
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y
-from rdstitch.alignment.noise import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ShapeTest
 from rdstitch.arrays import FloatArray, IntArray
@@ -39,6 +38,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.division_model import distort, undistort
 from rdstitch.geometry.radial_homography import inverses, project
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
+from rdstitch.robust.posterior import EXACTNESS
 
 Correction = Callable[[FloatArray, IntArray, float], FloatArray]
 """Takes measured points (M, 2), half diagonals, the image of each (M,), and the size of the effect to the points that

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rdstitch.alignment.result import CONTRADICTS, Alignment
+from rdstitch.alignment.result import Alignment, Unused
 from rdstitch.results.messages import Message, left_out, names_of
 
 _FEW = 1.0 / 3.0
@@ -21,7 +21,7 @@ def explain_unaligned(
     """
     contradicting: dict[int, list[int]] = {}
     for fit in alignment.links:
-        if not fit.used and fit.reason == CONTRADICTS:
+        if not fit.used and fit.reason is Unused.CONTRADICTS:
             contradicting.setdefault(fit.image1, []).append(fit.image2)
             contradicting.setdefault(fit.image2, []).append(fit.image1)
     blocks = [group for group in alignment.components if len(group) > 1]

@@ -19,13 +19,13 @@ from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, inverse_information
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, YAW, PlanarModel, X, Y
-from rdstitch.alignment.noise import EXACTNESS
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.select import Posterior
 from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.choices import Purpose
+from rdstitch.robust.posterior import EXACTNESS, LENS
 
 _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
 """Matches in all, and of each link at least, that say how high and how wide the hills are."""
@@ -179,7 +179,7 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rou
     Each model counts as much as Schwarz's criterion makes it likely.
     """
     free = problem.fit(HOMOGRAPHY)
-    posterior = Posterior(problem)
+    posterior = Posterior(problem, Purpose.TRAJECTORY)
     against = float(np.clip((posterior.of(free).score - posterior.of(fit).score) / 2.0, -50.0, 50.0))
     share = 1.0 / (1.0 + math.exp(against))
     off = free.adjusted.parameters.lens - fit.adjusted.parameters.lens
@@ -196,14 +196,13 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
     """
     if problem.free_lens.sum() != 1:
         return fit
-    parameters = fit.adjusted.parameters
+    parameters, prior = fit.adjusted.parameters, LENS[0]
     value = float(parameters.lens[0])
-    std = math.sqrt(float(covariance[-1, -1]))
-    weight, mean, scatter = np.array(LENS[0].parts).T
-    # Of the mixture's parts the one that it comes from the most likely; each is normal, and so is what is seen.
-    spread = np.hypot(scatter, std)
-    part = int(np.argmax(np.log(weight / spread) - ((value - mean) / spread) ** 2 / 2.0))
-    weighed = float(value + (mean[part] - value) * (std / spread[part]) ** 2)
+    # What the images say without the prior, which has had its part in the adjustment: the value and its variance.
+    told, own = 1.0 / float(problem.adjuster_of(fit).covariance(fit.adjusted)[-1, -1]), prior.curvature(value)
+    seen = max(told - own, 1e-9 * told)
+    variance = max(float(covariance[-1, -1]) - own / told**2, 1.0 / told) * (told / seen) ** 2
+    weighed = prior.combined(value + prior.slope(value) / seen, math.sqrt(variance))
     if abs(weighed - value) * float(np.median(problem.observations.scale1)) < EXACTNESS:
         return fit
     held = replace(problem, free_lens=np.zeros_like(problem.free_lens))

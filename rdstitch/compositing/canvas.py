@@ -139,6 +139,9 @@ _MAX_GROWTH = 100.0
 _MAX_ENLARGEMENT = 400.0  # pixels of the canvas for each of the images, where --scale requests it
 
 
+_LEVEL = 1e-9  # rounding of what a turn within the plane leaves as it is
+
+
 @dataclass(frozen=True)
 class Canvas:
     """The output image's geometry."""
@@ -155,6 +158,13 @@ class Canvas:
     # (3, 3): what the registered images were turned by before, as it is recorded; None where they were not
     orientation: FloatArray | None = None
     cropped_to: Box | None = None  # what a crop leaves, instead of the largest part without holes
+
+    @property
+    def from_level_plane(self) -> FloatArray | None:
+        """Affine (3, 3) from the plane of the registration to pixels; None where that was tilted to be upright."""
+        turned = np.eye(3) if self.orientation is None else self.orientation
+        level: FloatArray = self.matrix @ (turned / turned[2, 2])
+        return level if np.abs(turned[2, :2]).max() <= _LEVEL * abs(turned[2, 2]) else None
 
     def box(self, index: int) -> Box:
         """Bounds (x0, y0, x1, y1) of an image, whole pixels inside the canvas, end exclusive.

@@ -75,6 +75,10 @@ def with_positions(
     half as accurate.
     """
     places = [source.metadata.gps for source in sources] if file is None else _places(sources, file, epsg, offset)
+    for place in places if file is not None else ():
+        if place is not None and not (abs(place.latitude) <= 90.0 and abs(place.longitude) <= 180.0):
+            degrees = f"{place.latitude:g} and {place.longitude:g}"
+            raise InputError(f"{file}: expected latitude and longitude in degrees, not {degrees}")
     if accuracy is not None:
         std = (accuracy, 2.0 * accuracy)
         places = [place and (replace(place, std=std) if place.std is None else place) for place in places]
@@ -166,7 +170,7 @@ def _degrees(row: Row, column: str, reference: str) -> float | None:
         return None
     text = row.values[column]
     value = sum(abs(part) / 60.0**k for k, part in enumerate(parts[:3]))
-    side = re.search(r"\b([NSEW])\w*\s*$", f"{text} {row.values.get(reference, '')}", re.IGNORECASE)
+    side = re.search(r"(?:\b|(?<=[\d.'\"°]))([NSEW])\w*\s*$", f"{text} {row.values.get(reference, '')}", re.IGNORECASE)
     if side is None and "deg" in text:
         raise InputError(f"{row.where}: '{text}' does not say whether north or south, east or west; add N, S, E or W")
     return -value if text.startswith("-") or (side is not None and side[1] in "SsWw") else value

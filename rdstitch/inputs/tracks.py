@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.errors import InputError
-from rdstitch.inputs.measurements import timestamps_of
+from rdstitch.inputs.sensor_streams import timestamps_of
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.system.records import parse_xml
@@ -38,7 +38,8 @@ def by_events(sources: Sequence[Source], text: str, file: str) -> list[GpsPositi
         if match := _EVENT.match(line):
             number, latitude, longitude, height, *std = (float(value) for value in match.groups())
             accuracy = (math.hypot(std[0], std[1]) / math.sqrt(2.0), std[2])
-            events[int(number)] = GpsPosition(latitude, longitude, height, accuracy if min(std) > 0.0 else None)
+            if latitude or longitude:  # 0, 0 is what is written without a fix
+                events[int(number)] = GpsPosition(latitude, longitude, height, accuracy if min(std) > 0.0 else None)
     if not events:
         raise InputError(f"{file}: has no events of a DJI .MRK file")
     numbers = [_SEQUENCE.search(Path(source.name).stem) for source in sources]

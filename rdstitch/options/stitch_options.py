@@ -17,6 +17,7 @@ from rdstitch.system.machine import processor_count
 
 if TYPE_CHECKING:
     from rdstitch.geometry.camera import Camera
+    from rdstitch.inputs.sensor_streams import Odometry
 
 _SELECT_MODEL_BELOW = 50
 """Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
@@ -75,6 +76,13 @@ class StitchOptions:
         "Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; otherwise those of the "
         "video, bag or EXIF.",
         "FILE",
+    )
+    odometry: "Odometry | str | Path | None" = option(
+        None,
+        "Wheel odometry, by time: TUM's lines, CSV timestamp,x,y,yaw_deg, or a topic of the bag. It gives the unit of "
+        "positions, and poses of frames without texture.",
+        "FILE|TOPIC",
+        entered=str | None,
     )
     positions: str | Path | None = option(
         None,
@@ -174,6 +182,7 @@ class StitchOptions:
             self.mask,
             self.attitude,
             self.timestamps,
+            self.odometry if isinstance(self.odometry, str | Path) else None,
             self.positions,
             self.gcp,
             self.check_points,

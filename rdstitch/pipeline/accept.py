@@ -1,7 +1,8 @@
 """Stage: check a registration; what fails a check is left out by name, and the rest is aligned anew."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -17,10 +18,13 @@ from rdstitch.results.messages import Message, names_of, told_once
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
 from rdstitch.verification.evidence import Evidence
-from rdstitch.verification.findings import Finding, messages_of
+from rdstitch.verification.findings import Finding, Kind, Scope, messages_of
 from rdstitch.verification.limits import limit
 from rdstitch.verification.second_motion import planes_of_pairs
 from rdstitch.verification.verdict import RefusedError, judge
+
+OTHER_MODELS = ("rotation", "pose", "homography")
+"""What a camera can have done: turned, moved over a plane, or anything that joins images of a plane."""
 
 _MAX_ROUNDS = 20  # times that something is left out; each takes one adjustment
 
@@ -30,12 +34,12 @@ Offenders = Mapping[tuple[int, ...], Message]
 
 
 @impossible_estimates_fail()
-def accept(registration: Registration, options: StitchOptions, purpose: Purpose = "mosaic") -> Registration:
+def accept(registration: Registration, options: StitchOptions, purpose: Purpose = Purpose.MOSAIC) -> Registration:
     """The registration of what passes all checks, with everything that the user should know of it.
 
     The registration comes and goes in pixels of the working size.
     """
-    aligner, lens_only = aligner_of(registration, options, purpose), purpose == "calibrate"
+    aligner = aligner_of(registration, options, purpose)
     undamaged = None if options.force else _without_damage(registration, aligner)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None
@@ -45,10 +49,15 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
 
     current, findings = registration, checked(registration)
     first, first_findings = registration, findings
-    if _fails(findings) and undamaged is not None and not _fails(judged := checked(undamaged)):
-        current, findings = undamaged, judged
-    elif _fails(findings) and not options.force:
-        another = not lens_only and _may_be_another_plane(findings)
+    if _fails(findings) and not options.force:
+        # What the matches hardly tell apart, the pixels do; not the periods of a pattern.
+        unlike = purpose.picture and all(found.kind is Kind.UNLIKE for found in findings if found.fails)
+        for other in chain([undamaged], _by_other_models(registration, aligner) if unlike else ()):
+            if other is not None and not _fails(judged := checked(other)):
+                current, findings = other, judged
+                break
+    if _fails(findings) and not options.force:
+        another = not purpose.lens_only and _may_be_another_plane(findings)
         plane = plane_of_most(registration, options, aligner) if another else None
         judged = () if plane is None else checked(plane)
         if plane is not None and not any(map(_is_of_the_whole, judged)):
@@ -76,10 +85,20 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
     return accepted
 
 
+def _by_other_models(registration: Registration, aligner: Aligner) -> Iterator[Registration]:
+    """The same images by other motions of a camera, where the user left the choice open."""
+    used, options = registration.alignment.used, aligner.options
+    names = [name for name in OTHER_MODELS if name != registration.alignment.model and options.model == "auto"]
+    for name in names:
+        other = realigned(registration, replace(aligner, options=replace(options, model=name)))
+        if other is not None and (other.alignment.used >= used).all():
+            yield other
+
+
 def aligner_of(registration: Registration, options: StitchOptions, purpose: Purpose) -> Aligner:
     """What aligns the images of a registration anew."""
     aligner = Aligner.of(registration.sources, options, Cache(options.cache), purpose)
-    return replace(aligner, needs_poses=purpose == "trajectory")
+    return replace(aligner, needs_poses=purpose.poses)
 
 
 def realigned(registration: Registration, aligner: Aligner) -> Registration | None:
@@ -127,7 +146,9 @@ def _told(registration: Registration, findings: Sequence[Finding]) -> Registrati
 
 def _may_be_another_plane(findings: Iterable[Finding]) -> bool:
     """Whether something moves differently from what was registered, or the whole fails."""
-    return any(found.kind in ("second motion", "undecided motion") or _is_of_the_whole(found) for found in findings)
+    return any(
+        found.kind in (Kind.SECOND_MOTION, Kind.UNDECIDED_MOTION) or _is_of_the_whole(found) for found in findings
+    )
 
 
 def plane_of_most(registration: Registration, options: StitchOptions, aligner: Aligner) -> Registration | None:
@@ -147,7 +168,7 @@ def plane_of_most(registration: Registration, options: StitchOptions, aligner: A
 
 def _is_of_the_whole(finding: Finding) -> bool:
     """Whether it is a failure that no image or pair is to blame for."""
-    return finding.fails and len(finding.images) not in (1, 2)
+    return finding.fails and finding.kind.scope is Scope.WHOLE
 
 
 def _images(offenders: Offenders) -> dict[int, Message]:
@@ -158,9 +179,9 @@ def _images(offenders: Offenders) -> dict[int, Message]:
 def _worst(registration: Registration, findings: Iterable[Finding]) -> Offenders:
     """The worst images, no two of them linked, since a bad image spoils its neighbours; else the failing pairs."""
     failures = [finding for finding in findings if finding.fails]
-    single = {finding.images[0]: finding for finding in failures if len(finding.images) == 1}
+    single = {finding.images[0]: finding for finding in failures if finding.kind.scope is Scope.IMAGE}
     if not single:
-        pairs = [finding for finding in failures if len(finding.images) == 2]
+        pairs = [finding for finding in failures if finding.kind.scope is Scope.PAIR]
         said = zip(pairs, messages_of(pairs, registration), strict=True)
         return {finding.images: message for finding, message in said}
     used = [fit for fit in registration.alignment.links if fit.used]

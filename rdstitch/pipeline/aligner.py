@@ -95,7 +95,7 @@ class Aligner:
         sources: Sequence[Source],
         options: StitchOptions,
         cache: Cache,
-        purpose: Purpose = "mosaic",
+        purpose: Purpose = Purpose.MOSAIC,
     ) -> Self:
         """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`."""
         paths = tuple(str(source.path) for source in sources)
@@ -267,6 +267,8 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
     """
     back = stored([quarter_turn(source.metadata.orientation) for source in sources])
     attitudes = [source.attitude for source in sources if source.attitude is not None]
+    delayed = [source.attitude_by_delay for source in sources if source.attitude_by_delay is not None]
+    timed = delayed and len(delayed) == len(sources) and set(back) == {1}
     exact = bool(attitudes) and options.attitude_std == 0.0
     places = [source.metadata.gps for source in sources]
     return AlignmentOptions(
@@ -276,10 +278,11 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
         lens_known=options.known_distortion is not None,
         tilt=options.tilt or ((0.0, 0.0) if exact else None),
         attitudes=turned_tilts(np.array(attitudes), back) if attitudes else None,
+        delayed_attitudes=np.array(delayed) if timed else None,
         attitudes_std=options.attitude_std,
         gravity=_gravity(sources, back),
         positions=positions_of(sources) if sources else None,
-        positions_std=[math.nan if p is None or p.std is None else p.std[0] for p in places],
+        positions_std=[math.nan if p is None or p.std is None else p.std[0] for p in places] or None,
         pose_covariance=options.pose_covariance,
     )
 

@@ -25,10 +25,10 @@ from rdstitch.system.late_imports import optimize
 _MAX_IMAGES = 8  # that are compared
 _COARSE_SIDE = 512  # pixels
 _PATCHES = 5  # along the longer side
-_AGREEING = 1.0  # pixels: patches that show a common shift
+_AGREEING = 0.002  # diagonals of the image: patches that show a common shift
 _ENOUGH = 0.3  # of the patches must agree for a shift to be one
 _WORTH_CORRECTING = 0.2  # pixels: the error of a patch
-_ELSEWHERE = 4.0  # pixels between images of one flight: parallax, and triggers that are not quite at one time
+_ELSEWHERE = 0.01  # diagonals between images of one flight: parallax, and triggers that are not quite at one time
 _ROUNDS = 3
 
 Grey = NDArray[np.float32]
@@ -152,6 +152,7 @@ def _fit(camera: Camera, shifts: Sequence[_Shifts]) -> BandLens | None:
     points, others = (np.concatenate([getattr(each, name) for each in shifts]) for name in ("points", "others"))
     if len(points) < 9:
         return None
+    near = _AGREEING * math.hypot(*camera.image_size)
     start = np.zeros(9)
     start[[2, 5]] = np.median(others - points, axis=0) / camera.scale
 
@@ -163,13 +164,13 @@ def _fit(camera: Camera, shifts: Sequence[_Shifts]) -> BandLens | None:
         off: FloatArray = np.nan_to_num(seen(parameters) - others, nan=1e3).ravel()
         return off
 
-    result = optimize.least_squares(residuals, start, loss="cauchy", f_scale=_AGREEING / 3.0, x_scale=0.01, max_nfev=50)
+    result = optimize.least_squares(residuals, start, loss="cauchy", f_scale=near / 3.0, x_scale=0.01, max_nfev=50)
     off = np.linalg.norm(residuals(result.x).reshape(-1, 2), axis=1)
-    if (off < _AGREEING).mean() < _ENOUGH:
+    if (off < near).mean() < _ENOUGH:
         return None
     moved = np.linalg.norm(seen(result.x) - points, axis=1)
     homography = np.eye(3) + np.append(result.x[:8], 0.0).reshape(3, 3)
-    agreeing = off < _AGREEING
+    agreeing = off < near
     return BandLens(homography, float(result.x[8]), float(np.median(moved)), float(np.median(off[agreeing])))
 
 
@@ -177,19 +178,19 @@ def _refuse_other_places(
     compared: Sequence[tuple[Source, Source]], edges: Sequence[tuple[Grey, Grey]], coarse: Sequence[FloatArray]
 ) -> None:
     """Refuse images that show the same as the registered ones, but each shifted by something else."""
+    diagonal = math.hypot(*edges[0][0].shape)
     sure = []
     for (first, second), shift in zip(edges, coarse, strict=True):
         shifts = _patch_shifts(first, second, partial(np.add, shift))
         away = np.linalg.norm(shifts.others - shifts.points - shift, axis=1)
-        sure.append(len(away) > 0 and float((away < 3.0 * _AGREEING).mean()) > _ENOUGH)
+        sure.append(len(away) > 0 and float((away < 3.0 * _AGREEING * diagonal).mean()) > _ENOUGH)
     certain = np.array(sure)
     if certain.sum() < 2:
         return
     shifts_of = np.array(coarse)
     off = np.where(certain, np.linalg.norm(shifts_of - np.median(shifts_of[certain], axis=0), axis=1), 0.0)
     worst = int(np.argmax(off))
-    limit = max(_ELSEWHERE, 0.01 * math.hypot(*edges[0][0].shape))
-    if off[worst] > limit:
+    if off[worst] > _ELSEWHERE * diagonal:
         registered, given = compared[worst]
         raise InputError(
             f"{given.path}: shows what {registered.name} does {off[worst]:.0f} pixels further off than the "

@@ -21,8 +21,6 @@ from rdstitch.pipeline.result_files import make_folder
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import check_outputs, text_bytes, write_bytes_atomic
 
-_LEVEL = 1e-9  # rounding of what a turn within the plane leaves as it is
-
 
 def write_map(result: StitchResult, folder: str | Path, height: float, *, overwrite: bool = False) -> list[Path]:
     """Write ``map.yaml`` and ``map.png`` of a mosaic that was written, in metres by the height of the first image.
@@ -76,10 +74,9 @@ def _pixel_to_metres(result: StitchResult, height: float) -> FloatArray:
     poses = result.registration.alignment.poses
     if poses is None or result.canvas.projection.name != "plane":
         raise ArgumentError("a map needs metric poses over a plane; leave out --map-server, or choose a planar --model")
-    turned = np.eye(3) if result.canvas.orientation is None else result.canvas.orientation
-    if np.abs(turned[2, :2]).max() > _LEVEL * abs(turned[2, 2]):
+    if (to_pixels := result.canvas.from_level_plane) is None:
         raise ArgumentError("there is no map where the plane was tilted to be upright; leave out --straighten")
-    to_plane = np.linalg.inv(result.canvas.matrix @ (turned / turned[2, 2]))
+    to_plane = np.linalg.inv(to_pixels)
     first = int(Trajectory.from_poses(poses).frame[0])
     c, s, unit = math.cos(poses.yaw[first]), math.sin(poses.yaw[first]), height / poses.height[first]
     to_first = AXES["ros"] @ np.array([[c, -s], [s, c]]) * unit

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
+from rdstitch.export.hugin_project import project_of_hugin
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import image_files
@@ -11,7 +12,6 @@ from rdstitch.pipeline.result_files import (
     layer_files,
     make_folder,
     poses_file,
-    project_of_hugin,
     write_layers,
 )
 from rdstitch.results.messages import Message
@@ -40,7 +40,8 @@ def stage_beside(beside: FilesBeside, outputs: Outputs, result: StitchResult | R
     attempt(beside.report, lambda file: _report(beside, file, outputs, result))
     if isinstance(result, StitchResult) and result.plan is None:
         how = {"whole": beside.whole_layers, "overwrite": result.options.overwrite}
-        attempt(beside.hugin_project, lambda file: outputs.write(file, text_bytes(project_of_hugin(result))))
+        project = partial(project_of_hugin, result.registration, result.canvas)
+        attempt(beside.hugin_project, lambda file: outputs.write(file, text_bytes(project())))
         table = partial(poses_file, result, frame=beside.frame, height=beside.height)
         attempt(beside.poses, lambda file: outputs.write(file, text_bytes(table(file))))
         attempt(beside.layers, lambda folder: write_layers(result, folder, **how, outputs=outputs))

@@ -16,12 +16,13 @@ from rdstitch.export.trajectory_files import WRITERS, frame_of, has_times, path_
 from rdstitch.geometry.exif_orientation import quarter_turn
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
-from rdstitch.inputs.measurements import timestamps_of, with_times
 from rdstitch.inputs.selection import selected
+from rdstitch.inputs.sensor_streams import timestamps_of, with_times
 from rdstitch.inputs.source import Source
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty
+from rdstitch.pipeline.along_odometry import along_odometry, with_odometry_of_bag
 from rdstitch.pipeline.choose_layout import LaidOut, choose_layout
 from rdstitch.pipeline.compose import blocks_on, check_world_files, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
@@ -274,7 +275,7 @@ def _stitch_found(
     sources, unread = read_inputs(frames, options, skip_bad=not pano)
     check_world_files(images, sources, options.overwrite)
     check_map(sources, options.composite)
-    purpose: Purpose = "pano" if pano else "mosaic"
+    purpose = Purpose.PANO if pano else Purpose.MOSAIC
     with options.executor(len(sources)) as executor:
         known = [*unread, *listed.messages]
         accepted = _accepted(sources, known, options, executor, progress, purpose, beside)
@@ -316,7 +317,7 @@ def calibrate(
         sources, unread = read_inputs(with_times(listed.frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages]
-            accepted = _accepted(sources, known, options, executor, progress, "calibrate", beside)
+            accepted = _accepted(sources, known, options, executor, progress, Purpose.CALIBRATE, beside)
             result = _finished(at_full_size(accepted))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
@@ -371,6 +372,7 @@ def trajectory(
         replaced = [Path(output)] if Path(output).is_dir() and options.overwrite else []
     given = as_inputs(inputs, options.channel_order)
     options, notes = with_camera_in_bag(given, options)
+    options = with_odometry_of_bag(given, options)
     with found_images(given, every=every, topic=options.topic) as listed:
         files = [Path(file) for file in (output, plot) if file is not None]
         check_outputs([f for f in files if f not in replaced], options.overwrite, [*listed.files, *options.files])
@@ -380,11 +382,14 @@ def trajectory(
         sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
             known = [*unread, *listed.messages, *notes]
-            registration = at_full_size(_accepted(sources, known, options, executor, progress, "trajectory"))
+            registration = at_full_size(_accepted(sources, known, options, executor, progress, Purpose.TRAJECTORY))
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])
     path = Trajectory.from_alignment(turned_alignment(registration.alignment, back, None), height)
+    if options.odometry is not None:
+        path, notes = along_odometry(path, sources, options.odometry, keep_unit=height != 1.0)
+        registration = registration.with_messages(notes)
     path = path.labelled(
         [s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], timestamps_of(sources)
     )

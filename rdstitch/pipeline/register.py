@@ -40,7 +40,7 @@ def register(
     options: StitchOptions,
     executor: Executor,
     *,
-    purpose: Purpose = "mosaic",
+    purpose: Purpose = Purpose.MOSAIC,
     progress: Progress = silent,
 ) -> Registration:
     """Detect features, register pairs, and align all images as one.
@@ -55,7 +55,7 @@ def register(
         sources = with_image_circle(sources, executor, cache, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, purpose)
     store = cache if options.cache is not None else Cache.for_this_run()
-    skip_bad = purpose != "pano"
+    skip_bad = purpose is not Purpose.PANO
     detected = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
@@ -77,16 +77,16 @@ def register(
     pairs = pairing.estimate_candidates(candidates)
     moving = pairing.without_static_background(pairs, candidates)
     pairing, pairs = moving or (pairing, pairs)
-    pairs = pairing.match_repeated_patterns(pairs) if purpose == "calibrate" else pairs
+    pairs = pairing.match_repeated_patterns(pairs) if purpose.lens_only else pairs
     mixed, other_lens = separate_lenses(aligner.cameras, pairs, options.threshold, options.known_distortion)
     aligned = aligner.draft([pair for pair in pairs if not {*pair.images} & other_lens.keys()])
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
     aligned = close_loops(aligner, pairing, aligned, candidates)
-    if purpose == "trajectory":
+    if purpose.poses:
         aligner = replace(aligner, needs_poses=True)
         aligned = aligner.metric(aligned)
     aligned = aligner.completed(aligned)
-    settle = match_crossings if purpose == "calibrate" else settle_repeated_pattern
+    settle = match_crossings if purpose.lens_only else settle_repeated_pattern
     aligned, undecided = settle(aligner, pairing, aligned, sources, detected.stretch, options.threads)
     unplaced = {**other_lens, **detected.damaged, **undecided}
     return Registration(

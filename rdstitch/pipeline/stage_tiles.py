@@ -14,7 +14,7 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from rdstitch.alignment import Alignment
-from rdstitch.alignment.result import LinkFit, ReliefTest
+from rdstitch.alignment.result import LinkFit, ReliefTest, Unused
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Correspondences
@@ -434,7 +434,7 @@ def _pair(
     )
     indices = np.tile(np.arange(len(of_pair), dtype=np.intp)[:, None], 2)
     matches = Correspondences(indices, links.points1[of_pair], links.points2[of_pair], np.zeros(len(of_pair)))
-    reason = "" if used else "contradicts the other links"
+    reason = Unused.NO if used else Unused.CONTRADICTS
     fit = LinkFit(first, second, len(errors), int(agreeing.sum()), rms if used else math.nan, used, reason)
     return PairRegistration(first, second, StoredMatches.of(matches), relation), fit
 

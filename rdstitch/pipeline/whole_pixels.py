@@ -34,7 +34,7 @@ def on_whole_pixels(registration: Registration) -> Registration:
     lens that was given, and a turn on the spot, stay.
     """
     alignment = registration.alignment
-    given = alignment.distortion_std == 0.0 and any(any(camera.coefficients) for camera in alignment.cameras)
+    given = alignment.lens_given and any(any(camera.coefficients) for camera in alignment.cameras)
     whole = None if alignment.on_sphere or given else _whole_shifts(registration)
     frame = alignment.homographies[alignment.reference] / alignment.homographies[alignment.reference][2, 2]
     linear = frame[:2, :2] - np.outer(frame[:2, 2], frame[2, :2])

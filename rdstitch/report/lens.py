@@ -91,7 +91,7 @@ def _curve(camera: Camera, radii: FloatArray) -> str:
 
 def votes(registration: Registration) -> str:
     """Histogram of the pairs' λ (the paper's Figure 8), each weighted by how well it sees λ, with the adjusted λ."""
-    if registration.alignment.distortion_std == 0.0:
+    if registration.alignment.lens_given:
         return section("Votes on λ", "λ was given: no pair voted.")
     relations = [pair.relation for pair in registration.pairs if pair.relation]
     consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])

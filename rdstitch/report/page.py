@@ -191,9 +191,9 @@ def _left_out(registration: Registration) -> str:
 
 def _lambda(registration: Registration) -> str:
     alignment = registration.alignment
-    if not math.isfinite(alignment.distortion_std):
+    if not alignment.lens_observable:
         return "not observable"
-    given = alignment.distortion_std == 0.0
+    given = alignment.lens_given
     return f"{alignment.distortion:.6f} " + (
         f"({alignment.lens_reason})" if given else f"± {alignment.distortion_std:.6f}"
     )

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray, Rows
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.geometry.division_model import distorted_ratio
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
 from rdstitch.robust.loss import loss_ratio, robust_weight
@@ -55,6 +55,14 @@ class TransferDerivatives(Rows):
     # (B, N), bool: no transfer: behind the camera, or beyond the lens model. Errors and derivatives are then finite but
     # mean nothing
     lost: BoolArray
+
+    def whitened(self, row: IntArray, column: IntArray) -> FloatArray:
+        """Whitened errors (M, 2), pixels, of some matches of some pairs; NaN where there is no transfer."""
+        (xx, xy, yy), (x, y) = self.precision[row, :, column].T, self.columns[row, -1, :, column].T
+        root = np.sqrt(xx)
+        errors = np.column_stack([root * x + xy / root * y, np.sqrt(np.maximum(yy - xy * xy / xx, 0.0)) * y])
+        errors[self.lost[row, column]] = np.nan
+        return errors
 
 
 def differentiate(homography: FloatArray, lens: PairLenses, data: Measurements) -> TransferDerivatives:

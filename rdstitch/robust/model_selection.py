@@ -8,14 +8,13 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.division_model import OBSERVABLE_STD
-from rdstitch.robust.loss import loss_width, robust_cost
+from rdstitch.robust.loss import loss_width
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
+from rdstitch.robust.posterior import LENS, Evidence, farthest_error, freedom_cost
 from rdstitch.robust.refinement import Fits, PairEquations, PairProblems, refine_pairs
 
-# Halved or doubled, these change the median error of λ by a sixth at most.
-_MAX_RESIDUAL = 3.0  # errors, in thresholds, beyond which a match is left out of the choice
-_STEPS = 20
+_STEPS = 20  # of refinement; halved or doubled, the median error of λ changes by a sixth at most
 
 
 @dataclass(frozen=True)
@@ -81,28 +80,22 @@ class PairSelection:
 
 
 def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> list[PairFit]:
-    """Fit every model to each pair and choose by the Bayesian information criterion.
+    """Fit every model to each pair, and choose the one with the best posterior (:mod:`rdstitch.robust.posterior`).
 
-    The noise is that of the freest model, so that a more restricted model is compared with what the images allow and
+    The planar ones, from least to most free, compete with the free homography. The noise, and which matches are near
+    enough to count, are those of the latter, so that a more restricted model is compared with what the images allow and
     not with its own misfit.
-
-    Parameters
-    ----------
-    planar : sequence of PlanarPairModel
-        From least to most free; they compete with the free homography.
-    pairs : PairSelection
-        ``noise`` is estimated anew.
     """
     freest = pairs.fit(HomographyPairModel())
     errors, noise = freest.equations.errors, freest.equations.noise
-    far = pairs.data.present & ~(errors < _MAX_RESIDUAL * pairs.threshold)
-    near = replace(pairs.at(freest.fits), noise=noise, data=pairs.data.only(~far))
-    fitted = [*(near.fit(model) for model in planar), freest]
-    inliers = np.maximum((errors < pairs.threshold).sum(axis=1), 1)
-    price = noise**2 * np.log(2 * inliers)
-    costs = np.array([each.equations.cost + each.equations.information.shape[1] * price for each in fitted])
-    costs[-1] -= (robust_cost(freest.equations.squared, freest.equations.scale[:, None]) * far).sum(axis=1)
-    chosen = np.argmin(costs, axis=0)
+    row, column = np.nonzero(pairs.data.present & (errors < farthest_error(pairs.data.px)[:, None]))
+    near = np.zeros_like(pairs.data.present)
+    near[row, column] = True
+    standing = replace(pairs.at(freest.fits), noise=noise, data=pairs.data.only(near))
+    fitted = [*(standing.fit(model) for model in planar), freest]
+    every = np.arange(len(pairs.data))
+    evidence = Evidence.of(row, pairs.data.x1[row, :, column], every, noise, pairs.data.px)
+    chosen = np.argmin([_score(each, evidence, row, column, pairs.fixed_distortion) for each in fitted], axis=0)
     rms = np.stack([rms_of(each.equations.errors, pairs.threshold) for each in fitted], axis=1)
     result: dict[int, PairFit] = {}
 
@@ -127,6 +120,14 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
         free_fits = finished(len(planar), np.array(sorted(unseen), dtype=np.intp))
         result.update({row: fit for row, fit in free_fits.items() if np.isfinite(fit.distortion_std)})
     return [result[row] for row in range(len(pairs.data))]
+
+
+def _score(fitted: _Fitted, evidence: Evidence, row: IntArray, column: IntArray, fixed_distortion: bool) -> FloatArray:
+    """-2 log of the posterior of a model of each pair (B,), by the matches at these places, up to a constant."""
+    equations, distortion = fitted.equations, fitted.fits.distortion
+    seen = evidence.cost(equations.transferred.whitened(row, column))
+    lens = np.zeros(len(distortion)) if fixed_distortion else np.array([LENS[0].cost(x) for x in distortion.tolist()])
+    return seen.cost + freedom_cost(equations.information.shape[1], seen.count) + equations.prior + lens
 
 
 def _finished(fitted: _Fitted, pairs: PairSelection, reasons: list[str]) -> Iterator[PairFit]:

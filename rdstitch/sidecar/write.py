@@ -44,7 +44,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         "lambda_std": alignment.distortion_std,
         "lambda_px": camera.distortion_px,
         "lambda_focal": camera.distortion_focal,
-        "lambda_known": alignment.distortion_std == 0.0,
+        "lambda_known": alignment.lens_given,
         "lens": alignment.lens,
         "lens_reason": alignment.lens_reason,
         "camera": camera.as_dict(),

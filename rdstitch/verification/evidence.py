@@ -24,19 +24,7 @@ class Evidence:
     threshold: float  # largest transfer error of an inlier of a pair, pixels
     threads: int = 1  # pairs of images that are compared at the same time
     cache: Cache = NO_CACHE  # of results of earlier runs
-    purpose: Purpose = "mosaic"
-
-    @property
-    def picture(self) -> bool:
-        """Whether a picture is wanted, which its seams judge; only what is placed wrongly must not get there."""
-        return self.purpose in ("pano", "mosaic")
-
-    @property
-    def lens_only(self) -> bool:
-        """Whether only the lens is wanted, so that doubts about the places of images do not make the result fail, and
-        are not reported where a repeated pattern explains them.
-        """
-        return self.purpose == "calibrate"
+    purpose: Purpose = Purpose.MOSAIC
 
     @property
     def alignment(self) -> Alignment:

@@ -2,22 +2,194 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 from rdstitch.results.messages import MAX_NAMED, Message, Severity, names_of, shortened
 from rdstitch.results.registration import Registration
 
 
+class Scope(Enum):
+    """What is to blame: an image or a pair may be left out, the whole may not."""
+
+    WHOLE = 0
+    IMAGE = 1
+    PAIR = 2
+
+
+class Kind(Enum):
+    """What there is to find: what is to blame, a heading in docs/troubleshooting.md, and the sentence."""
+
+    LENSES_MIXED = (
+        Scope.WHOLE,
+        "",
+        (
+            "two lenses or zooms are mixed: {images2} (λ about {lens2:.3f}) and {images1} ({lens1:.3f}); stitch "
+            "those of each on their own"
+        ),
+    )
+    MATCHES_DISAGREE = (
+        Scope.WHOLE,
+        "",
+        "only {inliers} of {count} matches fit the places that were found for the images",
+    )
+    IMAGE_MISFITS = (
+        Scope.IMAGE,
+        "",
+        "only {inliers} of {count} of its matches fit the place that was found for it; {reason}",
+    )
+    PAIR_MISFITS = (
+        Scope.PAIR,
+        "",
+        "{both}: only {inliers} of {count} matches fit the places that were found for them; {reason}",
+    )
+    ERRORS = (
+        Scope.WHOLE,
+        "",
+        "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels",
+    )
+    ROUGH = (
+        Scope.WHOLE,
+        "relief",
+        (
+            "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels: the ground"
+            " is rough"
+        ),
+    )
+    RELIEF = (
+        Scope.WHOLE,
+        "relief",
+        "{what}; most of all between {first} and {second} ({rms:.1f} pixels)",
+    )
+    DEPTH_OF_A_TURN = (
+        Scope.WHOLE,
+        "parallax",
+        "{what}; most of all between {first} and {second} ({rms:.1f} pixels)",
+    )
+    PARALLAX = (
+        Scope.WHOLE,
+        "parallax",
+        (
+            "the camera moved while it turned (parallax), or things moved before it: they are off by up to "
+            "{size:.0f} pixels between {first} and {second} ({share:.0%} of their matches); turn about the lens, "
+            "not about yourself"
+        ),
+    )
+    SHAPE_UNKNOWN = (
+        Scope.WHOLE,
+        "shape",
+        (
+            "global accuracy unknown: the images do not come from one camera with one focal length, or what they "
+            "show is not flat; each has a homography of its own, and their errors add up from image to image"
+        ),
+    )
+    SHAPE_BENT = (
+        Scope.WHOLE,
+        "shape",
+        (
+            "may be bent by about {size:.0f} pixels from end to end, though neighbours fit: the errors have a "
+            "pattern that was not modelled, most likely {cause}"
+        ),
+    )
+    SHAPE_FREE = (
+        Scope.WHOLE,
+        "shape",
+        (
+            "may be bent by about {size:.0f} pixels from end to end, though neighbours fit: the images cannot "
+            "exclude {cause}; give {remedy}"
+        ),
+    )
+    UNLIKE = (
+        Scope.PAIR,
+        "",
+        "{both} do not look alike where they are put together ({confirming} of {cells} places agree)",
+    )
+    AMBIGUOUS = (
+        Scope.PAIR,
+        "",
+        (
+            "{both} fit as well elsewhere, {shift:.0%} of an image away (a repeated pattern?); take images that "
+            "share something unique"
+        ),
+    )
+    PATTERN = (
+        Scope.WHOLE,
+        "",
+        "{count} of {of} pairs fit as well elsewhere (a repeated pattern?)",
+    )
+    LOOKED_AT = (
+        Scope.WHOLE,
+        "",
+        "of {of} overlaps {count} were compared in their pixels, {sampled} of them at random: at most {share:.1%} of "
+        "all are wrong, with a confidence of 95%",
+    )
+    SETTLED_PATTERN = (
+        Scope.WHOLE,
+        "repeated-pattern",
+        (
+            "the images show a repeated pattern; what is unique in them (dirt, a mark, an object) decided where "
+            "they lie; look at the seams, that between {first} and {second} first"
+        ),
+    )
+    SECOND_MOTION = (
+        Scope.WHOLE,
+        "rival-motion",
+        "{moving} (something that moved, or a second surface?); a mask keeps it out",
+    )
+    UNDECIDED_MOTION = (
+        Scope.WHOLE,
+        "rival-motion",
+        "{moving}, and it is not clear which of the two is the plane; mask what does not belong to it",
+    )
+    TWO_OF_ONE_LENS = (
+        Scope.WHOLE,
+        "mixed-lenses",
+        (
+            "{both} fit without the images of another lens, as any two do; if all are of one lens, the scene is "
+            "not flat, and these two lie wrongly; add images of this lens"
+        ),
+    )
+    SEVERAL_CAMERAS = (
+        Scope.WHOLE,
+        "mixed-lenses",
+        "the images come from {number} cameras: {bodies}; stitch those of each on their own",
+    )
+    ZOOMED = (
+        Scope.WHOLE,
+        "mixed-lenses",
+        (
+            "the lens was zoomed between the images, by up to {ratio:.2f} (between {near} and {far}); stitch "
+            "those of one zoom on their own"
+        ),
+    )
+    UNMASKED = (
+        Scope.WHOLE,
+        "",
+        "{without_count} of {of_all} images have no mask: {without}",
+    )
+    OUTVOTED = (
+        Scope.WHOLE,
+        "doubtful-seam",
+        "{they_fit} badly, and little depends on {them}: {named}; look at the seams between them",
+    )
+    OUTVOTED_PATTERN = (
+        Scope.WHOLE,
+        "doubtful-seam",
+        "{they_fit} as well elsewhere (a repeated pattern?), and little depends on {them}: {named}; look at the seams "
+        "between them",
+    )
+
+    def __init__(self, scope: Scope, code: str, text: str) -> None:
+        self.scope, self.code, self.text = scope, code, text
+
+
 @dataclass(frozen=True)
 class Finding:
     """One thing that a rule found."""
 
-    kind: str  # a key of :data:`TEXTS`
+    kind: Kind
     images: tuple[int, ...] = ()  # indices of the images that it concerns; empty where it concerns the whole
-    # as of :class:`rdstitch.results.messages.Message`. A failure of one image or of a pair may be mended without
-    # these; one of
-    # the whole, or of more images, may not
-    severity: Severity = "failure"
+    severity: Severity = "failure"  # as of :class:`rdstitch.results.messages.Message`
     values: Mapping[str, object] = field(default_factory=dict)  # what was measured: sizes, shares and counts, by name
 
     @property
@@ -26,93 +198,10 @@ class Finding:
         return self.severity == "failure"
 
 
-TEXTS = {
-    "lenses mixed": (
-        "",
-        "two lenses or zooms are mixed: {images2} (λ about {lens2:.3f}) and {images1} ({lens1:.3f}); stitch those of "
-        "each on their own",
-    ),
-    "matches disagree": ("", "only {inliers} of {count} matches fit the places that were found for the images"),
-    "image misfits": ("", "only {inliers} of {count} of its matches fit the place that was found for it; {reason}"),
-    "pair misfits": ("", "{both}: only {inliers} of {count} matches fit the places that were found for them; {reason}"),
-    "errors": ("", "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels"),
-    "rough": (
-        "relief",
-        "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels: the ground is rough",
-    ),
-    "relief": ("relief", "{what}; most of all between {first} and {second} ({rms:.1f} pixels)"),
-    "depth of a turn": ("parallax", "{what}; most of all between {first} and {second} ({rms:.1f} pixels)"),
-    "parallax": (
-        "parallax",
-        "the camera moved while it turned (parallax), or things moved before it: they are off by up to {size:.0f} "
-        "pixels between {first} and {second} ({share:.0%} of their matches); turn about the lens, not about yourself",
-    ),
-    "shape unknown": (
-        "shape",
-        "global accuracy unknown: the images do not come from one camera with one focal length, or what they show is "
-        "not flat; each has a homography of its own, and their errors add up from image to image",
-    ),
-    "shape bent": (
-        "shape",
-        "may be bent by about {size:.0f} pixels from end to end, though neighbours fit: the errors have a pattern that "
-        "was not modelled, most likely {cause}",
-    ),
-    "shape free": (
-        "shape",
-        "may be bent by about {size:.0f} pixels from end to end, though neighbours fit: the images cannot exclude "
-        "{cause}; give {remedy}",
-    ),
-    "unlike": (
-        "",
-        "{both} do not look alike where they are put together ({confirming} of {cells} places agree)",
-    ),
-    "ambiguous": (
-        "",
-        "{both} fit as well elsewhere, {shift:.0%} of an image away (a repeated pattern?); take images that share "
-        "something unique",
-    ),
-    "pattern": ("", "{count} of {of} pairs fit as well elsewhere (a repeated pattern?)"),
-    "looked at": (
-        "",
-        "of {of} overlaps {count} were compared in their pixels, {sampled} of them at random: at most {share:.1%} of "
-        "all are wrong, with a confidence of 95%",
-    ),
-    "settled pattern": (
-        "repeated-pattern",
-        "the images show a repeated pattern; what is unique in them (dirt, a mark, an object) decided where they lie; "
-        "look at the seams, that between {first} and {second} first",
-    ),
-    "second motion": (
-        "rival-motion",
-        "{moving} (something that moved, or a second surface?); a mask keeps it out",
-    ),
-    "undecided motion": (
-        "rival-motion",
-        "{moving}, and it is not clear which of the two is the plane; mask what does not belong to it",
-    ),
-    "two of one lens": (
-        "mixed-lenses",
-        "{both} fit without the images of another lens, as any two do; if all are of one lens, the scene is not flat, "
-        "and these two lie wrongly; add images of this lens",
-    ),
-    "several cameras": (
-        "mixed-lenses",
-        "the images come from {number} cameras: {bodies}; stitch those of each on their own",
-    ),
-    "zoomed": (
-        "mixed-lenses",
-        "the lens was zoomed between the images, by up to {ratio:.2f} (between {near} and {far}); stitch those of one "
-        "zoom on their own",
-    ),
-    "unmasked": ("", "{without_count} of {of_all} images have no mask: {without}"),
-}
-"""Code (a heading in docs/troubleshooting.md) and sentence of each kind, with fields for its values."""
-
 _MOVING = (
     "{share:.0%} of what the images have in common moves differently from the rest, most of it around ({place[0]:.0f}, "
     "{place[1]:.0f}) of {shown[0]} when compared with {shown[1]}, by {off:.0f} pixels"
 )
-_OUTVOTED = {"outvoted": "badly", "ambiguous": "as well elsewhere (a repeated pattern?)"}
 
 
 def messages_of(findings: Iterable[Finding], registration: Registration) -> list[Message]:
@@ -125,7 +214,11 @@ def _message(finding: Finding, paths: Sequence[str]) -> Message:
     images, values = tuple(paths[k] for k in finding.images), dict[str, Any](finding.values)
     names = names_of(images)
     if "pairs" in values:
-        return Message(_outvoted(finding.kind, values["pairs"], paths), images, finding.severity, code="doubtful-seam")
+        pairs = values.pop("pairs")
+        values["named"] = shortened([" and ".join(names_of([paths[i], paths[j]])) for i, j in pairs])
+        several = len(pairs) > 1
+        values |= {"they_fit": f"{len(pairs)} pairs fit" if several else "one pair fits"}
+        values |= {"them": "them" if several else "it"}
     if len(names) == 2:
         values |= {"first": names[0], "second": names[1], "both": " and ".join(names)}
     for key in ("images1", "images2", "without"):
@@ -139,12 +232,5 @@ def _message(finding: Finding, paths: Sequence[str]) -> Message:
         values |= {"number": len(bodies), "bodies": "; ".join([*listed][:MAX_NAMED])}
     if "shown" in values:
         values["moving"] = _MOVING.format(**{**values, "shown": names_of(paths[k] for k in values["shown"])})
-    code, text = TEXTS[finding.kind]
-    return Message(text.format(of_all=len(paths), **values), images, finding.severity, code, finding.kind)
-
-
-def _outvoted(kind: str, pairs: Sequence[tuple[int, int]], paths: Sequence[str]) -> str:
-    """Suspicious pairs on which nothing depends."""
-    named = shortened([" and ".join(names_of([paths[i], paths[j]])) for i, j in pairs])
-    fit, it = ("one pair fits", "it") if len(pairs) == 1 else (f"{len(pairs)} pairs fit", "them")
-    return f"{fit} {_OUTVOTED[kind]}, and little depends on {it}: {named}; look at the seams between them"
+    kind = finding.kind
+    return Message(kind.text.format(of_all=len(paths), **values), images, finding.severity, kind.code, kind.name)

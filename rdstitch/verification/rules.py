@@ -13,7 +13,7 @@ from rdstitch.alignment.result import LinkFit, links_by_image
 from rdstitch.alignment.unaligned import few_features
 from rdstitch.inputs.source import Source
 from rdstitch.verification.evidence import Evidence
-from rdstitch.verification.findings import Finding
+from rdstitch.verification.findings import Finding, Kind
 from rdstitch.verification.limits import limit
 from rdstitch.verification.overlap_check import wrong_at_most
 from rdstitch.verification.second_motion import share_of
@@ -27,7 +27,7 @@ def disagreeing_pairs(evidence: Evidence) -> Iterator[Finding]:
     for fit in evidence.used:
         if fit.inliers < limit("inliers of a pair") * fit.count:
             reason = _reason(evidence, (fit.image1, fit.image2), [fit], "stitch them on their own")
-            yield _of_matches("pair misfits", (fit.image1, fit.image2), [fit], reason)
+            yield _of_matches(Kind.PAIR_MISFITS, (fit.image1, fit.image2), [fit], reason)
 
 
 def _misfitting_images(evidence: Evidence) -> Iterator[Finding]:
@@ -35,15 +35,15 @@ def _misfitting_images(evidence: Evidence) -> Iterator[Finding]:
     for k, links in sorted(links_by_image(evidence.used).items()):
         fits = [fit for fit in links if fit.inliers >= limit("inliers of a pair") * fit.count]
         if sum(fit.inliers for fit in fits) < limit("inliers of an image") * sum(fit.count for fit in fits):
-            yield _of_matches("image misfits", (k,), fits, _reason(evidence, (k,), fits))
+            yield _of_matches(Kind.IMAGE_MISFITS, (k,), fits, _reason(evidence, (k,), fits))
 
 
 def _matches_disagree(evidence: Evidence) -> Iterator[Finding]:
     if sum(fit.inliers for fit in evidence.used) < limit("inliers of a pair") * sum(fit.count for fit in evidence.used):
-        yield _of_matches("matches disagree", (), evidence.used)
+        yield _of_matches(Kind.MATCHES_DISAGREE, (), evidence.used)
 
 
-def _of_matches(kind: str, images: tuple[int, ...], fits: Sequence[LinkFit], reason: str = "") -> Finding:
+def _of_matches(kind: Kind, images: tuple[int, ...], fits: Sequence[LinkFit], reason: str = "") -> Finding:
     inliers, count = sum(fit.inliers for fit in fits), sum(fit.count for fit in fits)
     return Finding(kind, images, values={"inliers": inliers, "count": count, "reason": reason})
 
@@ -66,7 +66,7 @@ def _mixed_lenses(evidence: Evidence) -> Iterator[Finding]:
         images1, images2 = ([k for k, other in enumerate(mixed.second) if other == which] for which in (False, True))
         lens1, lens2 = mixed.distortion
         values = {"images1": images1, "images2": images2, "lens1": lens1, "lens2": lens2}
-        yield Finding("lenses mixed", values=values)
+        yield Finding(Kind.LENSES_MIXED, values=values)
 
 
 def _errors(evidence: Evidence) -> Iterator[Finding]:
@@ -83,10 +83,10 @@ def _errors(evidence: Evidence) -> Iterator[Finding]:
         relief.found and explained and evidence.alike >= limit("clearly alike")
     )
     values = {"rms": rms, "threshold": threshold}
-    if rough or evidence.picture:
-        yield Finding("rough", (), "warning", values)
+    if rough or evidence.purpose.picture:
+        yield Finding(Kind.ROUGH, (), "warning", values)
     else:
-        yield Finding("errors", values=values)
+        yield Finding(Kind.ERRORS, values=values)
 
 
 def _depth(evidence: Evidence) -> Iterator[Finding]:
@@ -94,27 +94,27 @@ def _depth(evidence: Evidence) -> Iterator[Finding]:
     if evidence.alignment.relief.found:
         fit = max(evidence.used, key=lambda fit: fit.rms)
         what = evidence.alignment.relief.explanation
-        kind = "depth of a turn" if evidence.alignment.on_sphere else "relief"
+        kind = Kind.DEPTH_OF_A_TURN if evidence.alignment.on_sphere else Kind.RELIEF
         yield Finding(kind, (fit.image1, fit.image2), "warning", {"what": what, "rms": fit.rms})
 
 
 def _shape(evidence: Evidence) -> Iterator[Finding]:
     """A shape of the whole that the overlaps do not hold, and the image that may be off the most."""
     alignment, shape = evidence.alignment, evidence.alignment.shape
-    if shape is None or evidence.lens_only:
+    if shape is None or evidence.purpose.lens_only:
         return
     if alignment.focal is None:
         # Chains of free homographies bend with whatever is not modelled, a curved wall for one.
         yield Finding(
-            "shape unknown",
+            Kind.SHAPE_UNKNOWN,
             (shape.image,),
             "warning" if shape.doubtful else "detail",
             {"size": _size_of_shape(evidence)},
         )
     elif shape.doubtful:
-        remedy = "more rows of images" if alignment.distortion_std == 0.0 else "the lens, or more rows of images"
+        remedy = "more rows of images" if alignment.lens_given else "the lens, or more rows of images"
         values = {"size": _size_of_shape(evidence), "cause": shape.cause, "remedy": remedy}
-        yield Finding("shape bent" if shape.shown else "shape free", (shape.image,), "warning", values)
+        yield Finding(Kind.SHAPE_BENT if shape.shown else Kind.SHAPE_FREE, (shape.image,), "warning", values)
 
 
 def _size_of_shape(evidence: Evidence) -> float:
@@ -127,10 +127,10 @@ def _unlike(evidence: Evidence) -> Iterator[Finding]:
     as depth shifts what it shows by a little nearly everywhere.
     """
     for link in evidence.checked:
-        coarsely = evidence.picture and link.agreement.coarsely >= limit("filled by a plane")
+        coarsely = evidence.purpose.picture and link.agreement.coarsely >= limit("filled by a plane")
         if link.agreement.cells >= limit("cells") and link.agreement.share < limit("unlike") and not coarsely:
             values = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
-            yield Finding("unlike", link.pair, "failure", values)
+            yield Finding(Kind.UNLIKE, link.pair, "failure", values)
 
 
 def _looked_at(evidence: Evidence) -> Iterator[Finding]:
@@ -139,31 +139,31 @@ def _looked_at(evidence: Evidence) -> Iterator[Finding]:
     if share < 1.0:
         sampled = sum(link.sampled for link in checked)
         values = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": share}
-        yield Finding("looked at", (), "detail", values)
+        yield Finding(Kind.LOOKED_AT, (), "detail", values)
 
 
 def _ambiguous(evidence: Evidence) -> Iterator[Finding]:
     for pair, link in evidence.ambiguous.items():
-        yield Finding("ambiguous", pair, values={"shift": link.ambiguity.shift})
+        yield Finding(Kind.AMBIGUOUS, pair, values={"shift": link.ambiguity.shift})
 
 
 def _pattern(evidence: Evidence) -> Iterator[Finding]:
     """A pattern over so many pairs that leaving some of them out proves nothing; or one in which the unique decided."""
     if len(evidence.ambiguous) > limit("pattern") * len(evidence.checked):
-        yield Finding("pattern", values={"count": len(evidence.ambiguous), "of": len(evidence.checked)})
+        yield Finding(Kind.PATTERN, values={"count": len(evidence.ambiguous), "of": len(evidence.checked)})
     settled = [link for link in evidence.checked if link.unique]
     if settled:
-        yield Finding("settled pattern", min(settled, key=lambda link: link.agreement.share).pair, "warning")
+        yield Finding(Kind.SETTLED_PATTERN, min(settled, key=lambda link: link.agreement.share).pair, "warning")
 
 
 def _second_motion(evidence: Evidence) -> Iterator[Finding]:
     """What moves differently: a failure of all images where it may be the plane, as without the one that shows it best
     it would only be harder to see. Of a turn it is parallax, or what moved before the camera.
     """
-    if evidence.picture:
+    if evidence.purpose.picture:
         return
     motions = evidence.motions
-    if evidence.lens_only:  # the same a period of the pattern further on; what is static has a message of its own
+    if evidence.purpose.lens_only:  # a motion by a period of the pattern is none; what is static has a message
         motions = [] if evidence.static else [motion for motion in motions if motion.images not in evidence.ambiguous]
     share = share_of(motions)
     if share < limit("second motion"):
@@ -172,19 +172,19 @@ def _second_motion(evidence: Evidence) -> Iterator[Finding]:
     off = min(worst.disagreement, 2.0 * evidence.alignment.cameras[worst.images[0]].scale)
     values = {"share": share, "place": worst.center, "shown": worst.images, "off": off}
     if evidence.alignment.on_sphere:
-        yield Finding("parallax", worst.images, "warning", {"size": off, "share": share})
-    elif evidence.lens_only or (worst.is_far and evidence.clear):
-        yield Finding("second motion", worst.images, "warning", values)
+        yield Finding(Kind.PARALLAX, worst.images, "warning", {"size": off, "share": share})
+    elif evidence.purpose.lens_only or (worst.is_far and evidence.clear):
+        yield Finding(Kind.SECOND_MOTION, worst.images, "warning", values)
     elif worst.is_far:  # nearer, it is depth
         images = tuple(sorted({k for motion in motions for k in motion.images}))
-        yield Finding("undecided motion", images, "failure", values)
+        yield Finding(Kind.UNDECIDED_MOTION, images, "failure", values)
 
 
 def _two_left(evidence: Evidence) -> Iterator[Finding]:
     """Two images without a third, taken for one of another lens, which is all that tells a curved wall from a plane."""
     used = evidence.alignment.used
     if evidence.registration.mixed is not None and used.sum() == 2:
-        yield Finding("two of one lens", tuple(used.nonzero()[0].tolist()), "warning")
+        yield Finding(Kind.TWO_OF_ONE_LENS, tuple(used.nonzero()[0].tolist()), "warning")
 
 
 def _inputs(evidence: Evidence) -> Iterator[Finding]:
@@ -197,13 +197,13 @@ def _inputs(evidence: Evidence) -> Iterator[Finding]:
             bodies.setdefault(" ".join(filter(None, (m.make, m.model, m.serial))), []).append(k)
     focal = {k: _focal_share(source) for k, source in enumerate(sources) if source.metadata.focal_px is not None}
     if len(bodies) > 1:
-        yield Finding("several cameras", (), "warning", {"bodies": bodies})
+        yield Finding(Kind.SEVERAL_CAMERAS, (), "warning", {"bodies": bodies})
     elif focal and max(focal.values()) > limit("zoom") * min(focal.values()):
         near, far = min(focal, key=lambda k: focal[k]), max(focal, key=lambda k: focal[k])
-        yield Finding("zoomed", (), "warning", {"ratio": focal[far] / focal[near], "near": near, "far": far})
+        yield Finding(Kind.ZOOMED, (), "warning", {"ratio": focal[far] / focal[near], "near": near, "far": far})
     without = [k for k, source in enumerate(sources) if source.mask is None]
     if 0 < len(without) < len(sources):
-        yield Finding("unmasked", (), "warning", {"without": without})
+        yield Finding(Kind.UNMASKED, (), "warning", {"without": without})
 
 
 def _focal_share(source: Source) -> float:
@@ -231,13 +231,14 @@ OF_THE_WHOLE: tuple[Find, ...] = (
 """Everything else."""
 
 OF_PLACES = {
-    "shape unknown", "shape bent", "shape free", "pattern", "settled pattern", "ambiguous", "outvoted"
+    Kind.SHAPE_UNKNOWN, Kind.SHAPE_BENT, Kind.SHAPE_FREE, Kind.PATTERN, Kind.SETTLED_PATTERN, Kind.AMBIGUOUS,
+    Kind.OUTVOTED, Kind.OUTVOTED_PATTERN,
 }  # fmt: skip
 """Kinds that make the places of images doubtful and leave the lens as it is: a board shifted by a square is as straight
 as before."""
 
 
-SEEN_AT_SEAMS = {"rough", "relief", "depth of a turn"}
+SEEN_AT_SEAMS = {Kind.ROUGH, Kind.RELIEF, Kind.DEPTH_OF_A_TURN}
 """Kinds that the seams of a picture show, or do not."""
 
 
@@ -258,9 +259,9 @@ class Aloud(NamedTuple):
 
 
 ALOUD = {
-    **dict.fromkeys(("shape unknown", "shape bent", "shape free"), Aloud("flatness", _bent)),
-    **dict.fromkeys(("rough", "relief"), Aloud("flatness", lambda evidence: evidence.flat or _seen(evidence))),
-    **dict.fromkeys(("parallax", "depth of a turn"), Aloud("flatness", _seen)),
-    "second motion": Aloud("second motion"),
+    **dict.fromkeys((Kind.SHAPE_UNKNOWN, Kind.SHAPE_BENT, Kind.SHAPE_FREE), Aloud("flatness", _bent)),
+    **dict.fromkeys((Kind.ROUGH, Kind.RELIEF), Aloud("flatness", lambda evidence: evidence.flat or _seen(evidence))),
+    **dict.fromkeys((Kind.PARALLAX, Kind.DEPTH_OF_A_TURN), Aloud("flatness", _seen)),
+    Kind.SECOND_MOTION: Aloud("second motion"),
 }
 """The gravest first; other kinds are always said, and before these."""

@@ -11,7 +11,7 @@ from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import Evidence
-from rdstitch.verification.findings import Finding
+from rdstitch.verification.findings import Finding, Kind
 
 
 class RefusedError(RegistrationError):
@@ -44,7 +44,7 @@ def judge(evidence: Evidence) -> tuple[Finding, ...]:
     tuple of Finding
         Failures, with the images that they concern where that is clear, and warnings; none for a good result.
     """
-    lens_only = evidence.lens_only
+    lens_only = evidence.purpose.lens_only
     count = len(evidence.registration.sources)
     of_matches = [finding for find in rules.OF_MATCHES for finding in find(evidence)]
     if evidence.static:
@@ -64,9 +64,12 @@ def judge(evidence: Evidence) -> tuple[Finding, ...]:
     return _aloud([f for f in every if not (lens_only and f.kind in rules.OF_PLACES)], evidence)
 
 
+_OF_MATCHES = (Kind.MATCHES_DISAGREE, Kind.IMAGE_MISFITS, Kind.PAIR_MISFITS)
+
+
 def _is_depth(finding: Finding, evidence: Evidence) -> bool:
     """Whether matches of a picture disagree where its images look alike: the scene has depth, or something moved."""
-    return evidence.picture and "inliers" in finding.values and evidence.looks_right(finding.images)
+    return evidence.purpose.picture and finding.kind in _OF_MATCHES and evidence.looks_right(finding.images)
 
 
 def decisive_pairs(suspicious: Collection[Pair], used: Sequence[LinkFit], count: int) -> list[Pair]:
@@ -79,12 +82,13 @@ def decisive_pairs(suspicious: Collection[Pair], used: Sequence[LinkFit], count:
 
 def _outvoted(suspicions: Iterable[Finding]) -> list[Finding]:
     """Suspicious pairs on which nothing depends: those that fit badly, and those that fit twice, together each."""
-    kinds: dict[str, list[tuple[int, ...]]] = {}
+    kinds: dict[Kind, list[tuple[int, ...]]] = {Kind.OUTVOTED: [], Kind.OUTVOTED_PATTERN: []}
     for finding in suspicions:
-        kinds.setdefault("ambiguous" if finding.kind == "ambiguous" else "outvoted", []).append(finding.images)
+        kinds[Kind.OUTVOTED_PATTERN if finding.kind is Kind.AMBIGUOUS else Kind.OUTVOTED].append(finding.images)
     return [
         Finding(kind, tuple(sorted({k for pair in pairs for k in pair})), "detail", {"pairs": pairs})
-        for kind, pairs in sorted(kinds.items(), reverse=True)
+        for kind, pairs in kinds.items()
+        if pairs
     ]
 
 
@@ -93,9 +97,9 @@ def _aloud(findings: Sequence[Finding], evidence: Evidence) -> tuple[Finding, ..
     rank = {kind: number for number, kind in enumerate(rules.ALOUD)}
     topics, aloud = set[str](), set[int]()
     for k in sorted(range(len(findings)), key=lambda k: rank.get(findings[k].kind, -1)):
-        rule = rules.ALOUD.get(findings[k].kind, rules.Aloud(findings[k].kind))
+        rule = rules.ALOUD.get(findings[k].kind, rules.Aloud(findings[k].kind.name))
         speaks = findings[k].severity == "warning" and rule.topic not in topics and rule.speaks(evidence)
-        speaks = speaks and not (evidence.picture and findings[k].kind in rules.SEEN_AT_SEAMS)
+        speaks = speaks and not (evidence.purpose.picture and findings[k].kind in rules.SEEN_AT_SEAMS)
         if speaks and len(aloud) < rules.MAX_WARNINGS:
             aloud.add(k)
             topics.add(rule.topic)

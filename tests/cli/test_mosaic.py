@@ -17,7 +17,7 @@ from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline import accept
 from rdstitch.results.messages import Message
 from rdstitch.synthetic import Sequence
-from rdstitch.verification.findings import Finding
+from rdstitch.verification.findings import Finding, Kind
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, flight, start, transfers
 from tests.sampled import sampled
 
@@ -47,19 +47,6 @@ def test_every_way_to_name_images(frames: list[Path], tmp_path: Path, how: str) 
     assert finished(process, data).status == 0
     record = json.loads((tmp_path / "mosaic.jpg.json").read_text(encoding="utf-8"))
     assert [image["name"] for image in record["images"]] == [path.name for path in frames]
-
-
-def test_an_unreadable_image_is_left_out_by_name(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    folder = tmp_path / "folder"
-    shutil.copytree(frames[0].parent, folder)
-    broken = folder / "broken.png"
-    broken.write_bytes(frames[0].read_bytes()[:2000])
-    rdstitch("mosaic", folder, "-o", tmp_path / "mosaic.jpg", *CACHED, told=str(broken))
-    record = json.loads((tmp_path / "mosaic.jpg.json").read_text(encoding="utf-8"))
-    assert {image["name"]: image["used"] for image in record["images"]} == {
-        "broken.png": False,
-        **{path.name: True for path in frames},
-    }
 
 
 def test_its_own_output_is_no_input(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
@@ -178,7 +165,7 @@ OUTPUTS = {"pano": "out.png", "mosaic": "out.png", "calibrate": "camera.json", "
 
 
 def _pretend(monkeypatch: pytest.MonkeyPatch, *found: Message) -> None:
-    findings = tuple(Finding("pretended", severity=message.severity) for message in found)
+    findings = tuple(Finding(Kind.ERRORS, severity=message.severity) for message in found)
     monkeypatch.setattr(accept, "judge", lambda *arguments, **options: findings)
     monkeypatch.setattr(accept, "messages_of", lambda *arguments: list(found))
 

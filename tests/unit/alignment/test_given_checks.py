@@ -9,7 +9,8 @@ from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.motion_models import PSI, THETA
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
-from tests.alignment_scenes import Scene, grid, jittered, scene
+from rdstitch.inputs.sensor_streams import DELAYS
+from tests.alignment_scenes import Scene, aligned, grid, jittered, scene
 
 _ONE = math.radians(1.0)
 
@@ -24,7 +25,7 @@ def windy() -> tuple[Scene, FloatArray]:
 
 
 def _aligned(given: Scene, attitudes: FloatArray | None, std: float) -> Alignment:
-    return align(given.cameras, given.links, AlignmentOptions(lens="division", attitudes=attitudes, attitudes_std=std))
+    return aligned(given, lens="division", attitudes=attitudes, attitudes_std=std)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +84,7 @@ def test_attitudes_that_say_less_than_their_scatter_are_no_contradiction() -> No
 def test_a_tilt_of_the_wrong_sign_is_not_used(tilt: tuple[float, float], right: bool) -> None:
     rng = np.random.default_rng(5)
     given = scene(grid(4, 3, (0.5, 0.4), 0.3, rng), tilt=(0.05, -0.03), rng=rng, per_link=80)
-    found = align(given.cameras, given.links, AlignmentOptions(lens="division", tilt=tilt))
+    found = aligned(given, lens="division", tilt=tilt)
     assert (found.messages == ()) == right
     assert found.tilt == pytest.approx((0.05, -0.03), abs=0.002)
     assert right or "they show 2.8" in found.messages[0].text
@@ -116,3 +117,27 @@ def test_attitudes_are_not_dropped_for_what_a_wrong_focal_length_makes_of_them()
     found = align(told, given.links, options)
     assert [message.code for message in found.messages] == ["focal-contradicted"]
     assert abs(math.log(found.cameras[0].focal / true)) < 4.0 * found.length_std
+
+
+@pytest.mark.parametrize("late", [0.04, 0.0])
+def test_attitudes_that_are_late_are_taken_for_when_they_were(late: float) -> None:
+    rng = np.random.default_rng(2)
+
+    def tilts(times: FloatArray) -> FloatArray:
+        return 0.03 * np.stack([np.sin(4.1 * times), np.cos(3.3 * times)], axis=-1)
+
+    poses, times = grid(4, 3, (0.4, 0.3), 0.25, rng), np.linspace(0.0, 3.3, 12)
+    poses[:, [PSI, THETA]] = tilts(times)
+    given = scene(poses, focal_source="exif", rng=rng, per_link=80)
+    measured = tilts(times[:, None] + DELAYS - late) + rng.normal(scale=math.radians(0.02), size=(12, len(DELAYS), 2))
+    options = AlignmentOptions(
+        lens="division",
+        attitudes=measured[:, len(DELAYS) // 2],
+        delayed_attitudes=measured,
+        attitudes_std=math.radians(0.05),
+    )
+    found = align(given.cameras, given.links, options)
+    assert [message.code for message in found.messages] == (["attitudes-late"] if late else [])
+    if late:
+        assert "40 ±" in found.messages[0].text or "39 ±" in found.messages[0].text or "41 ±" in found.messages[0].text
+    assert found.rms < 1.02 * _aligned(given, tilts(times), math.radians(0.05)).rms

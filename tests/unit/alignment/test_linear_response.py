@@ -10,9 +10,10 @@ from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors, whitened_errors
 from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Prior, Priors
+from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.radial_homography import inverses, project
+from rdstitch.robust.posterior import Prior
 from tests.alignment_scenes import grid, scene
 
 LENS = np.array([True, True, False, False, False])

@@ -5,15 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment import AlignmentOptions
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.align import from_another_start
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
 from rdstitch.alignment.select import ModelChoice, best_of
+from rdstitch.choices import Purpose
 from rdstitch.geometry.radial_homography import measurement_whitening
-from tests.alignment_scenes import Scene, grid, scene
+from tests.alignment_scenes import Scene, aligned, grid, scene
 
 
 def _scene(relief: float, seed: int = 0) -> Scene:
@@ -40,7 +41,7 @@ def test_hills_hardly_move_the_lens(relief: float) -> None:
     errors, misses = [], []
     for seed in range(6):
         given = _scene(relief, seed)
-        found = align(given.cameras, given.links, AlignmentOptions(model="similarity"))
+        found = aligned(given, model="similarity")
         errors.append(found.distortion - given.distortion)
         misses.append(abs(errors[-1]) / found.distortion_std)
         assert found.relief.found
@@ -50,9 +51,9 @@ def test_hills_hardly_move_the_lens(relief: float) -> None:
 
 def test_over_a_plane_nothing_changes() -> None:
     problem, fit = _fitted(_scene(0.0))
-    choice = ModelChoice(fit, "", 1.0)
+    choice = ModelChoice(fit, "")
     assert weighted_by_relief(problem, fit) is problem
-    assert choose_over_relief(problem, choice, ["similarity", "tilting"], layout_matters=True) is choice
+    assert choose_over_relief(problem, choice, ["similarity", "tilting"], Purpose.MOSAIC) is choice
 
 
 def test_of_two_images_tilts_do_what_heights_do() -> None:
@@ -65,7 +66,7 @@ def test_of_two_images_tilts_do_what_heights_do() -> None:
 def test_heights_are_found_as_they_scatter() -> None:
     """Of ``sin sin`` hills they scatter by half of the amplitude, which moves points by that share of the parallax."""
     problem, fit = _fitted(_scene(0.08))
-    choice = choose_over_relief(problem, ModelChoice(fit, "", 1.0), ["similarity"], layout_matters=True)
+    choice = choose_over_relief(problem, ModelChoice(fit, ""), ["similarity"], Purpose.MOSAIC)
     weighted = weighted_by_relief(problem, choice.fit)
     relief = weighted.observations.relief
     noise = choice.fit.adjusted.sigma
@@ -99,12 +100,12 @@ def test_nothing_is_the_best_of_layouts_that_nobody_would_keep() -> None:
     problem, fit = _fitted(_scene(0.0))
     steep = replace(fit.adjusted.parameters, shared=SIMILARITY.shared_from_physical(np.array([1.2, 0.0, 0.3])))
     leaning = replace(fit, adjusted=replace(fit.adjusted, parameters=steep))
-    for fits, layout_matters, found in (
-        ([leaning], True, False),
-        ([leaning], False, True),
-        ([leaning, fit], True, True),
+    for fits, purpose, found in (
+        ([leaning], Purpose.MOSAIC, False),
+        ([leaning], Purpose.TRAJECTORY, True),
+        ([leaning, fit], Purpose.MOSAIC, True),
     ):
-        best = best_of(problem, fits, requested=False, layout_matters=layout_matters)
+        best = best_of(problem, fits, purpose, requested=False)
         assert (best is not None) is found
     assert best is not None
     assert best.fit is fit
@@ -112,7 +113,7 @@ def test_nothing_is_the_best_of_layouts_that_nobody_would_keep() -> None:
 
 def test_the_error_of_the_reason_is_that_of_the_fit() -> None:
     _, fit = _fitted(_scene(0.0))
-    choice = ModelChoice(fit, "; as requested", 1.0)
+    choice = ModelChoice(fit, "; as requested")
     later = replace(choice, fit=replace(fit, adjusted=replace(fit.adjusted, sigma=7.25)))
     assert "7.25 pixels; as requested" in later.reason
 

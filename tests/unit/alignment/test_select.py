@@ -11,14 +11,15 @@ import pytest
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Problem
-from rdstitch.alignment.motion_models import PSI, RIGID, ROTATION, SIMILARITY, MotionModel
+from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, RIGID, ROTATION, MotionModel
 from rdstitch.alignment.select import Hypothesis, ModelChoice, Posterior, _best, select_model
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import Purpose
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
 from rdstitch.synthetic.panorama import camera_rotations
-from tests.alignment_scenes import grid, scene
+from tests.alignment_scenes import aligned, grid, scene
 
 SIZE, FOCAL = (640, 480), 520.0
 
@@ -99,7 +100,7 @@ def test_a_camera_that_moves_over_a_plane_does_not_turn(tilt: float) -> None:
     rng = np.random.default_rng(4)
     poses = grid(3, 2, (0.4, 0.35), 0.3, rng)
     given = scene(poses, rng=rng, tilt=(tilt, 0.0), focal_source="guess", per_link=120)
-    found = align(given.cameras, given.links)
+    found = aligned(given)
     assert found.model == "rigid"
     assert found.tilt[0] == pytest.approx(tilt, abs=0.03)
     assert found.distortion == pytest.approx(-0.25, abs=0.01)
@@ -110,7 +111,7 @@ def test_tilts_of_their_own_are_found() -> None:
     poses = grid(3, 3, (0.4, 0.35), 0.3, rng)
     poses[:, PSI] = np.radians([0, 4, -5, 6, -3, 2, -6, 5, 1])
     given = scene(poses, rng=rng, focal_source="guess", per_link=120)
-    assert align(given.cameras, given.links).model == "tilting"
+    assert aligned(given).model == "tilting"
 
 
 def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
@@ -120,36 +121,32 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
     found = align(*given)
     assert found.distortion == 0.0
     assert [message.severity for message in found.messages if "depth" in message.text] == ["detail"]
-    lens = align(*given, AlignmentOptions(purpose="calibrate"))
+    lens = align(*given, AlignmentOptions(purpose=Purpose.CALIBRATE))
     assert [message.severity for message in lens.messages if "depth" in message.text] == ["failure"]
 
 
 @pytest.mark.parametrize(
-    ("stretch", "turn", "similarity", "chosen"),
+    ("stretch", "turn", "chosen"),
     [
-        (20.0, 1.1, 1.1, "rotation"),
-        (20.0, 1.5, 1.1, "rigid"),
-        (110.0, 1.5, 1.1, "similarity"),
-        (math.inf, 1.5, 1.5, "rigid"),
+        (20.0, 1.1, "rotation"),  # what seams hide
+        (20.0, 1.5, "homography"),
+        (math.inf, 1.5, "homography"),
+        (7.0, 1.1, "homography"),
     ],
 )
-def test_instead_of_an_absurd_plane_others_may_leave_what_seams_hide_and_the_noise(
-    stretch: float, turn: float, similarity: float, chosen: str
+def test_instead_of_an_implausible_plane_a_turn_may_leave_what_seams_hide_and_the_noise(
+    stretch: float, turn: float, chosen: str
 ) -> None:
-    problem: Any = SimpleNamespace(count=2)
+    problem: Any = SimpleNamespace(count=3)
     posterior = Posterior(problem)
     # A quarter of 4 px, and the noise: 1.17 px.
-    vars(posterior)["evidence"] = SimpleNamespace(farthest=4.0, noise=0.6)
+    vars(posterior)["evidence"] = SimpleNamespace(farthest=np.array([4.0]), noise=np.array([0.6]))
 
-    def hypothesis(model: MotionModel, score: float, field: float, ratio: float) -> Hypothesis:
+    def hypothesis(model: MotionModel, score: float, field: float) -> Hypothesis:
         fit: Any = SimpleNamespace(model=model)
-        return Hypothesis(fit, score, field, ratio)
+        return Hypothesis(fit, score, field, stretch if model is RIGID else 1.0)
 
-    tried = [
-        hypothesis(ROTATION, 60.0, turn, 1.0),
-        hypothesis(RIGID, 0.0, 0.5, stretch),
-        hypothesis(SIMILARITY, 30.0, similarity, 2.0),
-    ]
+    tried = [hypothesis(ROTATION, 60.0, turn), hypothesis(RIGID, 0.0, 0.9), hypothesis(HOMOGRAPHY, -30.0, 0.2)]
     assert _best(posterior, tried).fit.model.name == chosen
 
 
@@ -163,9 +160,9 @@ def test_the_command_decides_between_what_is_as_good(monkeypatch: pytest.MonkeyP
     """`pano` is for turns, `mosaic` for planes: odds that evidence overrules."""
     scores = []
 
-    def spy(problem: Problem, names: list[str], *rest: object, **options: bool) -> ModelChoice:
+    def spy(problem: Problem, names: list[str], *rest: object) -> ModelChoice:
         choice = select_model(problem, ["rotation"])
-        scores.append([Posterior(problem, prefer_turn).of(choice.fit).score for prefer_turn in (True, False)])
+        scores.append([Posterior(problem, purpose).of(choice.fit).score for purpose in (Purpose.PANO, Purpose.MOSAIC)])
         return choice
 
     monkeypatch.setattr(import_module("rdstitch.alignment.align"), "select_model", spy)

@@ -8,6 +8,7 @@ import pytest
 
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import Purpose
 from rdstitch.executors import open_executor
 from rdstitch.features import Correspondences, FeatureOptions
 from rdstitch.geometry.camera import Camera
@@ -81,7 +82,7 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
     sources = _read(frames)
     with open_executor(1, len(sources)) as executor:
         found = register(sources, OPTIONS, executor)
-        accepted = accept(found, OPTIONS, "trajectory")
+        accepted = accept(found, OPTIONS, Purpose.TRAJECTORY)
     picture = mosaic(frames, None, replace(OPTIONS, focal=380.0)).registration
     steps = [np.diff(k.alignment.homographies[:, 0, 2]) for k in (found, accepted, picture)]
     assert np.all(np.abs(steps[0]) < 0.2)  # heights above the ground: what drives ahead moves by a sixth

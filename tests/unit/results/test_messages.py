@@ -13,7 +13,7 @@ from rdstitch.choices import LensName, ModelName, ProjectionName
 from rdstitch.compositing.projection import PROJECTIONS
 from rdstitch.errors import ArgumentError
 from rdstitch.results.messages import Message, left_out, told_once
-from rdstitch.verification.findings import TEXTS
+from rdstitch.verification.findings import Kind
 from rdstitch.verification.verdict import RefusedError
 
 
@@ -46,7 +46,7 @@ def test_every_code_has_a_paragraph_and_every_paragraph_a_code() -> None:
     of_errors = {kind.code for kind in vars(errors).values() if isinstance(kind, type) and hasattr(kind, "code")}
     sources = [path.read_text(encoding="utf-8") for path in (_ROOT / "rdstitch").rglob("*.py")]
     of_messages = {code for text in sources for code in re.findall(r'code ?= ?"([a-z-]+)"', text)}
-    of_messages |= {code for code, _ in TEXTS.values()}
+    of_messages |= {kind.code for kind in Kind}
     assert {RefusedError.code, "relief", "lambda-not-observable"} <= of_messages
     assert sorted(headings) == sorted((of_errors | of_messages) - {""})
     assert sorted(troubleshooting()) == sorted(headings)

@@ -7,6 +7,7 @@ from rdstitch.choices import SOLVERS, SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
+from rdstitch.synthetic import panorama_rotations
 from tests.correspondences import correspondences
 
 MATCHES = correspondences(150, seed=4, outliers=0.3)
@@ -121,3 +122,26 @@ def test_a_given_wide_lens_is_kept_while_the_motion_is_refined() -> None:
     found = estimate_radial_homography(given, points2, (640, 480), distortion=-0.985)
     assert found.ok
     assert np.median(np.linalg.norm(found.transfer(points1) - lens.distort(shift), axis=1)) < 0.05
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_two_points_find_turns_that_a_thirteenth_of_the_matches_shows(known: bool) -> None:
+    """Without the solvers for turns a quarter of them; whatever the focal length is guessed as."""
+    found = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        camera = Camera((1000, 800), -0.1, focal=float(rng.uniform(600.0, 1200.0)), focal_source="option")
+        rotation = panorama_rotations(2, 0.25, jitter=0.03, seed=seed)
+        relative = rotation[1] @ rotation[0].T
+        first = rng.uniform((0.0, 0.0), (999.0, 799.0), (400, 2))
+        rays = np.column_stack([(camera.undistort(first) - camera.center) / camera.focal, np.ones(400)]) @ relative.T
+        second = camera.distort(rays[:, :2] / rays[:, 2:] * camera.focal + camera.center)
+        inside = np.flatnonzero(((second >= 0.0) & (second <= [999.0, 799.0])).all(axis=1))[:200]
+        first, second = first[inside], second[inside] + rng.normal(0.0, 0.7, (len(inside), 2))
+        right = len(inside) // 13
+        second[right:] = rng.uniform((0.0, 0.0), (999.0, 799.0), (len(inside) - right, 2))
+        order = rng.permutation(len(inside))
+        lens = -0.1 if known else None
+        result = estimate_radial_homography(first[order], second[order], (1000, 800), distortion=lens)
+        found += bool(result.inliers[order < right].mean() > 0.6)
+    assert found >= 5

@@ -16,7 +16,7 @@ from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.results.messages import Message
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import Evidence
-from rdstitch.verification.findings import TEXTS, Finding, messages_of
+from rdstitch.verification.findings import Finding, Kind, messages_of
 from rdstitch.verification.limits import LIMITS
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
@@ -29,14 +29,14 @@ SHAPE = replace(registration().alignment.shape, doubtful=True, shift=6.0, shift_
 SHAPED = evidence(registration(shape=SHAPE), alike=0.8)
 
 
-def _said(*kinds: str, found: Evidence = SHAPED) -> list[str]:
+def _said(*kinds: Kind, found: Evidence = SHAPED) -> list[Kind]:
     findings = [Finding(kind, (0,), "warning") for kind in kinds]
     return [finding.kind for finding in _aloud(findings, found) if finding.severity == "warning"]
 
 
 def test_what_is_not_said_is_a_detail() -> None:
-    (note,) = _aloud([Finding("parallax", (0, 1), "warning", {"size": 3.0})], SHAPED)
-    assert note == Finding("parallax", (0, 1), "detail", {"size": 3.0})
+    (note,) = _aloud([Finding(Kind.PARALLAX, (0, 1), "warning", {"size": 3.0})], SHAPED)
+    assert note == Finding(Kind.PARALLAX, (0, 1), "detail", {"size": 3.0})
 
 
 TURNED = evidence(registration(model="rotation"), alike=0.8)
@@ -47,34 +47,37 @@ SMALL = evidence(registration(shape=replace(SHAPE, shift=1e4)), alike=0.8)
 @pytest.mark.parametrize(
     ("found", "kinds", "said"),
     [
-        (TURNED, ["relief"], []),  # of a turn and of pairs only what is seen
-        (TURNED, ["parallax"], []),
-        (UNLIKE, ["relief"], ["relief"]),
-        (UNLIKE, ["parallax"], ["parallax"]),
-        (SHAPED, ["relief"], ["relief"]),
-        (SHAPED, ["relief", "shape bent"], ["shape bent"]),  # one line says that the plane may be none
-        (SMALL, ["shape bent"], []),  # by more than an image
-        (evidence(TURNED.registration, "mosaic", alike=0.1), ["relief", "rough"], []),  # its seams are looked at
-        (SHAPED, ["second motion"], ["second motion"]),
+        (TURNED, [Kind.RELIEF], []),  # of a turn and of pairs only what is seen
+        (TURNED, [Kind.PARALLAX], []),
+        (UNLIKE, [Kind.RELIEF], [Kind.RELIEF]),
+        (UNLIKE, [Kind.PARALLAX], [Kind.PARALLAX]),
+        (SHAPED, [Kind.RELIEF], [Kind.RELIEF]),
+        (SHAPED, [Kind.RELIEF, Kind.SHAPE_BENT], [Kind.SHAPE_BENT]),  # one line says that the plane may be none
+        (SMALL, [Kind.SHAPE_BENT], []),  # by more than an image
+        (
+            evidence(TURNED.registration, Purpose.MOSAIC, alike=0.1),
+            [Kind.RELIEF, Kind.ROUGH],
+            [],
+        ),
+        (SHAPED, [Kind.SECOND_MOTION], [Kind.SECOND_MOTION]),
     ],
 )
-def test_what_is_said_aloud(found: Evidence, kinds: list[str], said: list[str]) -> None:
+def test_what_is_said_aloud(found: Evidence, kinds: list[Kind], said: list[Kind]) -> None:
     assert _said(*kinds, found=found) == said
 
 
 def test_failures_stay() -> None:
-    given = (Finding("errors"), Finding("image misfits", (1,)))
+    given = (Finding(Kind.ERRORS), Finding(Kind.IMAGE_MISFITS, (1,)))
     assert _aloud(given, TURNED) == given
 
 
 def test_there_are_a_few_lines_of_a_run_the_gravest_first_and_one_of_a_kind() -> None:
-    others = ["unmasked", "zoomed", "two of one lens", "settled pattern"][: rules.MAX_WARNINGS]
-    assert _said("second motion", *others) == others
+    others = [Kind.UNMASKED, Kind.ZOOMED, Kind.TWO_OF_ONE_LENS, Kind.SETTLED_PATTERN][: rules.MAX_WARNINGS]
+    assert _said(Kind.SECOND_MOTION, *others) == others
     assert _said(others[0], others[0]) == others[:1]
 
 
 def test_every_kind_has_a_sentence_and_every_threshold_its_unit_andsource() -> None:
-    assert set(rules.ALOUD) | rules.OF_PLACES <= {*TEXTS, "outvoted"}
     assert all(limit.unit and limit.source for limit in LIMITS.values())
 
 
@@ -82,7 +85,7 @@ MOTION = SecondMotion((0, 1), 46, 54, (30.0, 40.0), 120.0)
 
 
 def _of_motions(
-    motion: SecondMotion, purpose: Purpose = "trajectory", *, clear: bool = True, model: str = "rigid"
+    motion: SecondMotion, purpose: Purpose = Purpose.TRAJECTORY, *, clear: bool = True, model: str = "rigid"
 ) -> list[tuple[str, str]]:
     """Severity and words of what is said of a second motion."""
     given = registration(cameras=(CAMERA,) * 3, model=model)
@@ -102,7 +105,7 @@ def test_of_a_turn_a_second_motion_is_parallax() -> None:
 def test_of_a_motion_with_an_area_the_pixels_decide(area: int, clear: bool, severity: str | None) -> None:
     said = _of_motions(replace(MOTION, area=area, plane_area=100 - area), clear=clear)
     assert [how for how, _ in said] == ([] if severity is None else [severity])
-    assert _of_motions(replace(MOTION, area=area, plane_area=100 - area), purpose="mosaic", clear=clear) == []
+    assert _of_motions(replace(MOTION, area=area, plane_area=100 - area), purpose=Purpose.MOSAIC, clear=clear) == []
 
 
 def test_the_place_is_named_and_no_distance_is_larger_than_an_image() -> None:
@@ -114,7 +117,7 @@ def test_the_place_is_named_and_no_distance_is_larger_than_an_image() -> None:
 
 
 def test_a_second_motion_does_not_spoil_the_lens() -> None:
-    ((how, _),) = _of_motions(MOTION, "calibrate", clear=False)
+    ((how, _),) = _of_motions(MOTION, Purpose.CALIBRATE, clear=False)
     assert how == "warning"
 
 
@@ -195,19 +198,19 @@ def test_what_moves_by_no_more_than_tree_tops_rivals_no_plane() -> None:
     near, far = (SecondMotion((0, 1), 46, 54, (30.0, 40.0), off, relation) for off in (20.0, 30.0))
     assert [how for how, _ in _of_motions(far, clear=False)] == ["failure"]
     assert _of_motions(near, clear=False) == []
-    assert [how for how, _ in _of_motions(near, "calibrate", clear=False)] == ["warning"]  # depth looks like a lens
+    assert [how for how, _ in _of_motions(near, Purpose.CALIBRATE, clear=False)] == ["warning"]
 
 
 @pytest.mark.parametrize(("doubtful", "severity"), [(True, "warning"), (False, "detail")])
 def test_free_homographies_are_doubted_where_their_errors_have_a_pattern(doubtful: bool, severity: str) -> None:
     found = evidence(registration(focal=None, shape=replace(SHAPE, image=1, doubtful=doubtful)))
-    assert [(own.kind, own.severity) for own in rules._shape(found)] == [("shape unknown", severity)]
+    assert [(own.kind, own.severity) for own in rules._shape(found)] == [(Kind.SHAPE_UNKNOWN, severity)]
 
 
 LARGEST = 0.02 * 500.0  # pixels that relief explains, of images with a diagonal of 500
 
 
-def _kinds(findings: Any) -> list[str]:
+def _kinds(findings: Any) -> list[Kind]:
     return [finding.kind for finding in findings]
 
 
@@ -216,27 +219,27 @@ def _kinds(findings: Any) -> list[str]:
     [
         (2.99, 0.0, None, None),
         (3.0, 0.0, None, None),  # the definition of an inlier, 3 pixels here
-        (3.01, 0.24, None, "errors"),
-        (3.01, 0.25, None, "rough"),
-        (9.0, 0.25, None, "rough"),  # three thresholds
-        (9.01, 0.9, None, "errors"),
-        (9.01, 0.5, 9.0, "rough"),  # what neighbours have in common left out, it is a plane
-        (9.01, 0.49, 9.0, "errors"),
-        (9.5, 0.9, 9.02, "rough"),  # 9.5² - 9.02² = 8.9
-        (9.5, 0.9, 9.01, "errors"),  # 9.07: more than 3²
-        (LARGEST, 0.9, 9.9, "rough"),
-        (LARGEST + 0.01, 0.9, 9.9, "errors"),
-        (np.nan, 0.9, None, "errors"),
+        (3.01, 0.24, None, Kind.ERRORS),
+        (3.01, 0.25, None, Kind.ROUGH),
+        (9.0, 0.25, None, Kind.ROUGH),  # three thresholds
+        (9.01, 0.9, None, Kind.ERRORS),
+        (9.01, 0.5, 9.0, Kind.ROUGH),  # what neighbours have in common left out, it is a plane
+        (9.01, 0.49, 9.0, Kind.ERRORS),
+        (9.5, 0.9, 9.02, Kind.ROUGH),  # 9.5² - 9.02² = 8.9
+        (9.5, 0.9, 9.01, Kind.ERRORS),  # 9.07: more than 3²
+        (LARGEST, 0.9, 9.9, Kind.ROUGH),
+        (LARGEST + 0.01, 0.9, 9.9, Kind.ERRORS),
+        (np.nan, 0.9, None, Kind.ERRORS),
     ],
 )
-def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kind: str | None) -> None:
+def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kind: Kind | None) -> None:
     ground = replace(registration().alignment.relief, found=relief is not None, size=relief or 0.0)
     cameras = (CAMERA, Camera((40, 30)), CAMERA)
     found = evidence(registration(rms=rms, relief=ground, cameras=cameras), alike=alike)
     findings = list(rules._errors(found))
     assert _kinds(findings) == ([] if kind is None else [kind])
     for finding in findings:
-        assert finding.severity == ("warning" if kind == "rough" else "failure")
+        assert finding.severity == ("warning" if kind == Kind.ROUGH else "failure")
         assert finding.values == pytest.approx({"rms": rms, "threshold": 3.0}, nan_ok=True)
 
 
@@ -248,7 +251,7 @@ def _checked(share: float, pair: tuple[int, int], *, unique: bool) -> CheckedLin
 def test_of_pairs_that_unique_places_decided_the_least_alike_is_named() -> None:
     seen = [_checked(share, (k, k + 1), unique=k < 2) for k, share in enumerate((0.5, 0.3, 0.1))]
     (finding,) = rules._pattern(evidence(registration(4), ambiguous={}, checked=seen))
-    assert (finding.kind, finding.images) == ("settled pattern", (1, 2))
+    assert (finding.kind, finding.images) == (Kind.SETTLED_PATTERN, (1, 2))
 
 
 @pytest.mark.parametrize("certain", [True, False])

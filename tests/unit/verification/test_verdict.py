@@ -22,7 +22,7 @@ from rdstitch.results.registration import Registration
 from rdstitch.synthetic import Photometry, camera_rotations, turning_sequence
 from rdstitch.verification import evidence, verdict
 from rdstitch.verification.evidence import Evidence
-from rdstitch.verification.findings import Finding, messages_of
+from rdstitch.verification.findings import Finding, Kind, messages_of
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.second_motion import SecondMotion
@@ -43,12 +43,12 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
         return register(sources, options, executor)
 
 
-def judge(registration: Registration, threshold: float, purpose: Purpose = "mosaic") -> tuple[Message, ...]:
+def judge(registration: Registration, threshold: float, purpose: Purpose = Purpose.MOSAIC) -> tuple[Message, ...]:
     """What is found, in words."""
     return tuple(messages_of(verdict.judge(Evidence(registration, threshold, purpose=purpose)), registration))
 
 
-def _texts(registration: Registration, purpose: Purpose = "mosaic") -> list[str]:
+def _texts(registration: Registration, purpose: Purpose = Purpose.MOSAIC) -> list[str]:
     return [m.clause for m in judge(registration, THRESHOLD, purpose) if m.severity == "failure"]
 
 
@@ -71,7 +71,7 @@ def test_images_that_do_not_look_alike_where_they_are_put_fail(good: Registratio
     found = _texts(_moved(good, 2, shift))
     assert any("do not look alike where they are put together" in text for text in found)
     # Of the lens it says nothing.
-    assert _texts(_moved(good, 2, shift), "calibrate") == []
+    assert _texts(_moved(good, 2, shift), Purpose.CALIBRATE) == []
 
 
 def test_a_wrong_pair_beside_enough_right_ones_is_a_warning(good: Registration) -> None:
@@ -87,7 +87,7 @@ def test_a_wrong_pair_beside_enough_right_ones_is_a_warning(good: Registration) 
 @pytest.mark.parametrize(("share", "fails"), [(0.45, True), (0.55, False)])
 def test_matches_of_which_less_than_half_agree_fail(good: Registration, share: float, fails: bool) -> None:
     links = tuple(replace(fit, count=1000, inliers=int(1000 * share)) for fit in good.alignment.links)
-    found = _texts(replace(good, alignment=replace(good.alignment, links=links)), "calibrate")
+    found = _texts(replace(good, alignment=replace(good.alignment, links=links)), Purpose.CALIBRATE)
     assert any("matches fit the places that were found" in text for text in found) is fails
     assert any("stitch them on their own" in text for text in found) is fails
 
@@ -97,7 +97,7 @@ def test_a_picture_whose_overlaps_look_alike_stands_whatever_its_matches_say(goo
     links = tuple(replace(fit, count=1000, inliers=300) for fit in good.alignment.links)
     deep = replace(good, alignment=replace(good.alignment, links=links, rms=5 * THRESHOLD))
     assert _texts(deep) == []
-    assert _texts(deep, "trajectory") != []
+    assert _texts(deep, Purpose.TRAJECTORY) != []
     assert _texts(_moved(deep, 2, 0.05)) != []
 
 
@@ -122,7 +122,7 @@ def test_relief_is_a_warning_that_names_the_pair_where_it_is_largest(good: Regis
     worst = links[position]
     names = [good.sources[k].name for k in (worst.image1, worst.image2)]
     relief = replace(good, alignment=rough)
-    (message,) = [m for m in judge(relief, 3.0, "trajectory") if "most of all between" in m.text]
+    (message,) = [m for m in judge(relief, 3.0, Purpose.TRAJECTORY) if "most of all between" in m.text]
     assert message.severity == "warning"
     assert all(m.severity == "detail" for m in judge(relief, 3.0))  # of a picture its seams say more
     assert f"between {names[0]} and {names[1]} (9.0 pixels)" in message.text
@@ -135,7 +135,7 @@ def _checked(cells: int, confirming: int, *, pair: tuple[int, int] = (0, 1), els
 
 def _checked_by(monkeypatch: pytest.MonkeyPatch, good: Registration, *checked: CheckedLink) -> list[Message]:
     monkeypatch.setattr(evidence, "check_overlaps", lambda *_: list(checked))
-    return list(judge(good, THRESHOLD, "trajectory"))
+    return list(judge(good, THRESHOLD, Purpose.TRAJECTORY))
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,10 @@ def test_depth_shifts_what_a_picture_shows_by_a_little(
     checked = _checked(100, 6)
     checked = replace(checked, agreement=replace(checked.agreement, coarsely=coarsely))
     monkeypatch.setattr(evidence, "check_overlaps", lambda *_: [checked])
-    assert [len(judge(good, THRESHOLD, purpose)) for purpose in ("mosaic", "trajectory")] == [picture, poses]
+    assert [len(judge(good, THRESHOLD, purpose)) for purpose in (Purpose.MOSAIC, Purpose.TRAJECTORY)] == [
+        picture,
+        poses,
+    ]
 
 
 @pytest.mark.parametrize(("clear", "severity"), [(True, "warning"), (False, "failure")])
@@ -194,7 +197,7 @@ def test_what_only_the_places_suffer_from_is_not_said_of_a_lens(
     monkeypatch.setattr(evidence, "find_second_motions", lambda *_: [SecondMotion(shown, 20, 80, (30.0, 40.0), 120.0)])
     checked = [_checked(100, 90, elsewhere=0.9), _checked(100, 5, pair=(1, 2))]
     monkeypatch.setattr(evidence, "check_overlaps", lambda *_: checked)
-    found = judge(replace(good, static_background=resting), THRESHOLD, "calibrate")
+    found = judge(replace(good, static_background=resting), THRESHOLD, Purpose.CALIBRATE)
     assert sum("moves differently" in message.text for message in found) == count
     assert not any("elsewhere" in message.text or "seam" in message.text for message in found)
 
@@ -211,10 +214,10 @@ def test_of_doubtful_pairs_on_which_nothing_depends_the_images_are_named() -> No
     def said(*findings: Finding) -> list[Message]:
         return messages_of(verdict._outvoted(findings), registration(4))
 
-    (message,) = said(Finding("unlike", (2, 3)), Finding("pair misfits", (0, 2)))
+    (message,) = said(Finding(Kind.UNLIKE, (2, 3)), Finding(Kind.PAIR_MISFITS, (0, 2)))
     assert message.images == ("folder/a.jpg", "folder/c.jpg", "folder/d.jpg")
     assert "2 pairs fit badly, and little depends on them: c.jpg and d.jpg, a.jpg and c.jpg" in message.text
-    badly, twice = said(Finding("unlike", (2, 3)), Finding("ambiguous", (0, 2)))
+    badly, twice = said(Finding(Kind.UNLIKE, (2, 3)), Finding(Kind.AMBIGUOUS, (0, 2)))
     assert "one pair fits badly, and little depends on it: c.jpg and d.jpg" in badly.text
     assert "one pair fits as well elsewhere (a repeated pattern?)" in twice.text
     assert twice.images == ("folder/a.jpg", "folder/c.jpg")
@@ -228,7 +231,7 @@ def test_a_doubtful_shape_names_the_image_and_the_size(good: Registration) -> No
     (message,) = judge(bent, THRESHOLD)
     assert message.images == (str(good.sources[2].path),)
     assert "about 10 pixels" in message.text
-    assert judge(bent, THRESHOLD, "calibrate") == ()
+    assert judge(bent, THRESHOLD, Purpose.CALIBRATE) == ()
     free = replace(good, alignment=replace(alignment, focal=None))
     (message,) = judge(free, THRESHOLD)
     assert "homography of its own" in message.text

@@ -13,10 +13,10 @@ from PIL import Image
 from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import read_camera_file
 from rdstitch.errors import ArgumentError
+from rdstitch.export.hugin_project import project_of_hugin
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.pipeline.result_files import project_of_hugin
 from rdstitch.synthetic.panorama import panorama_rotations, turning_sequence
 from tests.cli.running import flight
 
@@ -78,7 +78,7 @@ def _turn(folder: Path) -> list[Path]:
 def test_control_points_meet(taken: Callable[[Path], list[Path]], tmp_path: Path) -> None:
     paths = taken(tmp_path)
     result = mosaic(paths, options=StitchOptions(workers=1, dry_run=True))
-    (tmp_path / "a.pto").write_text(text := project_of_hugin(result), encoding="utf-8")
+    (tmp_path / "a.pto").write_text(text := project_of_hugin(result.registration, result.canvas), encoding="utf-8")
     images, control = _lines(text, "i"), _lines(text, "c")
     assert [Path(image["n"].strip('"')) for image in images] == [path.absolute() for path in sorted(paths)]
     resolved = [
@@ -123,4 +123,4 @@ def test_free_homographies_are_refused(tmp_path: Path) -> None:
     paths = flight(3, 2).write(tmp_path)
     result = mosaic(paths, options=StitchOptions(workers=1, dry_run=True, model="homography"))
     with pytest.raises(ArgumentError, match="no images with a homography of their own"):
-        project_of_hugin(result)
+        project_of_hugin(result.registration, result.canvas)

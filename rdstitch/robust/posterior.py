@@ -1,0 +1,260 @@
+"""One comparison of hypotheses: the model of a pair, the lens, the motion of all images, whole pixels.
+
+``score = -2 log L(errors) - 2 log p(camera) + cost of freedom``, the smaller the better: how likely the errors are, how
+far the camera is off from what cameras are, and what the parameters cost: ``log n`` each by so many independent
+observations (Schwarz's approximation), or, where the posterior of a parameter is at hand, the logarithm of how many
+times narrower than its prior that is (Laplace's).
+
+Errors are noise of the keypoints, and parts that neighbours share: depth, relief, or a lens of another kind move all
+points of a part of an overlap together. The errors ``e`` of a link are therefore taken as ``noise + field``, the field
+being piecewise constant on two grids over the overlap: blocks of a quarter of it, and cells of a sixteenth. The noise
+belongs to the keypoints; how large the two parts of the field are belongs to the hypothesis, and is what makes its
+errors most likely. Where the field is larger than the noise, a cell is one observation, however many matches it has: a
+freer model does not win by fitting relief a little better.
+
+Up to constants, with ``m_c`` the mean error of a cell of ``n_c`` matches, ``v_c = τ₂² + σ²/n_c``, and ``M_b`` and
+``1/W_b`` the mean and variance of a block by its cells,
+
+``-2 log L = Σ_c 2 log v_c + |m_c|²/v_c + Σ_b 2 log(1 + W_b τ₁²) - τ₁² W_b² |M_b|² / (1 + W_b τ₁²)``.
+
+Priors of the world are mixtures of normal distributions, of a narrow core where most of the world lies, and of a wide
+tail, so that measurements overrule them. What the user gives replaces them.
+
+======================= ============================ ==========================================================
+parameter               core; tail (weight)          source
+======================= ============================ ==========================================================
+λ                       0 ± 0.04; -0.35 ± 0.12 (0.1) phones, compact and system cameras stay within 0.06, action
+                                                     cameras and fisheyes reach -0.6; the pincushion of long
+                                                     lenses stays below 0.05
+μ, ν, distortion centre 0 ± 0.1, 0.03, 0.03          fisheye projections as series; tolerances of assembly
+log f, guessed          1.2 ± 30 %; 1.5 ± 70 % (0.1) half diagonals: phones, drones and compact cameras; from
+                                                     fisheyes to long lenses
+log f, from EXIF        ± 5 %; as guessed (0.1)      rounded to a millimetre, mostly right; wrong by any factor
+                                                     where a program has resized the image
+log f, given            ± 1 %, or as stated; live,   the user, or a camera file; of another lens, another zoom or
+                        any ± 20 % (0.05)            another size of image
+tilt of a plane         0 ± 20°; 0 ± 45° (0.2)       what is laid flat is looked at from above; robots look ahead
+======================= ============================ ==========================================================
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.geometry.camera import LENS_STD
+
+TWENTY_TO_ONE = 6.0
+"""What odds cost that are said beforehand: a richer lens is rarer, ``pano`` is for turns and ``mosaic`` for planes."""
+
+EXACTNESS = 0.1
+"""Pixels: how exactly a lens and a plane can be described at all; smaller errors do not tell hypotheses apart."""
+
+_SIDE = 4
+"""Cells along each side of an overlap; blocks have half as many."""
+
+_FARTHEST = 0.02
+"""Half diagonals: errors beyond count as this; a link that is off by less is no wrong pair."""
+
+_SIZES = 14
+"""Sizes of each part of the field that are tried, from :data:`EXACTNESS` to the farthest error."""
+
+_EXACT_STD = 1e-6
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A mixture of normal distributions of one parameter; of none, it says nothing."""
+
+    parts: tuple[tuple[float, float, float], ...] = ()  # weight, mean and standard deviation of each, the core first
+
+    def cost(self, value: float) -> float:
+        """-2 log of the density, relative to that of the core alone at its middle."""
+        if not self.parts:
+            return 0.0
+        logs = self._logs(value)
+        highest = max(logs)
+        return -2.0 * (highest + math.log(sum(math.exp(log - highest) for log in logs)))
+
+    def slope(self, value: float) -> float:
+        """Half the derivative of the cost."""
+        return sum(share * (value - mean) / std**2 for share, (_, mean, std) in self._shares(value))
+
+    def curvature(self, value: float) -> float:
+        """Half the second derivative of the cost where the shares of the parts stay as they are: positive."""
+        return sum(share / std**2 for share, (_, _, std) in self._shares(value))
+
+    def combined(self, value: float, std: float) -> float:
+        """Where a measurement, and the part of the mixture that it comes from the most likely, put the parameter."""
+        weight, mean, scatter = np.array(self.parts).T
+        spread = np.hypot(scatter, std)
+        part = int(np.argmax(np.log(weight / spread) - ((value - mean) / spread) ** 2 / 2.0))
+        return float(value + (mean[part] - value) * (std / spread[part]) ** 2)
+
+    @cached_property
+    def _heights(self) -> list[float]:
+        """Logarithm of each part's density at its middle, relative to that of the core."""
+        weight, _, core = self.parts[0]
+        return [math.log(w / weight * core / std) for w, _, std in self.parts]
+
+    def _logs(self, value: float) -> list[float]:
+        return [
+            height - ((value - mean) / std) ** 2 / 2.0
+            for height, (_, mean, std) in zip(self._heights, self.parts, strict=True)
+        ]
+
+    def _shares(self, value: float) -> list[tuple[float, tuple[float, float, float]]]:
+        """How likely the value comes from each part, with the part."""
+        if not self.parts:
+            return []
+        logs = self._logs(value)
+        highest = max(logs)
+        densities = [math.exp(log - highest) for log in logs]
+        total = sum(densities)
+        return [(density / total, part) for density, part in zip(densities, self.parts, strict=True)]
+
+
+def costs(priors: Sequence[Prior], values: FloatArray) -> float:
+    """The cost of some parameters (K,)."""
+    return sum(prior.cost(value) for prior, value in zip(priors, values.tolist(), strict=True))
+
+
+def slopes(priors: Sequence[Prior], values: FloatArray) -> FloatArray:
+    """The slopes (K,) at some parameters (K,)."""
+    return np.array([prior.slope(value) for prior, value in zip(priors, values.tolist(), strict=True)])
+
+
+def curvatures(priors: Sequence[Prior], values: FloatArray) -> FloatArray:
+    """The curvatures (K,) at some parameters (K,)."""
+    return np.array([prior.curvature(value) for prior, value in zip(priors, values.tolist(), strict=True)])
+
+
+def exact(value: float) -> Prior:
+    """The prior of what is known exactly."""
+    return Prior(((1.0, value, _EXACT_STD),))
+
+
+def focal_prior(log_focal: float, std: float, source: str) -> Prior:
+    """The prior on log f, f in half diagonals, by where a focal length comes from."""
+    if source not in ("exif", "guess"):
+        return Prior(((1.0, log_focal, std),))
+    return Prior(((0.9, log_focal, std), (0.1, math.log(1.5), 0.7)))
+
+
+LENS = (
+    Prior(((0.9, 0.0, 0.04), (0.1, -0.35, 0.12))),
+    *(Prior(((1.0, 0.0, std),)) for std in LENS_STD[1:].tolist()),
+)
+"""Priors on :data:`rdstitch.geometry.camera.LENS_PARAMETERS`."""
+
+WRONG_GIVEN_FOCAL = 0.05, 0.2
+"""How often a given focal length is that of something else, and by how much its logarithm is off then."""
+
+TILT = Prior(((0.8, 0.0, math.radians(20.0)), (0.2, 0.0, math.radians(45.0))))
+
+
+@dataclass(frozen=True)
+class ErrorCost:
+    """What the errors of G problems say of a hypothesis, each array (G,)."""
+
+    cost: FloatArray  # -2 log of their likelihood, up to a constant of the problem
+    field: FloatArray  # size of what neighbours share, pixels of a coordinate
+    # independent coordinates: all where there is noise only, a pair of them a cell or block where the field is large
+    count: FloatArray
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Cells of the overlaps of links, by which hypotheses on the same matches are compared, for G problems at once."""
+
+    cell: (
+        IntArray  # cell, block, group: (M,), (C,) and (K,): cell of each match, block of each cell, problem of a block
+    )
+    block: IntArray
+    group: IntArray
+    counts: FloatArray  # (C,): matches in each cell
+    noise: FloatArray  # (G,): standard deviation of a coordinate of a keypoint's error, pixels
+    farthest: FloatArray  # (G,): pixels that an error counts as at most
+    weight: FloatArray  # (G,): independent links over links: every link measures the same keypoints again
+
+    @classmethod
+    def of(
+        cls,
+        link: IntArray,
+        points: FloatArray,
+        group: IntArray,
+        noise: FloatArray,
+        scale: FloatArray,
+        weight: FloatArray | None = None,
+    ) -> Self:
+        """Divide the overlaps: by the link (M,) of each match and its point (M, 2), and the problem of each link (L,).
+
+        ``noise``, half diagonals ``scale`` in pixels, and ``weight`` are those of each problem.
+        """
+        low, high = np.full((len(group), 2), np.inf), np.full((len(group), 2), -np.inf)
+        np.minimum.at(low, link, points)
+        np.maximum.at(high, link, points)
+        place = (points - low[link]) / np.maximum(high - low, 1e-12)[link]
+        x, y = np.minimum((place * _SIDE).astype(np.intp), _SIDE - 1).T
+        numbers, cell = np.unique((link * _SIDE + x) * _SIDE + y, return_inverse=True)
+        in_link, x, y = numbers // _SIDE**2, numbers // _SIDE % _SIDE // 2, numbers % _SIDE // 2
+        blocks, block = np.unique((in_link * 2 + x) * 2 + y, return_inverse=True)
+        return cls(
+            cell,
+            block,
+            group[blocks // 4],
+            np.bincount(cell).astype(np.float64),
+            np.maximum(noise, EXACTNESS),
+            farthest_error(scale),
+            np.ones(len(noise)) if weight is None else weight,
+        )
+
+    def cost(self, errors: FloatArray) -> ErrorCost:
+        """How likely errors (M, 2), pixels, are with the fields that make them most likely."""
+        group, groups = self.group[self.block], len(self.noise)
+        length, farthest = np.linalg.norm(errors, axis=1), self.farthest[group[self.cell]]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            kept = np.where(length > farthest, farthest / length, 1.0)[:, None] * errors
+        kept = np.where(np.isfinite(kept), kept, (farthest / np.sqrt(2.0))[:, None])
+        sums = np.stack([np.bincount(self.cell, axis, len(self.counts)) for axis in kept.T], axis=1)
+        mean = sums / self.counts[:, None]
+        squared = np.einsum("ck,ck->c", mean, mean)
+        sizes = np.geomspace(EXACTNESS, np.maximum(self.farthest, 2.0 * EXACTNESS), _SIZES)
+        coarse = np.concatenate([np.zeros((1, groups)), sizes])[:, self.group]
+        best = ErrorCost(np.full(groups, np.inf), np.zeros(groups), np.full(groups, 2.0))
+        every = np.arange(groups)
+        for fine in sizes:
+            variance = (fine**2)[group] + (self.noise**2)[group] / self.counts
+            information = np.bincount(self.block, 1.0 / variance)
+            weighted = np.stack([np.bincount(self.block, axis / variance) for axis in mean.T], axis=1)
+            power = np.einsum("bk,bk->b", weighted, weighted)
+            grown = 1.0 + information * coarse**2
+            of_blocks = 2.0 * np.log(grown) - coarse**2 * power / grown
+            costs = np.stack([np.bincount(self.group, each, groups) for each in of_blocks])
+            index = np.argmin(costs, axis=0)
+            of_cells = np.bincount(group, 2.0 * np.log(variance) + squared / variance, groups)
+            cost = self.weight * (of_cells + costs[index, every])
+            field = np.hypot(fine, np.concatenate([np.zeros((1, groups)), sizes])[index, every])
+            left = information / np.take_along_axis(grown, index[self.group][None], axis=0)[0]
+            count = 2.0 * self.weight * (field**2 + self.noise**2) * np.bincount(self.group, left, groups)
+            better = cost < best.cost
+            best = ErrorCost(
+                np.where(better, cost, best.cost),
+                np.where(better, field, best.field),
+                np.where(better, np.maximum(count, 2.0), best.count),
+            )
+        return best
+
+
+def farthest_error(scale: FloatArray) -> FloatArray:
+    """Pixels that an error counts as at most, by half the diagonal of the images (G,), pixels."""
+    return _FARTHEST * scale
+
+
+def freedom_cost(parameters: int, count: FloatArray) -> FloatArray:
+    """What parameters cost, by so many independent observations of each problem (Schwarz's criterion)."""
+    return parameters * np.log(count)
