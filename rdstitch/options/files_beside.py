@@ -45,8 +45,9 @@ class FilesBeside:
     frame: Annotated[
         PosesFrame,
         Option(
-            "Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. map: easting, "
-            "northing and height in metres, where the output is georeferenced."
+            "Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. first: those of "
+            "camera, and the sidecar has them too: the first image is the reference. map: easting, northing and height "
+            "in metres, where the output is georeferenced."
         ),
     ] = "enu"
     height: Height = 1.0
