@@ -17,40 +17,6 @@ _REPORT_SUFFIXES = (".html", ".htm")
 class FilesBeside:
     """What is written beside an image, published together with it; the report of a result that is refused too."""
 
-<<<<<<< HEAD
-    report: Annotated[
-        Path | None, Option("Write a report to FILE (.html): graph, votes on λ, matches, residuals.", "FILE")
-    ] = None
-    layers: Annotated[
-        Path | None,
-        Option(
-            "Write each image, warped, with alpha, and its mask into DIR: TIFF, cropped, with the offsets that "
-            "enblend reads.",
-            "DIR",
-        ),
-    ] = None
-    whole_layers: Annotated[bool, Option("With --layers: on the whole canvas instead of cropped.")] = False
-    hugin_project: Annotated[
-        Path | None,
-        Option("Write a project for Hugin (.pto): all images with lens and pose, and control points.", "FILE"),
-    ] = None
-    poses: Annotated[
-        Path | None,
-        Option(
-            "Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does; "
-            "images.txt: COLMAP's; geo.txt: OpenDroneMap's.",
-            "FILE",
-        ),
-    ] = None
-    frame: Annotated[
-        PosesFrame,
-        Option(
-            "Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. first: those of "
-            "camera, and the sidecar has them too: the first image is the reference. map: easting, northing and height "
-            "in metres, where the output is georeferenced."
-        ),
-    ] = "enu"
-=======
     report: Path | None = option(None, "Write a report to FILE (.html): graph, votes on λ, matches, residuals.", "FILE")
     layers: Path | None = option(
         None,
@@ -70,10 +36,10 @@ class FilesBeside:
     )
     frame: PosesFrame = option(
         "enu",
-        "Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. map: easting, "
-        "northing and height in metres, where the output is georeferenced.",
+        "Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. first: those of camera, "
+        "and the sidecar has them too: the first image is the reference. map: easting, northing and height in metres, "
+        "where the output is georeferenced.",
     )
->>>>>>> main
     height: Height = 1.0
     command: str = ""  # the command line, for the report
     timer: StageTimer = field(default_factory=StageTimer)  # the ``progress`` of the recipe, for the report

@@ -1,10 +1,6 @@
 """What robots load: a map of nav2, odometry in a bag, all in one frame."""
 
-<<<<<<< HEAD
-import csv
 import json
-=======
->>>>>>> main
 import math
 import sys
 from pathlib import Path
