@@ -26,30 +26,15 @@ class Unused(StrEnum):
 
 @dataclass(frozen=True)
 class LinkFit:
-    """How well one link agrees with the whole.
+    """How well one link agrees with the whole."""
 
-    Attributes
-    ----------
-    image1, image2 : int
-        Indices of the images.
-    count : int
-        Correspondences given.
-    inliers : int
-        Correspondences that agree with the alignment.
-    rms : float
-        Root mean square error of those, pixels; NaN where the link was not used.
-    used : bool
-    reason : Unused
-        Why the link was not used.
-    """
-
-    image1: int
-    image2: int
-    count: int
-    inliers: int
-    rms: float
+    image1: int  # Indices of the images
+    image2: int  # Indices of the images
+    count: int  # Correspondences given
+    inliers: int  # Correspondences that agree with the alignment
+    rms: float  # Root mean square error of those, pixels; NaN where the link was not used
     used: bool
-    reason: Unused = Unused.NO
+    reason: Unused = Unused.NO  # Why the link was not used
 
     @property
     def images(self) -> tuple[int, int]:
@@ -59,27 +44,17 @@ class LinkFit:
 
 @dataclass(frozen=True)
 class PlanarPoses:
-    """Where the camera was for each image, in a metric plane.
+    """Where the camera was for each image, in a metric plane."""
 
-    Attributes
-    ----------
-    yaw : ndarray of shape (N,)
-        φ, radians.
-    position : ndarray of shape (N, 2)
-        (x, y) in the plane, in units of the reference image's height above it.
-    height : ndarray of shape (N,)
-        Height above the plane in the same unit.
-    tilt : ndarray of shape (N, 2)
-        (ψ, θ), radians.
-    covariance, with_first : ndarray of shape (N, 4, 4), or None
-        Of x, y, height and yaw: of each image, and of each with the first that is used; where they were asked for.
-    """
-
-    yaw: FloatArray
-    position: FloatArray
-    height: FloatArray
-    tilt: FloatArray
+    yaw: FloatArray  # (N,): φ, radians
+    position: FloatArray  # (N, 2): (x, y) in the plane, in units of the reference image's height above it
+    height: FloatArray  # (N,): Height above the plane in the same unit
+    tilt: FloatArray  # (N, 2): (ψ, θ), radians
+    # (N, 4, 4): Of x, y, height and yaw: of each image, and of each with the first that is used; where they were asked
+    # for
     covariance: FloatArray | None = None
+    # (N, 4, 4): Of x, y, height and yaw: of each image, and of each with the first that is used; where they were asked
+    # for
     with_first: FloatArray | None = None
 
     def relative_to(self, reference: int) -> "PlanarPoses":
@@ -101,54 +76,29 @@ class PlanarPoses:
 
 @dataclass(frozen=True)
 class ReliefTest:
-    """Whether the scene is the plane that it is taken for.
+    """Whether the scene is the plane that it is taken for."""
 
-    Attributes
-    ----------
-    found : bool
-        The residuals of neighbouring points agree too well to be noise.
-    coherence : float
-        Mean correlation of the residuals of neighbouring points, 0 for noise, 1 for a smooth surface.
-    size : float
-        Root mean square of the coherent part of the residuals, pixels.
-    explanation : str
-        One sentence; what it means for λ.
-    """
-
-    found: bool
-    coherence: float
-    size: float
-    explanation: str
+    found: bool  # The residuals of neighbouring points agree too well to be noise
+    coherence: float  # Mean correlation of the residuals of neighbouring points, 0 for noise, 1 for a smooth surface
+    size: float  # Root mean square of the coherent part of the residuals, pixels
+    explanation: str  # One sentence; what it means for λ
 
 
 @dataclass(frozen=True)
 class ShapeTest:
-    """Whether the overlaps hold the shape of the whole, or it may be off where they agree.
+    """Whether the overlaps hold the shape of the whole, or it may be off where they agree."""
 
-    Attributes
-    ----------
-    doubtful : bool
-        An image may be off by more than is tolerable.
-    shown : bool
-        The errors show that something is left out; otherwise the images only fail to exclude it.
-    gain : float
-        By how many squared standard deviations the errors would be smaller with what is left out.
-    image : int
-        The image that may be off the most.
-    shift, shift_std : float
-        How far that image would move with what is left out, and the standard deviation of that, pixels; up to one
-        homography of the whole. The latter grows with ``gain``: what is left out is more than what was tried.
-    cause : str
-        What is most likely to be left out.
-    """
-
-    doubtful: bool
-    shown: bool
-    gain: float
-    image: int
+    doubtful: bool  # An image may be off by more than is tolerable
+    shown: bool  # The errors show that something is left out; otherwise the images only fail to exclude it
+    gain: float  # By how many squared standard deviations the errors would be smaller with what is left out
+    image: int  # The image that may be off the most
+    # How far that image would move with what is left out, and the standard deviation of that, pixels; up to one
+    # homography of the whole. The latter grows with ``gain``: what is left out is more than what was tried.
     shift: float
+    # How far that image would move with what is left out, and the standard deviation of that, pixels; up to one
+    # homography of the whole. The latter grows with ``gain``: what is left out is more than what was tried.
     shift_std: float
-    cause: str
+    cause: str  # What is most likely to be left out
 
 
 @dataclass(frozen=True, repr=False)
