@@ -2,7 +2,8 @@
 
 Along every border of two images, windows of both are compared. A seam is broken where the two differ at the border
 itself, and either fit clearly better with one of them moved, or lines of one do not go on in the other. What differs
-beside the border does not count: a seam that goes around a moving object holds.
+beside the border does not count: a seam that goes around a moving object holds; nor does what is finer than a seam's
+surroundings: gravel and leaves hide it.
 """
 
 import math
@@ -33,7 +34,7 @@ _COARSER, _CELL, _MIN_CELLS = 3, 13, 8  # overlaps are compared so many times sm
 _CHANCE, _MIN_ALIKE = 0.2, 0.5
 # Coherence of edges (0: all directions, 1: one) from which on a person sees them end: leaves and gravel hide a seam.
 _DIRECTED = 0.4
-_MAX_SHARE, _MIN_BROKEN = 0.05, 3  # of the places that may be broken before a person sees it
+_MAX_SHARE, _MIN_BROKEN = 0.03, 3  # of the places that may be broken before a person sees it
 _MAX_LENGTH = 0.045  # of a break that a person does not see, diagonals of an image
 _SURELY_ALIKE = 0.9  # correlation of windows that need not be moved
 
@@ -249,7 +250,7 @@ def _compared(
             moved = shift > _MOVED and best > _ALIKE and best - alike[k] > _GAIN
             edges, directions = zip(_edges(windows1[k]), _edges(windows2[k]), strict=True)
             unlike = alike[k] < _UNLIKE and max(edges) > contrast and max(directions) > _DIRECTED
-            broken = bool(moved or (unlike and _differ_coarsely(windows1[k], windows2[k], near[k], contrast)))
+            broken = bool(moved or unlike) and _differ_coarsely(windows1[k], windows2[k], near[k], contrast)
             shift = shift if moved else math.nan
         result.append((at[k], broken, shift if broken else 0.0))
     return result
