@@ -50,8 +50,8 @@ class PlanarPoses:
     position: FloatArray  # (N, 2): (x, y) in the plane, in units of the reference image's height above it
     height: FloatArray  # (N,): height above the plane in the same unit
     tilt: FloatArray  # (N, 2): (ψ, θ), radians
-    # covariance, with_first: (N, 4, 4): of x, y, height and yaw: of each image, and of each with the first that is used;
-    # none where they were not asked for
+    # covariance, with_first: (N, 4, 4): of x, y, height and yaw: of each image, and of each with the first that is
+    # used, where they were asked for
     covariance: FloatArray | None = None
     with_first: FloatArray | None = None
 
