@@ -15,7 +15,7 @@ Options that matter first: *output *overwrite *images *preview *reference *camer
 Places: *grid columns order origin *overlap *positions positions-offset position-accuracy gcp check-points
     *positions-only *pixel-size *search
 Tiles: *channel *z time *flat-field *save-flat-field
-Input: *follow idle refresh *every *exclude include-only match topic timestamps
+Input: *follow idle refresh *every *exclude include-only match topic timestamps odometry
 Camera: *lambda lens tilt attitude attitude-std save-camera camera-format
 Features and registration: features aliked-model lightglue-model max-features work-megapixels solver model threshold
 Output: *gsd crs like extent georeference north-up rotate straighten rectangle level yaw pitch roll *crop projection

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rdstitch.results.stitch_result import StitchResult
 
 STITCHING = [
-    *flags_of(StitchOptions),
+    *flags_of(StitchOptions, without="odometry"),
     *flags_of(FeatureOptions),
     *flags_of(CompositeOptions),
     *flags(

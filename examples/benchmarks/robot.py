@@ -149,6 +149,7 @@ def live(drive: Drive, options: rdstitch.StitchOptions) -> Outcome:
         pose = tracker.add(image, k / RATE)
         spent.append(time.thread_time() - start)
         poses |= {known.number: known for known in (*tracker.revised, pose) if known and known.map == 0}
+    poses |= {known.number: known for known in tracker.finish() if known and known.map == 0}
     frames = sorted(poses)
     given = [poses[k] for k in frames]
     places = np.array([complex(*pose.position[:2]) for pose in given if pose.position is not None])

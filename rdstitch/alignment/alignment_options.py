@@ -11,6 +11,7 @@ from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.plane_marks import ControlPoints, Sighting
 from rdstitch.alignment.priors import CameraPriors, known_focal
+from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
@@ -26,6 +27,7 @@ class AlignmentOptions:
     tilt: tuple[float, float] | None = None  # (ψ, θ), radians
     # (ψ, θ) of each image (N, 2), radians, by an IMU or a gimbal; ``tilt`` is then how the camera is mounted on that
     attitudes: ArrayLike | None = None
+    delayed_attitudes: FloatArray | None = None  # (N, S, 2): the same if their times are late by sensor_streams.DELAYS
     attitudes_std: float = 0.0  # radians; 0: exact
     # direction down (N, 3) in the axes of each camera (right, down, ahead); NaN where unknown; it levels panoramas
     gravity: ArrayLike | None = None
@@ -69,6 +71,7 @@ class AlignmentOptions:
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
             positions=positions,
+            delayed_attitudes=self.delayed_attitudes,
             positions_std=np.full(count, np.nan) if self.positions_std is None else np.asarray(self.positions_std),
             control=ControlPoints.of(self.control, cameras),
         )
@@ -85,7 +88,8 @@ class AlignmentOptions:
         """Models to be tried, from the least to the most free."""
         if self.model != "auto":
             return [self.model]
-        # Measured attitudes are a prior of the tilts; exact ones leave nothing of the tilts free.
+        # Measured attitudes are a prior of the tilts, which are free within it; exact ones leave nothing of them free.
         measured, exact = self.attitudes is not None, self.attitudes is not None and self.attitudes_std == 0.0
-        without = {"tilting": exact, "pose": measured}
+        inexact = measured and not exact
+        without = {"rigid": inexact, "similarity": inexact, "tilting": exact, "pose": measured}
         return [name for name in MODELS if not without.get(name, False)]

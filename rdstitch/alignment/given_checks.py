@@ -19,6 +19,7 @@ from rdstitch.alignment.priors import CameraPriors
 from rdstitch.alignment.select import select_model
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.sensor_streams import DELAY_STD, DELAYS, at_delay, smooth
 from rdstitch.results.messages import Message
 
 _MAX_IMAGES = 60
@@ -36,6 +37,11 @@ _EXACT = math.radians(0.01)
 _STRAINED = 2.0
 """Standard deviations of a given focal length by which it must have given way to be looked at again."""
 
+_WITH_TILTS = ["tilting"]
+
+_LATE = 3.0
+"""Standard deviations from which on a delay is one."""
+
 _FREE_MOUNT = 1.0
 """Standard deviation, radians, of a tilt of the mount of which nothing is known."""
 
@@ -52,19 +58,27 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
     """
     if options.attitudes is None and options.tilt is None:
         return None
-    without = replace(options, attitudes=None, tilt=None)
+    without = replace(options, attitudes=None, delayed_attitudes=None, tilt=None)
     known = problem.camera_priors
     given = known.attitudes + known.tilt
     nothing = replace(
         known, attitudes=np.zeros_like(known.attitudes), attitudes_std=None, tilt=(0.0, 0.0), tilt_known=False
     )
     bare = replace(problem, camera_priors=nothing)
-    fit = select_model(bare, [name for name in without.models if not MODELS[name].on_sphere]).fit
+    models = [name for name in without.models if not MODELS[name].on_sphere]
+    # A model of one tilt shows no others.
+    models = models if without.model == "auto" or options.attitudes is None else _WITH_TILTS
+    fit = select_model(bare, models).fit
     if not isinstance(fit.model, PlanarModel):
         return None
     if fit.model.free_tilts and not fit.model.any_tilt:  # whose prior draws tilts together
         fit = bare.refine(POSE, bare.taken_over(POSE, fit))
     shown = _ShownTilts.of(bare, fit, free_mount=options.tilt is None)
+    if known.delayed_attitudes is not None and (late := shown.delay(known.delayed_attitudes + known.tilt)) is not None:
+        attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
+        text = "the times of the attitudes are {:.0f} ± {:.0f} ms late, which is allowed for"
+        note = Message(text.format(*1e3 * np.array(late)), severity="note", code="attitudes-late")
+        return replace(options, attitudes=attitudes, delayed_attitudes=None), note
     stated = options.attitudes_std if options.attitudes is not None else 0.0
     scores = [shown.likelihood(given @ change.T) for change in _SIGNED_ORDERS]
     none = shown.likelihood(np.zeros_like(given))
@@ -162,3 +176,15 @@ class _ShownTilts:
         values = [self.log_likelihood(expected, scatter) for scatter in _SCATTERS.tolist()]
         best = int(np.argmax(values))
         return values[best], float(_SCATTERS[best])
+
+    def delay(self, expected: FloatArray) -> tuple[float, float] | None:
+        """By how many seconds the times of tilts (N, S, 2) at :data:`DELAYS` are late, with its std, or None."""
+        slow = smooth(expected)
+        scores = np.array([self.likelihood(slow[:, k])[0] for k in range(len(DELAYS))]) - (DELAYS / DELAY_STD) ** 2 / 2
+        best, step = int(np.argmax(scores)), float(DELAYS[1] - DELAYS[0])
+        if best in (0, len(DELAYS) - 1):
+            return None
+        below, top, above = scores[best - 1 : best + 2].tolist()
+        bend = 2.0 * top - below - above
+        delay, std = float(DELAYS[best]) + step * (above - below) / (2.0 * bend), step / math.sqrt(bend)
+        return (delay, std) if abs(delay) > _LATE * std else None

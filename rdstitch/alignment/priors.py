@@ -54,6 +54,7 @@ class CameraPriors:
     places_precision: FloatArray | None = None
     marks: PlaneMarks | None = None
     fix_frame: bool = True  # the frame is the reference image's, not that of places and marks
+    delayed_attitudes: FloatArray | None = None  # (N, S, 2): the attitudes, if their times are late by DELAYS
 
     def priors(self, model: MotionModel, count: int, tilt_spread: float, log_focal: float | None = None) -> Priors:
         """For ``count`` images whose tilts scatter by ``tilt_spread`` where nothing else is known of them.
@@ -88,6 +89,7 @@ class CameraPriors:
             positions=self.positions[images],
             positions_std=self.positions_std[images],
             control=self.control.within(images),
+            delayed_attitudes=None if self.delayed_attitudes is None else self.delayed_attitudes[images],
         )
 
 

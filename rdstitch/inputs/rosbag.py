@@ -16,6 +16,7 @@ from rdstitch.errors import InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.keyframes import Wanted, wanted_frames
+from rdstitch.inputs.sensor_streams import Odometry, odometry_of, yaw_of
 from rdstitch.io.video import write_frame
 from rdstitch.system.file_access import read_beginning
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 _SUFFIXES = (".bag", ".db3", ".mcap")
 _DESCRIPTION, _KEY, _HEADER = "metadata.yaml", b"rosbag2_bagfile_information", 4096
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_ODOMETRY = "nav_msgs/msg/Odometry"
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TYPES = {
     **dict.fromkeys(("mono8", "8UC1", "rgb8", "bgr8", "8UC3", "rgba8", "bgra8", "8UC4"), np.uint8),
@@ -119,6 +121,25 @@ def camera_in_bag(path: Path, topic: str | None = None) -> "tuple[CameraFile, st
                 content["distortion_model"] = message.distortion_model
             return camera_of_content(content, f"{path}: {connection.topic}"), connection.topic
     return None
+
+
+def odometry_in_bag(path: Path, topic: str) -> Odometry:
+    """The odometry of a topic of nav_msgs/Odometry."""
+    rows = []
+    with opened_bag(path) as reader:
+        connections = [c for c in reader.connections if c.topic == topic and c.msgtype == _ODOMETRY]
+        if not connections:
+            listed = ", ".join(sorted({c.topic for c in reader.connections if c.msgtype == _ODOMETRY})) or "none"
+            raise InputError(
+                f"{path}: the bag has no odometry of the topic {topic}; topics of nav_msgs/Odometry: {listed}"
+            )
+        for connection, time_ns, data in reader.messages(connections=connections):
+            message = reader.deserialize(data, connection.msgtype)
+            stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+            at, turn, known = message.pose.pose.position, message.pose.pose.orientation, message.pose.covariance
+            yaw = yaw_of(turn.x, turn.y, turn.z, turn.w)
+            rows.append((stamp or time_ns * 1e-9, at.x, at.y, yaw, (known[0] + known[7]) / 2.0, known[35]))
+    return odometry_of(rows, f"{path}: {topic}")
 
 
 def camera_in(path: str | Path) -> Camera:

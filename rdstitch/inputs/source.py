@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
 from rdstitch.features.prepared_image import View, halving
 from rdstitch.geometry.camera import Camera
@@ -42,6 +43,8 @@ class Source:
     mask: Path | None = None  # image that is dark where this one does not count
     mask_frame: int | None = None  # how it is turned, see :func:`rdstitch.io.mask.mask_frame`
     attitude: tuple[float, float] | None = None  # (ψ, θ), radians, as a gimbal or an IMU has measured it
+    # (S, 2): the same at :data:`rdstitch.inputs.sensor_streams.DELAYS`; None where it has no times
+    attitude_by_delay: FloatArray | None = field(default=None, compare=False, repr=False)
     # its number and time in the sequence; the pixels, where they are no file
     frame: Frame | None = field(default=None, compare=False, repr=False)
     # where it is kept between two stages that both look at it

@@ -17,6 +17,7 @@ from rdstitch.system.machine import processor_count
 
 if TYPE_CHECKING:
     from rdstitch.geometry.camera import Camera
+    from rdstitch.inputs.sensor_streams import Odometry
 
 _SELECT_MODEL_BELOW = 50
 """Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
@@ -94,6 +95,15 @@ class StitchOptions:
             "Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; otherwise those of the "
             "video, bag or EXIF.",
             "FILE",
+        ),
+    ] = None
+    odometry: Annotated[
+        "Odometry | str | Path | None",
+        Option(
+            "Wheel odometry, by time: TUM's lines, CSV timestamp,x,y,yaw_deg, or a topic of the bag. It gives the unit "
+            "of positions, and poses of frames without texture.",
+            "FILE|TOPIC",
+            entered=str | None,
         ),
     ] = None
     positions: Annotated[
@@ -212,6 +222,7 @@ class StitchOptions:
             self.mask,
             self.attitude,
             self.timestamps,
+            self.odometry if isinstance(self.odometry, str | Path) else None,
             self.positions,
             self.gcp,
             self.check_points,

@@ -261,6 +261,8 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
     """
     quarters = QuarterTurns.of(sources)
     attitudes = [source.attitude for source in sources if source.attitude is not None]
+    delayed = [source.attitude_by_delay for source in sources if source.attitude_by_delay is not None]
+    timed = delayed and len(delayed) == len(sources) and set(quarters.back) == {1}
     exact = bool(attitudes) and options.attitude_std == 0.0
     places = [source.metadata.gps for source in sources]
     return AlignmentOptions(
@@ -270,6 +272,7 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
         lens_known=options.known_distortion is not None,
         tilt=options.tilt or ((0.0, 0.0) if exact else None),
         attitudes=quarters.stored_tilts(np.array(attitudes)) if attitudes else None,
+        delayed_attitudes=np.array(delayed) if timed else None,
         attitudes_std=options.attitude_std,
         gravity=_gravity(sources, quarters),
         positions=positions_of(sources) if sources else None,

@@ -4,7 +4,7 @@ import math
 import sys
 import time
 import weakref
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,8 +22,17 @@ from rdstitch.export.trajectory_files import covariance_in_frame, in_frame, ros_
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.inputs.frame import Frame, Image, as_inputs
-from rdstitch.inputs.measurements import XMP, time_of, timestamps_of, with_attitudes
 from rdstitch.inputs.selection import is_selected, mask_of, with_masks
+from rdstitch.inputs.sensor_streams import (
+    DELAYS,
+    XMP,
+    BodyPose,
+    Odometry,
+    read_odometry,
+    time_of,
+    timestamps_of,
+    with_attitudes,
+)
 from rdstitch.inputs.source import Source
 from rdstitch.io.opening import check_readable
 from rdstitch.io.write import write_image
@@ -32,7 +41,7 @@ from rdstitch.pipeline.aligner import alignment_options
 from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message
-from rdstitch.tracking import CameraPose, Preview, Tracked, TrackingOptions
+from rdstitch.tracking import Preview, Tracked, TrackingOptions
 from rdstitch.tracking import Tracker as FrameTracker
 
 _FEATURES = 600  # of a frame, that suffice to follow it
@@ -55,21 +64,31 @@ class FollowedPoses:
     height: float = 1.0
     frame: TrajectoryFrame = "enu"
 
-    def fields(self, pose: CameraPose | None) -> dict[str, float | None]:
+    def unit(self, tracked: Tracked) -> float:
+        """How long the height of the first keyframe is: as given, or, where that is one, as odometry says."""
+        return tracked.unit if self.height == 1.0 and math.isfinite(tracked.unit) else self.height
+
+    def length_std(self, tracked: Tracked) -> float:
+        """Relative standard deviation that all lengths share."""
+        return tracked.length_std if self.unit(tracked) == self.height else tracked.unit_std
+
+    def fields(self, tracked: Tracked | None) -> dict[str, float | None]:
         """x, y, yaw and height."""
-        if pose is None:
+        if tracked is None or (pose := tracked.pose) is None:
             return dict.fromkeys(("x", "y", "yaw_deg", "yaw", "height"))
-        x, y = in_frame(pose.x * self.height, pose.y * self.height, self.frame)
+        unit = self.unit(tracked)
+        x, y = in_frame(pose.x * unit, pose.y * unit, self.frame)
         yaw = {"yaw_deg": math.degrees(pose.yaw), "yaw": pose.yaw}
-        return {"x": x, "y": y, **yaw, "height": pose.height * self.height}
+        return {"x": x, "y": y, **yaw, "height": pose.height * unit}
 
     def covariance(self, tracked: Tracked) -> FloatArray | None:
         """Of x, y, height and yaw (4, 4), in the axes of the first image; with what all lengths share."""
         if (pose := tracked.pose) is None or tracked.covariance is None:
             return None
         place = np.array([pose.x, pose.y, 0.0, 0.0])
-        shared = 0.0 if math.isnan(tracked.length_std) else tracked.length_std
-        unit = np.array([self.height, self.height, self.height, 1.0])
+        shared, length = self.length_std(tracked), self.unit(tracked)
+        shared = 0.0 if math.isnan(shared) else shared
+        unit = np.array([length, length, length, 1.0])
         return np.asarray((tracked.covariance + shared**2 * np.outer(place, place)) * np.outer(unit, unit))
 
 
@@ -108,7 +127,7 @@ class Pose:
     @property
     def position(self) -> tuple[float, float, float] | None:
         """X, y and height above the plane, in the frame and unit of the tracker; None where there is no place."""
-        at = self.poses.fields(None if self.tracked is None else self.tracked.pose)
+        at = self.poses.fields(self.tracked)
         x, y, height = at["x"], at["y"], at["height"]
         return None if x is None or y is None or height is None else (x, y, height)
 
@@ -146,7 +165,7 @@ class Pose:
     @property
     def length_std(self) -> float:
         """Relative standard deviation that all lengths share, by the focal length; NaN where it is not known."""
-        return math.nan if self.tracked is None else self.tracked.length_std
+        return math.nan if self.tracked is None else self.poses.length_std(self.tracked)
 
     def as_dict(self) -> dict[str, Any]:
         """As a line of JSON takes it; null for what is not known."""
@@ -157,7 +176,7 @@ class Pose:
             "name": self.name,
             "frame": self.number,
             "timestamp": _known(self.timestamp),
-            **self.poses.fields(None if tracked is None else tracked.pose),
+            **self.poses.fields(tracked),
             "covariance": None if covariance is None else covariance.ravel().tolist(),
             "length_std": _known(self.length_std),
             "quality": self.quality,
@@ -189,7 +208,8 @@ def follow(
     afterwards, by :func:`rdstitch.mosaic` or :func:`rdstitch.trajectory`. Features are fewer and from smaller images
     than there. Memory does not grow with the number of frames. ``comes_again`` says of a frame that could not be read
     whole whether it will come again (:class:`rdstitch.inputs.arrivals.Arrivals`); ``preview`` is written every
-    ``refresh`` seconds at most. One pose a frame, and one more for keyframes that find their place only later.
+    ``refresh`` seconds at most. One pose a frame, and more for those that find their
+    place, or another one, only later.
     """
     tracker = Tracker(options, poses, patient=True)
     sketch = None if preview is None else _Sketch(preview, refresh)
@@ -211,6 +231,7 @@ def follow(
             if sketch is not None:
                 sketch.add(source, result)
             source.decoded_images.clear()
+    yield from tracker.finish()
     if sketch is not None:
         sketch.write()
 
@@ -227,7 +248,7 @@ class Tracker:
     Attributes
     ----------
     revised : tuple of Pose
-        Of earlier frames that found their place with the last one.
+        Of earlier frames that found their place with the last one, or another one, where all lengths were revised.
 
     Examples
     --------
@@ -244,7 +265,12 @@ class Tracker:
     ) -> None:
         self._options, self._poses = options or StitchOptions(), poses or FollowedPoses()
         self._detection = _live_features(self._options.features)
-        for file in (self._options.attitude, self._options.mask):  # before the first frame, not at each
+        given = self._options.odometry
+        for file in (
+            self._options.attitude,
+            self._options.mask,
+            None if isinstance(given, Odometry) else given,
+        ):  # before the first frame, not at each
             if file is not None and file != XMP and not Path(file).is_dir():
                 check_readable(Path(file))
         how = TrackingOptions(self._options.estimation, alignment_options([], self._options), patient)
@@ -265,7 +291,13 @@ class Tracker:
         """What the user should know of all that has come so far."""
         return tuple(self._frames.messages)
 
-    def add(self, image: Image, timestamp: float | None = None, attitude: tuple[float, float] | None = None) -> Pose:
+    def add(
+        self,
+        image: Image,
+        timestamp: float | None = None,
+        attitude: tuple[float, float] | None = None,
+        odometry: tuple[float, float, float] | None = None,
+    ) -> Pose:
         """Register the next frame.
 
         Parameters
@@ -277,6 +309,9 @@ class Tracker:
         attitude : (float, float), optional
             Tilt (ψ, θ) of this frame, radians, as an IMU has measured it, with ``attitude_std`` of the options; instead
             of a table of them.
+        odometry : (float, float, float), optional
+            x (ahead), y (to the left) and yaw (radians, counterclockwise from above) of the robot's body by its wheels;
+            instead of a table of them.
 
         Returns
         -------
@@ -288,7 +323,8 @@ class Tracker:
         (named,) = as_inputs(image, self._options.channel_order)
         frame = replace(named, path=Path(f"image_{number:04d}")) if isinstance(named, Frame) else Frame(Path(named))
         frame = replace(frame, number=number, timestamp=timestamp)
-        *revised, pose = self.register(frame, *self.read(frame, attitude))
+        body = None if odometry is None else BodyPose(*odometry)
+        *revised, pose = self.register(frame, *self.read(frame, attitude), body)
         self.revised = tuple(revised)
         return pose
 
@@ -317,27 +353,41 @@ class Tracker:
             source = with_masks([source], options.mask)[0]
         return [source] if source.attitude is not None else with_attitudes([source], options.attitude)
 
-    def register(self, frame: Frame, source: Source | None, image: PreparedImage | None, reason: str) -> list[Pose]:
-        """Register a frame that was read; it comes last, after those before it that only now have found their place."""
+    def register(
+        self,
+        frame: Frame,
+        source: Source | None,
+        image: PreparedImage | None,
+        reason: str,
+        body: BodyPose | None = None,
+    ) -> list[Pose]:
+        """Register a frame that was read; it comes last, after those before it whose place is new."""
         label = Pose(frame.path.name, frame.number or 0, math.nan, None, reason, self._poses)
         if source is None or image is None:
             return [label]
         label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))
         camera = at_working_size(source.camera, self._detection.limits[1])
-        results = self._frames.add(image, camera, source.attitude)
+        attitude = source.attitude_by_delay
+        if attitude is None and source.attitude is not None:
+            attitude = np.tile(source.attitude, (len(DELAYS), 1))
+        if body is None and (given := self._options.odometry) is not None:
+            odometry = given if isinstance(given, Odometry) else read_odometry(given)
+            body = odometry.at(label.timestamp)
+        results = self._frames.add(image, camera, attitude, body)
         self._labels[results[-1].number] = label
-        poses = [
-            replace(
-                self._labels[result.number],
-                tracked=result,
-                reason=result.reason,
-            )
-            for result in results
-        ]
+        return self._poses_of(results)
+
+    def finish(self) -> tuple[Pose, ...]:
+        """Poses of frames that find their place, or another one, when no other frame comes."""
+        return tuple(self._poses_of(self._frames.finish()))
+
+    def _poses_of(self, results: Sequence[Tracked]) -> list[Pose]:
+        poses = [replace(self._labels[result.number], tracked=result, reason=result.reason) for result in results]
         told, self._told = self._frames.messages[self._told :], len(self._frames.messages)
-        poses[-1] = replace(poses[-1], messages=tuple(told))
-        waiting = self._frames.numbers_without_place
-        self._labels = {number: known for number, known in self._labels.items() if number in waiting}
+        if poses:
+            poses[-1] = replace(poses[-1], messages=tuple(told))
+        revisable = self._frames.revisable
+        self._labels = {number: known for number, known in self._labels.items() if number in revisable}
         return poses
 
 

@@ -15,12 +15,13 @@ from rdstitch.export.odometry_bag import check_bag, write_bag, write_bag_folder
 from rdstitch.export.trajectory_files import WRITERS, frame_of, has_times, path_as_svg
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
-from rdstitch.inputs.measurements import timestamps_of, with_times
 from rdstitch.inputs.selection import selected
+from rdstitch.inputs.sensor_streams import timestamps_of, with_times
 from rdstitch.inputs.source import Source
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty
+from rdstitch.pipeline.along_odometry import along_odometry, with_odometry_of_bag
 from rdstitch.pipeline.choose_layout import LaidOut, choose_layout
 from rdstitch.pipeline.compose import blocks_on, check_world_files, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
@@ -370,6 +371,7 @@ def trajectory(
         replaced = [Path(output)] if Path(output).is_dir() and options.overwrite else []
     given = as_inputs(inputs, options.channel_order)
     options, notes = with_camera_in_bag(given, options)
+    options = with_odometry_of_bag(given, options)
     with found_images(given, every=every, topic=options.topic) as listed:
         files = [Path(file) for file in (output, plot) if file is not None]
         check_outputs([f for f in files if f not in replaced], options.overwrite, [*listed.files, *options.files])
@@ -384,6 +386,9 @@ def trajectory(
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     stored = QuarterTurns.of(registration.sources).stored_alignment(registration.alignment)
     path = Trajectory.from_alignment(stored, height)
+    if options.odometry is not None:
+        path, notes = along_odometry(path, sources, options.odometry, keep_unit=height != 1.0)
+        registration = registration.with_messages(notes)
     path = path.labelled(
         [s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], timestamps_of(sources)
     )

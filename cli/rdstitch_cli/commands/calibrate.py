@@ -19,7 +19,7 @@ from rdstitch_cli.terminal import Reporter
   rdstitch calibrate wall/ -o camera.yml --report lens.html
   rdstitch undistort other/*.jpg --camera camera.json -o straight/
 """,
-    flags_of(StitchOptions, without="reference gcp check_points local_alignment dry_run save_camera"),
+    flags_of(StitchOptions, without="odometry reference gcp check_points local_alignment dry_run save_camera"),
     flags_of(FeatureOptions),
     flags_of(FilesBeside, only="report"),
 )

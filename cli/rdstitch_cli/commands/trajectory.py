@@ -66,12 +66,14 @@ def trajectory(
     poses are printed as frames arrive.
     """
     from rdstitch.export.trajectory_files import frame_of
+    from rdstitch.pipeline.along_odometry import with_odometry_of_bag
     from rdstitch.pipeline.follow import FollowedPoses
     from rdstitch.pipeline.recipes import trajectory as recipe
 
     with ExitStack() as stack:
         stitch = stitch_options(reporter, given)
         if following:
+            stitch = with_odometry_of_bag(inputs, stitch)
             printed = FollowedPoses(height, frame or frame_of(layout))
             watched: dict[str, Any] = {"output": output, "plot": plot, "every": every, "idle": idle, "poses": printed}
             arrived = live.followed(inputs, stitch, reporter, **watched)

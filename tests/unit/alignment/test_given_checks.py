@@ -9,6 +9,7 @@ from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.motion_models import PSI, THETA
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
+from rdstitch.inputs.sensor_streams import DELAYS
 from tests.alignment_scenes import Scene, grid, jittered, scene
 
 _ONE = math.radians(1.0)
@@ -116,3 +117,27 @@ def test_attitudes_are_not_dropped_for_what_a_wrong_focal_length_makes_of_them()
     found = align(told, given.links, options)
     assert [message.code for message in found.messages] == ["focal-contradicted"]
     assert abs(math.log(found.cameras[0].focal / true)) < 4.0 * found.length_std
+
+
+@pytest.mark.parametrize("late", [0.04, 0.0])
+def test_attitudes_that_are_late_are_taken_for_when_they_were(late: float) -> None:
+    rng = np.random.default_rng(2)
+
+    def tilts(times: FloatArray) -> FloatArray:
+        return 0.03 * np.stack([np.sin(4.1 * times), np.cos(3.3 * times)], axis=-1)
+
+    poses, times = grid(4, 3, (0.4, 0.3), 0.25, rng), np.linspace(0.0, 3.3, 12)
+    poses[:, [PSI, THETA]] = tilts(times)
+    given = scene(poses, focal_source="exif", rng=rng, per_link=80)
+    measured = tilts(times[:, None] + DELAYS - late) + rng.normal(scale=math.radians(0.02), size=(12, len(DELAYS), 2))
+    options = AlignmentOptions(
+        lens="division",
+        attitudes=measured[:, len(DELAYS) // 2],
+        delayed_attitudes=measured,
+        attitudes_std=math.radians(0.05),
+    )
+    found = align(given.cameras, given.links, options)
+    assert [message.code for message in found.messages] == (["attitudes-late"] if late else [])
+    if late:
+        assert "40 ±" in found.messages[0].text or "39 ±" in found.messages[0].text or "41 ±" in found.messages[0].text
+    assert found.rms < 1.02 * _aligned(given, tilts(times), math.radians(0.05)).rms

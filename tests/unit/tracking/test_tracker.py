@@ -130,11 +130,11 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     tracker = _tracker(DISTORTION)
     for frame in _frames(_drive(40, overlap=0.6, path="line")):
         tracker.add(frame, Camera(SIZE))
-    assert len(tracker._keyframes) == 10
-    first = tracker._keyframes[0].number
+    assert len(tracker._map.keyframes) == 10
+    first = tracker._map.keyframes[0].number
     assert first >= 25
-    assert tracker._window_links
-    assert all(link.image1 >= first for link in tracker._window_links)
+    assert tracker._map.links
+    assert all(link.image1 >= first for link in tracker._map.links)
 
 
 def test_a_camera_that_stands_still_makes_no_keyframes() -> None:

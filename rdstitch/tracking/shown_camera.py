@@ -1,0 +1,161 @@
+"""What the motions between frames show of a camera whose lens is known: its tilt and focal length, and a delay."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.geometry.planar_motion import rotation_from_tilt
+from rdstitch.inputs.sensor_streams import DELAY_STD, at_delay, smooth
+from rdstitch.robust.posterior import WRONG_GIVEN_FOCAL
+
+_POINTS = 32  # of a pair
+_TILT_STARTS = (0.0, 0.0), (0.35, 0.0), (-0.35, 0.0), (0.0, 0.35), (0.0, -0.35)
+_STEPS, _DIFFERENCE, _SETTLED = 15, 1e-5, 1e-6  # radians
+_MAX_CONDITION, _HALVINGS = 1e6, 6
+_HORIZON = 0.05  # of a ray of unit depth: what is nearer to the horizon has no place
+_SHARED = 2.0  # pairs that the errors of a frame are common to
+_PSI, _THETA, _LOG_FOCAL, _DELAY = range(4)
+
+
+@dataclass(frozen=True)
+class SeenPairs:
+    """Points that K pairs of frames share."""
+
+    rays: FloatArray  # (2, K, M, 2): undistorted, in focal lengths
+    attitudes: FloatArray | None  # (2, K, S, 2): ψ and θ as measured at so many delays, radians
+
+    @classmethod
+    def of(cls, rays: Sequence[FloatArray], attitudes: Sequence[FloatArray]) -> "SeenPairs":
+        """From the rays (N, 2) of the one and the other frame of the first pair, of the second, and so on."""
+        chosen = [some[np.linspace(0, len(some) - 1, _POINTS).astype(np.intp)] for some in rays]
+        measured = smooth(np.array([attitudes[::2], attitudes[1::2]])) if attitudes else None
+        return cls(np.array([chosen[::2], chosen[1::2]]), measured)
+
+    def errors(self, camera: FloatArray) -> FloatArray:
+        """How far (2 K M,) points on the plane are from a rigid motion, focal lengths; inf beyond the horizon.
+
+        ``camera``: the tilt, the logarithm of how much longer the focal length is, and the delay.
+        """
+        longer = math.exp(camera[_LOG_FOCAL])
+        tilts = np.broadcast_to(camera[:2], (*self.rays.shape[:2], 2))
+        if self.attitudes is not None:
+            tilts = tilts + at_delay(self.attitudes, float(camera[_DELAY]))
+        rays = np.concatenate([self.rays / longer, np.ones((*self.rays.shape[:3], 1))], axis=-1)
+        seen = rays @ rotation_from_tilt(tilts)
+        depth = np.where(seen[..., 2] > _HORIZON, seen[..., 2], np.nan)
+        places = np.nan_to_num((seen[..., 0] + 1j * seen[..., 1]) / depth, nan=np.inf)
+        one, two = places - places.mean(axis=-1, keepdims=True)
+        turn = (one * two.conj()).sum(axis=-1, keepdims=True)
+        # In given focal lengths, as the points were measured: a longer one makes no errors smaller.
+        errors = (one - turn / np.maximum(abs(turn), 1e-300) * two) * longer
+        return np.concatenate([errors.real.ravel(), errors.imag.ravel()])
+
+
+@dataclass(frozen=True)
+class ShownCamera:
+    """What motions show of a camera."""
+
+    tilt: tuple[float, float]  # (ψ, θ), radians, with the focal length that is given
+    tilt_std: float  # of its less certain direction
+    rms: float  # of the points on the plane, heights
+    log_focal: float  # log of how much longer the focal length is than the given one, by the motions alone
+    log_focal_std: float
+    tilt_by_itself: tuple[float, float]  # the tilt with that focal length
+    delay: float  # s, by which times of attitudes are late; with the prior of that
+    delay_std: float
+
+
+def shown_camera(pairs: SeenPairs) -> ShownCamera:
+    """The tilt, and the focal length, by which the motions between frames are rigid."""
+    count, points = pairs.rays.shape[1:3]
+    base = [_PSI, _THETA] if pairs.attitudes is None else [_PSI, _THETA, _DELAY]
+    with np.errstate(all="ignore"):  # beyond the horizon
+        fits = [_fitted(pairs, np.array([*start, 0.0, 0.0]), base) for start in _TILT_STARTS]
+        camera, value, slope = min(fits, key=lambda fit: _cost(fit[1]))
+        if not np.isfinite(slope).all():
+            return ShownCamera((0.0, 0.0), math.inf, math.inf, 0.0, math.inf, (0.0, 0.0), 0.0, DELAY_STD)
+        free = [*base, _LOG_FOCAL]
+        longer, better, steeper = _fitted(pairs, camera, free)
+    variance = _covariance(value, slope, count)
+    known = np.isfinite(steeper).all() and np.linalg.cond(steeper) < _MAX_CONDITION and count >= 2 * len(free)
+    freer = _covariance(better, steeper, count) if known else np.full((4, 4), math.inf)
+    delay, delay_std = 0.0, DELAY_STD
+    if pairs.attitudes is not None and variance[2, 2] > 0.0:
+        delay_std = 1.0 / math.sqrt(1.0 / float(variance[2, 2]) + 1.0 / DELAY_STD**2)
+        delay = float(camera[_DELAY]) * delay_std**2 / float(variance[2, 2])
+    return ShownCamera(
+        (float(camera[_PSI]), float(camera[_THETA])),
+        math.sqrt(max(float(np.linalg.eigvalsh(variance[:2, :2])[-1]), 0.0)),
+        math.sqrt(_cost(value) / max(count * points, 1)),
+        float(longer[_LOG_FOCAL]) if known else 0.0,
+        math.sqrt(float(freer[-1, -1])),
+        (float(longer[_PSI]), float(longer[_THETA])),
+        delay,
+        delay_std,
+    )
+
+
+def _cost(errors: FloatArray) -> float:
+    cost = float(errors @ errors)
+    return cost if math.isfinite(cost) else math.inf
+
+
+def _covariance(errors: FloatArray, slope: FloatArray, pairs: int) -> FloatArray:
+    """Covariance (F, F) of what was fitted, by errors (2 K M,) that those of one pair may have in common."""
+    freedom = slope.shape[1]
+    inverse = np.linalg.pinv(slope.T @ slope, hermitian=True)
+    apart = float(errors @ errors) / max(len(errors) - 3 * pairs - freedom, 1)
+    of_pairs = (slope * errors[:, None]).reshape(2, pairs, -1, freedom).sum(axis=(0, 2))
+    together = pairs / max(pairs - freedom, 1) * of_pairs.T @ of_pairs
+    return np.asarray(apart * inverse + _SHARED * inverse @ together @ inverse)
+
+
+def _fitted(pairs: SeenPairs, start: FloatArray, free: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The camera, its errors and their derivatives (2 N, F) after Gauss and Newton's steps."""
+    camera, value, change = start, pairs.errors(start), np.full((1, len(free)), np.nan)
+    steps = _DIFFERENCE * np.eye(len(start))[free]
+    for _ in range(_STEPS):
+        change = np.stack([pairs.errors(camera + step) - value for step in steps], axis=1) / _DIFFERENCE
+        if not np.isfinite(change).all():
+            break
+        step = np.zeros(len(start))
+        step[free] = np.linalg.lstsq(change, value, rcond=None)[0]
+        shorter = ((step / 2**k, pairs.errors(camera - step / 2**k)) for k in range(_HALVINGS))
+        step, after = next((one for one in shorter if _cost(one[1]) < _cost(value)), (step, None))
+        if after is None:
+            break
+        camera, value = camera - step, after
+        if abs(step).max() < _SETTLED:
+            break
+    return camera, value, change
+
+
+def judged_focal(stated_std: float, shown: float, shown_std: float) -> tuple[float, float]:
+    """How far a given focal length may be off, and how likely it is wrong.
+
+    It is right within what was stated of it, or wrong by anything; see :data:`WRONG_GIVEN_FOCAL`.
+
+    Parameters
+    ----------
+    stated_std : float
+        Of the logarithm of the given focal length.
+    shown, shown_std : float
+        By how much the images show a longer one, as a logarithm, and its standard deviation; inf where they do not.
+
+    Returns
+    -------
+    float, float
+        Root mean square of the error of its logarithm; probability.
+    """
+    share, far = WRONG_GIVEN_FOCAL
+    logs, squares = [], []
+    for weight, std in ((1.0 - share, stated_std), (share, far)):
+        spread = std**2 + shown_std**2
+        gain = std**2 / spread if math.isfinite(spread) else 0.0
+        logs.append(math.log(weight) - (0.5 * (math.log(spread) + shown**2 / spread) if gain else 0.0))
+        squares.append((gain * shown) ** 2 + (1.0 - gain) * std**2)
+    wrong = 1.0 / (1.0 + math.exp(min(logs[0] - logs[1], 700.0)))
+    return math.sqrt((1.0 - wrong) * squares[0] + wrong * squares[1]), wrong

@@ -1,0 +1,138 @@
+"""Wheel odometry: the scale of a path, poses of frames that show nothing, offline and live."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rdstitch
+from rdstitch.alignment.odometry import OdometryFit, bridged, scaled_by_odometry
+from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.arrays import FloatArray
+from rdstitch.errors import InputError
+from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.sensor_streams import BodyPose, read_odometry
+from rdstitch.synthetic import Sequence
+from tests.floor_drives import DISTORTION, floor_drive, true_path
+
+HEIGHT, LEVER, MOUNT = 0.42, 0.15 - 0.06j, np.exp(0.5j * np.pi)  # metres; the top of the image is ahead
+
+
+def _bodies(path: Trajectory, slip: float, seed: int = 0) -> list[BodyPose]:
+    """What wheels say of the body that carries a camera along a path in metres."""
+    rng, yaw = np.random.default_rng(seed), path.yaw
+    camera = path.position @ np.array([1.0, -1.0j]) * MOUNT
+    body = camera - LEVER * np.exp(1j * yaw)
+    steps = np.diff(body) * (1.0 + slip * rng.standard_normal(len(body) - 1))
+    places = np.concatenate([[0.0], np.cumsum(steps)])
+    return [BodyPose(place.real, place.imag, turn) for place, turn in zip(places, yaw.tolist(), strict=True)]
+
+
+def _path(seed: int = 0) -> Trajectory:
+    """In heights, with noise of a thousandth of a step."""
+    rng = np.random.default_rng(seed)
+    yaw = np.cumsum(rng.normal(0.0, 0.15, 40))
+    ahead = np.stack([np.sin(-yaw), -np.cos(-yaw)], axis=1)
+    position = np.cumsum(0.5 * ahead, axis=0)
+    return Trajectory(np.arange(40), position - position[0], yaw - yaw[0], np.ones(40))
+
+
+def test_the_scale_and_the_mount_are_found_as_well_as_it_says() -> None:
+    errors = []
+    for seed in range(20):
+        path = _path(seed)
+        metres = replace(path, position=path.position * HEIGHT)
+        found = scaled_by_odometry(path, list(_bodies(metres, 0.02, seed)), keep_unit=False)
+        assert found is not None
+        scaled, fit = found
+        errors.append((scaled.height[0] / HEIGHT - 1.0) / np.sqrt(fit.relative_std**2 - 0.01**2))
+        assert abs(fit.lever - LEVER) < 0.05
+        assert fit.scale == pytest.approx(MOUNT, abs=0.05)
+        assert 0.01 < fit.relative_std < 0.03
+    assert 0.3 < np.mean(np.square(errors)) < 2.5
+    assert OdometryFit.of([]) is None
+
+
+def test_frames_without_texture_get_their_poses() -> None:
+    whole = _path()
+    metres = replace(whole, position=whole.position * HEIGHT, height=whole.height * HEIGHT)
+    bodies = dict(enumerate(_bodies(metres, 0.01)))
+    seen = np.r_[0:15, 20:35]
+    shown = Trajectory(seen, whole.position[seen], whole.yaw[seen], whole.height[seen], covariance=np.zeros((30, 4, 4)))
+    found = scaled_by_odometry(shown, [bodies[int(k)] for k in seen], keep_unit=False)
+    assert found is not None
+    path = bridged(found[0], bodies, found[1])
+    assert path.frame.tolist() == list(range(40))
+    assert np.abs(path.position - metres.position)[:35].max() < 0.03
+    assert path.covariance is not None
+    off = np.linalg.norm(path.position - metres.position * path.height[0] / HEIGHT, axis=1)
+    assert (off < 4.0 * np.sqrt(np.trace(path.covariance[:, :2, :2], axis1=1, axis2=2)) + 0.004).all()
+    assert path.covariance[38, 0, 0] > path.covariance[36, 0, 0] > 0.0
+
+
+@pytest.fixture(scope="module")
+def drive() -> Sequence:
+    return floor_drive("turn", 16, seed=3, size=(320, 240), overlap=0.6)
+
+
+def _metres(drive: Sequence) -> Trajectory:
+    path = true_path(drive)
+    turn, first = np.exp(1j * path.yaw[0]), path.position[0]
+    places = turn * ((path.position - first) @ [1.0, 1.0j]) * HEIGHT / path.height[0]
+    return replace(path, position=np.stack([places.real, places.imag], axis=1), yaw=path.yaw - path.yaw[0])
+
+
+def _files(drive: Sequence, folder: Path) -> dict[str, Any]:
+    """Odometry at twice the rate of the frames, and times of these."""
+    bodies, times = _bodies(_metres(drive), 0.01), np.arange(len(drive)) * 0.1
+    between = [BodyPose(*np.mean([a, b], axis=0)) for a, b in pairwise(bodies)]
+    rows = sorted([*zip(times, bodies, strict=True), *zip(times[:-1] + 0.05, between, strict=True)])
+    text = "".join(f"{t:.3f},{b.x:.6f},{b.y:.6f},{np.degrees(b.yaw):.6f}\n" for t, b in rows)
+    (folder / "odom.csv").write_text(f"timestamp,x,y,yaw_deg\n{text}", encoding="utf-8")
+    (folder / "times.txt").write_text("".join(f"{time}\n" for time in times), encoding="utf-8")
+    return {"odometry": folder / "odom.csv", "timestamps": folder / "times.txt"}
+
+
+CAMERA = Camera((320, 240), DISTORTION, focal=256.0, focal_source="option")
+
+
+def _within(places: FloatArray, drive: Sequence) -> None:
+    assert np.abs(places - _metres(drive).position).max() < 0.06 * HEIGHT + 0.02
+
+
+def test_offline_and_live_give_metres_and_bridge_what_shows_nothing(drive: Sequence, tmp_path: Path) -> None:
+    images = list(drive.frames())
+    for k in (9, 10):
+        images[k] = np.full_like(images[k], 120)
+    options = rdstitch.StitchOptions(camera=CAMERA, tilt=(np.radians(3.0), np.radians(-2.0)), **_files(drive, tmp_path))
+    path, registration = rdstitch.trajectory(images, options=options)
+    assert path.frame.tolist() == list(range(16))
+    assert path.height[0] == pytest.approx(HEIGHT, rel=0.03)
+    _within(path.position, drive)
+    assert any("placed by the odometry alone: image_0009" in message.text for message in registration.messages)
+
+    tracker, poses = rdstitch.Tracker(options, rdstitch.FollowedPoses(frame="camera")), dict[int, rdstitch.Pose]()
+    for k, image in enumerate(images):
+        pose = tracker.add(image, 0.1 * k)
+        poses |= {known.number: known for known in (*tracker.revised, pose)}
+    assert all(poses.values())
+    assert {pose.map for pose in poses.values()} == {0}
+    late = [k for k in poses if k > 6]
+    places = np.array([poses[k].position[:2] for k in late])
+    assert np.abs(places - _metres(drive).position[late]).max() < 0.08 * HEIGHT + 0.03
+    assert 0.01 < poses[15].length_std < 0.03
+
+
+def test_odometry_is_read_from_tum_and_refused_by_line(tmp_path: Path) -> None:
+    file = tmp_path / "odom.tum"
+    file.write_text("# time\n1 0 0 0 0 0 0 1\n2 1 0.5 0 0 0 0.70710678 0.70710678\n", encoding="utf-8")
+    body = read_odometry(file).at(1.5)
+    assert body is not None
+    assert body[:3] == pytest.approx((0.5, 0.25, np.pi / 4))
+    assert read_odometry(file).at(2.5) is None
+    file.write_text("1 0 0 0 0 0 0 1\n2 1 0.5 0 0 0 one 1\n", encoding="utf-8")
+    with pytest.raises(InputError, match="line 2"):
+        read_odometry(file)
