@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
+from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, TILTING, YAW, X, Y
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
@@ -133,3 +134,7 @@ def jittered(poses: FloatArray, height: float, tilt: float, rng: np.random.Gener
     result[:, LOG_HEIGHT] = np.log1p(rng.uniform(-height, height, len(poses)))
     result[:, [PSI, THETA]] = rng.normal(0, tilt, (len(poses), 2))
     return result
+
+
+def aligned(given: Scene, **options: object) -> Alignment:
+    return align(given.cameras, given.links, AlignmentOptions(**options))  # type: ignore[arg-type]

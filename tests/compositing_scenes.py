@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from examples.judging.comparison import plane_under
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing import Canvas, PlacedImage, plan_canvas
+from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedImage, compose, plan_canvas
 from rdstitch.compositing.source_images import Displacement, ImageLoader
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import DecodedImage, Metadata
@@ -38,6 +38,12 @@ class Scene:
     @property
     def images(self) -> list[PlacedImage]:
         return place_images(self.sources, self.cameras, self.homographies)
+
+    def composed(self, frames: Sequence[NDArray[Any]] | None = None, **options: Any) -> Composite:
+        """The images, or other ones from the same places, as one."""
+        sources = self.sources if frames is None else [partial(as_image, frame) for frame in frames]
+        images = place_images(sources, self.cameras, self.homographies)
+        return compose(images, self.canvas, CompositeOptions(**options))
 
     def truth(self, canvas: Canvas | None = None) -> NDArray[np.float32]:
         """The plane as a perfect composite shows it: grey (h, w), 0 to 1."""
@@ -94,6 +100,16 @@ def inner(alpha: NDArray[np.uint8], margin: int = 4) -> NDArray[np.bool_]:
     """Covered px at least ``margin`` px from what is not."""
     kernel = np.ones((2 * margin + 1,) * 2, np.uint8)
     return cv2.erode((alpha > 0).astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0
+
+
+def side_by_side(frames: Sequence[NDArray[Any]], places: Sequence[tuple[float, float]], **options: Any) -> Composite:
+    """Frames of one size that lie at these places in a plane, pixels, as one."""
+    lens = Camera((frames[0].shape[1], frames[0].shape[0]))
+    homographies = np.tile(np.eye(3), (len(places), 1, 1))
+    homographies[:, :2, 2] = np.array(places) / lens.scale
+    cameras = [lens] * len(places)
+    images = place_images([partial(as_image, frame) for frame in frames], cameras, homographies)
+    return compose(images, plan_canvas(cameras, homographies), CompositeOptions(**options))
 
 
 def place_images(

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.geometry.camera import Camera
 from tests.alignment_scenes import Scene, grid, scene
 
@@ -15,10 +14,6 @@ def lens_scene(lens: Camera, seed: int, *, relief: float = 0.0, columns: int = 4
     rng = np.random.default_rng(seed)
     poses = grid(columns, rows, (0.4, 0.35), np.pi, rng)
     return scene(poses, lens=lens, rng=rng, noise=0.25, relief=relief, focal=420.0)
-
-
-def aligned(given: Scene, **options: object) -> Alignment:
-    return align(given.cameras, given.links, AlignmentOptions(**options))  # type: ignore[arg-type]
 
 
 def lens_distance(found: Camera, truth: Camera) -> float:

@@ -276,7 +276,7 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
         attitudes_std=options.attitude_std,
         gravity=_gravity(sources, quarters),
         positions=positions_of(sources) if sources else None,
-        positions_std=[math.nan if p is None or p.std is None else p.std[0] for p in places],
+        positions_std=[math.nan if p is None or p.std is None else p.std[0] for p in places] or None,
         pose_covariance=options.pose_covariance,
     )
 

@@ -255,12 +255,17 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
     # A pattern that repeats itself is as high in many places of the plain correlation, and in chance ones of the other.
     for values, threshold in ((surface, peak_threshold(deviation, surface.size)), (plain, 0.0)):
         shown = np.where(possible, values, 0.0).astype(np.float32)
-        rows, columns = np.nonzero((shown == cv2.dilate(shown, np.ones((3, 3), np.uint8))) & (shown > threshold))
-        order = np.argsort(-shown[rows, columns], kind="stable")[:_WIDE_PEAKS]
-        found |= dict.fromkeys(zip(x[columns[order]].tolist(), y[rows[order]].tolist(), strict=True))
+        found |= dict.fromkeys((int(x[column]), int(y[row])) for column, row in peaks(shown, threshold, _WIDE_PEAKS))
     places = np.array(list(found), dtype=np.float64).reshape(-1, 2)
     boxes = [Overlap.expected(0, 1, place, sizes[:, ::-1], 1) for place in places]
     return places, np.array([log_evidence(tiles, box, at) for at, box in zip(places, boxes, strict=True)])
+
+
+def peaks(surface: NDArray[Any], threshold: float, count: int) -> list[tuple[int, int]]:
+    """Columns and rows of the highest peaks above a threshold, so many at most, the highest first."""
+    rows, columns = np.nonzero((surface == cv2.dilate(surface, np.ones((3, 3), np.uint8))) & (surface > threshold))
+    order = np.argsort(-surface[rows, columns], kind="stable")[:count]
+    return list(zip(columns[order].tolist(), rows[order].tolist(), strict=True))
 
 
 def peak_threshold(deviation: float, places: int) -> float:

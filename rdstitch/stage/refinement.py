@@ -34,6 +34,10 @@ class BlockMatches:
     points2: FloatArray
     information: FloatArray  # (M, 2, 2): inverse covariance of their difference, 1/pixels²
 
+    @classmethod
+    def none(cls) -> "BlockMatches":
+        return cls(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2, 2)))
+
     def __len__(self) -> int:
         """Number of blocks."""
         return len(self.points1)
@@ -51,7 +55,7 @@ def refine(
     """Refine where blocks (K, 4) of the first tile (h, w) are in the second; ``tolerance`` pixels off at most."""
     matches = [match for block in blocks if (match := _refined(first, second, block, transfer, tolerance)) is not None]
     if not matches:
-        return BlockMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2, 2)))
+        return BlockMatches.none()
     points1, points2, information = (np.array(values) for values in zip(*matches, strict=True))
     return BlockMatches(points1, points2, information)
 

@@ -1,11 +1,12 @@
 """From nominal places and tiles to all places: correlate, learn the stage, refine, adjust."""
 
+import csv
+import io
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +20,7 @@ from rdstitch.stage.correlation import (
     correlate,
     log_evidence,
     peak_threshold,
+    peaks,
     wide_peaks,
 )
 from rdstitch.stage.grid import TileGrid
@@ -232,9 +234,9 @@ class _PairFinder:
                 heights[int(np.abs(overlap.offset).argmax())] += tops
         inner = slice(self.spare, self.spare + 2 * self.radius + 1)
         plain = surface.plain[inner, inner].astype(np.float64)
-        likely = [_vertex(total, *at) for at in _maxima(total, _threshold(total, _NARROW))]
+        likely = [_vertex(total, *at) for at in peaks(total, _threshold(total, _NARROW), _CANDIDATES)]
         # Of a repeated pattern all places are alike, whichever of them a whitened correlation makes higher.
-        others = [_vertex(plain, *at) for at in _maxima(plain, 0.0)]
+        others = [_vertex(plain, *at) for at in peaks(plain, 0.0, _CANDIDATES)]
         grain = min(tile.grain for tile in tiles)
         others = [at for at in others if all(np.abs(at - other).max() > grain for other in likely)]
         offsets: list[FloatArray] = []
@@ -250,13 +252,6 @@ class _PairFinder:
             places, values = wide_peaks(tiles)
             offsets, nats = [*offsets, *places], [*nats, *values.tolist()]
         return _Candidates(self.factor * np.array(offsets).reshape(-1, 2), np.array(nats), self.factor * grain)
-
-
-def _maxima(surface: FloatArray, threshold: float) -> list[tuple[int, int]]:
-    """Columns and rows of the highest peaks above a threshold, the highest first."""
-    y, x = np.nonzero((surface == cv2.dilate(surface, np.ones((3, 3)))) & (surface > threshold))
-    order = np.argsort(-surface[y, x], kind="stable")[:_CANDIDATES]
-    return [(int(x[k]), int(y[k])) for k in order]
 
 
 def _vertex(surface: FloatArray, x: int, y: int) -> FloatArray:
@@ -401,13 +396,9 @@ def _coarse_links(grid: TileGrid, pairs: IntArray, chosen: dict[int, FloatArray]
 
 def _links(pairs: IntArray, matches: dict[int, BlockMatches]) -> LinkedPoints:
     """Concatenate the matches of all pairs."""
-    blocks = list(matches.values())
-    if not blocks:
-        return LinkedPoints(
-            np.empty(0, np.intp), np.empty((0, 2), np.intp), np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2, 2))
-        )
+    blocks = [BlockMatches.none(), *matches.values()]
     return LinkedPoints(
-        np.repeat(np.arange(len(blocks)), [len(match) for match in blocks]),
+        np.repeat(np.arange(-1, len(matches)), [len(match) for match in blocks]),
         pairs[list(matches)],
         np.concatenate([match.points1 for match in blocks]),
         np.concatenate([match.points2 for match in blocks]),
@@ -429,26 +420,15 @@ def _result(
 
 def places_table(names: Sequence[str], tiled: TileRegistration) -> str:
     """CSV of name, x and y of the first pixel, row, column, what placed it, and micrometres where they are known."""
-    grid, fitted = tiled.grid, tiled.adjustment
-    places = fitted.places - fitted.places.min(axis=0)
-    header = ["name", "x", "y", "std", "row", "column", "placed_by"]
-    if grid.pixel_size is not None:
-        header += ["x_um", "y_um"]
-    lines, stds = [",".join(header)], tiled.stds
-    for index, name in enumerate(names):
-        x, y = places[index].tolist()
-        by = "overlap" if tiled.linked[index] else "stage"
-        quoted = f'"{name}"' if "," in name else name
-        cells = [
-            quoted,
-            f"{x:.3f}",
-            f"{y:.3f}",
-            f"{stds[index]:.3f}",
-            str(grid.rows[index]),
-            str(grid.columns[index]),
-            by,
-        ]
-        if grid.pixel_size is not None:
-            cells += [f"{x * grid.pixel_size:.4f}", f"{y * grid.pixel_size:.4f}"]
-        lines.append(",".join(cells))
-    return "\n".join([*lines, ""])
+    grid, places = tiled.grid, tiled.adjustment.places
+    places = places - places.min(axis=0)
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    micrometres = [] if grid.pixel_size is None else ["x_um", "y_um"]
+    table.writerow(["name", "x", "y", "std", "row", "column", "placed_by", *micrometres])
+    rows, columns = grid.rows, grid.columns
+    for k, (name, place, std) in enumerate(zip(names, places.tolist(), tiled.stds, strict=True)):
+        line = [name, *(f"{value:.3f}" for value in (*place, std)), rows[k], columns[k]]
+        by = "overlap" if tiled.linked[k] else "stage"
+        table.writerow([*line, by, *(f"{value * grid.pixel_size:.4f}" for value in place if grid.pixel_size)])
+    return text.getvalue()

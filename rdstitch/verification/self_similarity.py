@@ -105,7 +105,18 @@ def placement_ambiguity(first: Drawing, second: Drawing, longest_side: int = MAX
     enough = overlaps.area >= limit("kept overlap") * most
     other = np.where(peak & (distance > share * _MIN_SHIFT) & enough, score, np.float32(0.0))
     best = int(other.argmax())
-    return Ambiguity(float(score[near].max()), float(other.flat[best]), float(distance.flat[best]) / longest_side)
+    elsewhere = float(other.flat[best]) and _between_pixels(score, *np.unravel_index(best, score.shape))
+    return Ambiguity(float(score[near].max()), elsewhere, float(distance.flat[best]) / longest_side)
+
+
+def _between_pixels(score: Grey, row: np.intp, column: np.intp) -> float:
+    """Height of a peak between pixels, by a parabola across each axis: a period is no whole number of pixels."""
+    top = float(score[row, column])
+    for line, at in ((score[:, column], row), (score[row], column)):
+        if 0 < at < len(line) - 1:
+            before, after = float(line[at - 1]), float(line[at + 1])
+            top += (after - before) ** 2 / max(8.0 * (2.0 * float(line[at]) - before - after), 1e-12)
+    return min(top, 1.0)
 
 
 def find_ambiguity(first: ComparedImage, second: ComparedImage) -> Ambiguity:

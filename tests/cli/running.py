@@ -1,5 +1,6 @@
 """The command line, run in this process or as a stranger runs it, and small images to run it on."""
 
+import csv
 import json
 import os
 import re
@@ -102,6 +103,11 @@ def finished(process: "subprocess.Popen[bytes]", data: bytes | None = None) -> O
     out, err = process.communicate(data, timeout=300)
     assert b"Traceback" not in err, err.decode("utf-8", "replace")
     return Outcome.of(process.returncode, out.decode("utf-8", "replace"), err.decode("utf-8", "replace"))
+
+
+def rows_of(table: Path) -> list[dict[str, str]]:
+    with table.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
 
 
 def state_of(folder: Path) -> dict[str, bytes | None]:

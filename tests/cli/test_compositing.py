@@ -73,6 +73,7 @@ def test_amounts_of_memory() -> None:
 def test_dry_run_reports_and_writes_nothing(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     done = rdstitch("mosaic", *frames, "-o", tmp_path / "a.tif", "--dry-run", *CACHED, err="")
     assert not list(tmp_path.iterdir())
+    assert done.made == ""
     distortion, *plan = done.out.splitlines()
     float(distortion)
     told = dict(line.split(": ") for line in plan)

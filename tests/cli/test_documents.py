@@ -54,11 +54,6 @@ def test_readme_names_every_command_and_no_other() -> None:
     assert named == set(cli.load_all())
 
 
-def test_the_set_ups_are_one_line_each() -> None:
-    blocks = re.findall(r"(?ms)^```sh\n(.*?)^```$", README.read_text(encoding="utf-8"))
-    assert [len(block.splitlines()) for block in blocks] == [1, 1]
-
-
 def test_every_page_is_in_the_site() -> None:
     listed = set(re.findall(r"(?m): ([a-z-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
     assert listed == {page.name for page in (ROOT / "docs").glob("*.md")}

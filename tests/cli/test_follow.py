@@ -1,6 +1,5 @@
 """``--follow``: a line for each frame as it arrives, and in the end what a run over the whole folder gives."""
 
-import csv
 import json
 import shutil
 import signal
@@ -17,7 +16,7 @@ from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.follow import follow
-from tests.cli.running import DISTORTION, FAST, Run, flight, start
+from tests.cli.running import DISTORTION, FAST, Run, flight, rows_of, start
 from tests.sampled import sampled
 
 
@@ -130,8 +129,7 @@ def test_lines_have_the_units_and_the_times_of_the_table(
     done = rdstitch("trajectory", folder, "-o", output, "--follow", "--idle", "0.1", *known)
     lines = [json.loads(line) for line in done.out.splitlines()][:-1]
     live = {line["name"]: line for line in lines if line["x"] is not None}
-    with output.open(encoding="utf-8", newline="") as stream:
-        table = list(csv.DictReader(stream))
+    table = rows_of(output)
     assert [row["name"] for row in table] == sorted(live)
     for row in table:
         line = live[row["name"]]

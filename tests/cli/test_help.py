@@ -71,8 +71,3 @@ def test_help_loads_neither_opencv_nor_scipy(arguments: list[str]) -> None:
     done = subprocess.run([sys.executable, "-c", check, *arguments], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout
-
-
-def test_version(rdstitch: Run) -> None:
-    shown = rdstitch("--version")
-    assert re.fullmatch(r"rdstitch, version \d+\.\d+\.\d+\n", shown.out)

@@ -49,19 +49,6 @@ def test_every_way_to_name_images(frames: list[Path], tmp_path: Path, how: str) 
     assert [image["name"] for image in record["images"]] == [path.name for path in frames]
 
 
-def test_an_unreadable_image_is_left_out_by_name(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    folder = tmp_path / "folder"
-    shutil.copytree(frames[0].parent, folder)
-    broken = folder / "broken.png"
-    broken.write_bytes(frames[0].read_bytes()[:2000])
-    rdstitch("mosaic", folder, "-o", tmp_path / "mosaic.jpg", *CACHED, told=str(broken))
-    record = json.loads((tmp_path / "mosaic.jpg.json").read_text(encoding="utf-8"))
-    assert {image["name"]: image["used"] for image in record["images"]} == {
-        "broken.png": False,
-        **{path.name: True for path in frames},
-    }
-
-
 def test_its_own_output_is_no_input(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     folder = tmp_path / "folder"
     shutil.copytree(frames[0].parent, folder)

@@ -82,7 +82,7 @@ def test_quiet_prints_nothing_and_verbose_prints_more(
 ) -> None:
     arguments = ("pano", *frames[:2], stranger, "-o", tmp_path / "pano.jpg", "--overwrite", *CACHED)
     quiet, usual, verbose = rdstitch(*arguments, "-q"), rdstitch(*arguments), rdstitch(*arguments, "-v")
-    assert quiet.err == ""
+    assert quiet.err == quiet.made == ""
     assert len(usual.err.splitlines()) < len(verbose.err.splitlines())
     assert quiet.out == usual.out == verbose.out
 

@@ -137,13 +137,6 @@ def test_the_numbers_are_those_of_the_result(pair: StitchResult) -> None:
     assert (graph.count("<path"), graph.count("<line"), graph.count("<circle")) == (2, 1, 2)
 
 
-def test_calibrate_has_no_mosaic(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    report = tmp_path / "lens.html"
-    rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", "--report", report, *CACHED)
-    headings = [heading for heading in _SECTIONS if heading not in _OF_IMAGES]
-    assert _checked(report.read_text(encoding="utf-8")).headings == headings
-
-
 @pytest.mark.parametrize(("command", "output"), [("mosaic", "out.png"), ("calibrate", "lens.json")])
 def test_what_is_refused_is_shown(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, output: str

@@ -1,6 +1,5 @@
 """What robots load: a map of nav2, odometry in a bag, all in one frame."""
 
-import csv
 import math
 import sys
 from pathlib import Path
@@ -11,12 +10,11 @@ import pytest
 import yaml
 from PIL import Image
 
-from tests.cli.running import CACHED, Run
+from tests.cli.running import CACHED, Run, rows_of
 
 
 def _poses(file: Path) -> np.ndarray[Any, Any]:
-    with file.open(encoding="utf-8", newline="") as stream:
-        return np.array([[float(row[key]) for key in ("x", "y", "yaw_deg")] for row in csv.DictReader(stream)])
+    return np.array([[float(row[key]) for key in ("x", "y", "yaw_deg")] for row in rows_of(file)])
 
 
 def test_map_poses_and_odometry_lie_in_one_frame(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Robots: videos, a lens, a path, and floors."""
 
-import csv
 import json
 import re
 from functools import partial
@@ -20,26 +19,16 @@ from rdstitch.camera_files.lens_models import nearest_model
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image
 from rdstitch.synthetic import Photometry, Sequence, drive_poses, ground, sequence_over
-from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, start
+from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, rows_of, start
 from tests.floor_drives import read_path, true_path
 from tests.videos import write_video
 
 
-def _rows(file: Path) -> list[dict[str, str]]:
-    with file.open(encoding="utf-8", newline="") as stream:
-        return list(csv.DictReader(stream))
-
-
-@pytest.fixture
-def video(frames: list[Path], tmp_path: Path) -> Path:
-    """Each frame twice, at 5 frames a second."""
-    return write_video(tmp_path / "drive.avi", (read_image(frame).pixels for frame in frames for _ in range(2)))
-
-
-def test_frames_of_a_video_keep_their_numbers_and_times(rdstitch: Run, video: Path, tmp_path: Path) -> None:
+def test_frames_of_a_video_keep_their_numbers_and_times(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "path.csv"
+    video = write_video(tmp_path / "drive.avi", (read_image(frame).pixels for frame in frames for _ in range(2)))
     rdstitch("trajectory", video, "--every", "2", "-o", output, "--focal", "380", *CACHED)
-    rows = _rows(output)
+    rows = rows_of(output)
     assert [row["source_frame"] for row in rows] == ["0", "2", "4"]
     assert [row["frame"] for row in rows] == ["0", "1", "2"]
     np.testing.assert_allclose([float(row["timestamp"]) for row in rows], [0.0, 0.4, 0.8], atol=1e-6)
@@ -69,21 +58,6 @@ def test_exif_tells_the_time(rdstitch: Run, frames: list[Path], tmp_path: Path) 
     np.testing.assert_allclose(np.loadtxt(output)[:, 0], 1714557600.25 + np.arange(3), atol=1e-5)
 
 
-@pytest.mark.parametrize("header", ["name,timestamp\n", "# timestamp filename\n"])
-def test_lists_of_time_stamps(rdstitch: Run, frames: list[Path], tmp_path: Path, header: str) -> None:
-    times = tmp_path / "times.txt"
-    lines = [
-        f"{frame.name},{10 + k}.5\n" if "," in header else f"{10 + k}.5 rgb/{frame.name}\n"
-        for k, frame in enumerate(frames)
-    ]
-    times.write_text(header + "".join(lines), encoding="utf-8")
-    known = ("--timestamps", times, "--focal", "380", *CACHED)
-    rdstitch("trajectory", *frames, "-o", tmp_path / "path.csv", *known)
-    assert [row["timestamp"] for row in _rows(tmp_path / "path.csv")] == ["10.500000", "11.500000", "12.500000"]
-    times.write_text(header + lines[0], encoding="utf-8")
-    rdstitch("trajectory", *frames, "-o", tmp_path / "lacking.csv", *known, status=3, told=frames[1].name)
-
-
 def test_without_times_numbers_stand_for_them_and_that_is_said(
     rdstitch: Run, frames: list[Path], tmp_path: Path
 ) -> None:
@@ -102,7 +76,7 @@ def test_what_cannot_be_read_keeps_its_time_and_is_counted(rdstitch: Run, frames
     (tmp_path / "times.txt").write_text("".join(f"{100 + k}\n" for k in range(6)), encoding="utf-8")
     known = ("--timestamps", tmp_path / "times.txt", "--focal", "380", *CACHED)
     done = rdstitch("trajectory", folder, "-o", tmp_path / "path.csv", *known)
-    assert [row["timestamp"] for row in _rows(tmp_path / "path.csv")] == ["100.000000", "102.000000", "104.000000"]
+    assert [row["timestamp"] for row in rows_of(tmp_path / "path.csv")] == ["100.000000", "102.000000", "104.000000"]
     assert "3 of 6 images" in done.made
     for name in ("1.png", "3.png", "5.png"):
         assert name in done.err
@@ -115,7 +89,7 @@ def test_two_videos_of_one_name_are_two(rdstitch: Run, frames: list[Path], tmp_p
         write_video(video, (read_image(frame).pixels for frame in part))
     rdstitch("trajectory", *videos, "-o", tmp_path / "path.csv", "--focal", "380", *CACHED)
     names = [f"{name}.png" for name in ("a/drive_000000", "drive_000001", "b/drive_000000")]
-    assert [row["name"] for row in _rows(tmp_path / "path.csv")] == names
+    assert [row["name"] for row in rows_of(tmp_path / "path.csv")] == names
 
 
 def _write_bag(
@@ -194,7 +168,7 @@ def test_a_bag_is_as_good_as_its_frames(
     of_files = rdstitch("trajectory", *frames, "-o", tmp_path / "files.csv", "--focal", "380", *CACHED)
     assert done.out == of_files.out
     assert abs(float(done.out) - DISTORTION) < 0.01
-    assert [row["timestamp"] for row in _rows(output)] == ["1000.000000", "1000.500000", "1001.000000"]
+    assert [row["timestamp"] for row in rows_of(output)] == ["1000.000000", "1000.500000", "1001.000000"]
     rdstitch("mosaic", bag, "--topic", "/other", "-o", tmp_path / "out.png", *CACHED, status=3, told="/camera")
 
 
@@ -263,8 +237,7 @@ def test_csv_holds_the_path(rdstitch: Run, frames: list[Path], sequence: Sequenc
     known = ("--focal", str(sequence.lens.focal), "--plot", tmp_path / "path.svg")
     done = rdstitch("trajectory", frames[0].parent, "-o", tmp_path / "path.csv", *known, *CACHED, err="")
     assert abs(float(done.out) - DISTORTION) < 0.01
-    with (tmp_path / "path.csv").open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = rows_of(tmp_path / "path.csv")
     place = np.array([[float(row["x"]), float(row["y"])] for row in rows])
     steps = np.linalg.norm(np.diff(place, axis=0), axis=1)
     true = np.linalg.norm(np.diff(sequence.poses.position, axis=0), axis=1)

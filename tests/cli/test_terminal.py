@@ -50,11 +50,6 @@ def test_the_last_line_says_what_was_made(rdstitch: Run, frames: list[Path], tmp
     assert "straight: 3 images undistorted" in straight.made
 
 
-def test_nothing_is_said_when_quiet_or_nothing_was_made(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    assert rdstitch("pano", *frames, "-o", tmp_path / "pano.png", "-q", *CACHED).made == ""
-    assert rdstitch("pano", *frames, "-o", tmp_path / "dry.png", "--dry-run", *CACHED).made == ""
-
-
 def test_the_bar_is_gone_before_lambda(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     with Reporter(0) as reporter:

@@ -1,6 +1,5 @@
 """``rdstitch tiles``, run for real on rendered tiles of a stage."""
 
-import csv
 import json
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import tifffile
 
 from rdstitch.io.flat_field import FlatField
 from rdstitch.report.page import backlash
-from tests.cli.running import SIDECAR_SCHEMA, Run
+from tests.cli.running import SIDECAR_SCHEMA, Run, rows_of
 from tests.stage_grid import StageGrid
 
 STAGE = StageGrid(rows=3, columns=3, tile=256, overlap=0.15, content=0.8, backlash=4.0, seed=5)
@@ -30,7 +29,7 @@ def test_samples_of_the_mosaic_are_those_of_the_tiles(rdstitch: Run, slide: Path
         "tiles", slide, *NAMED, "-o", output, "--positions-only", table, "--report", tmp_path / "r.html", "-j", "1"
     )
     mosaic = tifffile.imread(output)
-    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
+    rows = rows_of(table)
     found = np.array([(float(row["x"]), float(row["y"])) for row in rows])
     off = found - STAGE.places
     assert np.linalg.norm(off - np.median(off, axis=0), axis=1).max() < 0.5
@@ -63,7 +62,7 @@ def test_places_from_a_mirrored_stage_are_found_too(rdstitch: Run, slide: Path, 
     stage.write_text("\n".join(["name,x,y", *lines]), encoding="utf-8")
     table = tmp_path / "places.csv"
     rdstitch("tiles", slide, "--positions", stage, "--positions-only", table, "-j", "1")
-    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
+    rows = rows_of(table)
     assert float(rows[0]["x"]) < float(rows[2]["x"])
     assert not list(tmp_path.glob("*.json"))
 

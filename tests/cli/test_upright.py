@@ -74,6 +74,13 @@ def _placed(sidecar: Path, sequence: Sequence) -> tuple[float, float, float]:
     return float(angle), float(np.hypot(ax, ay) / np.hypot(bx, by)), error
 
 
+def _check_upright(output: Path, sequence: Sequence, of_aspect: float = 0.01) -> None:
+    angle, aspect, error = _placed(Path(f"{output}.json"), sequence)
+    assert angle < 0.2
+    assert aspect == pytest.approx(1.0, abs=of_aspect)
+    assert error < 1.0 or of_aspect > 0.01
+
+
 def _corners(sequence: Sequence) -> str:
     middle = sequence.to_plane(0, [(199.5, 149.5)])[0]
     corners = sequence.to_image(0, middle + np.array([(-120, -80), (120, -80), (120, 80), (-120, 80)]))
@@ -99,10 +106,7 @@ def test_a_facade_becomes_upright(
     images, output, again = ("--images", paths[0].parent), tmp_path / "up.png", tmp_path / "again.png"
     done = rdstitch("apply", registered, *images, "-o", output, *how)
     assert ("1.5 times as wide as high" in done.err) == (way == "rectangle")
-    angle, aspect, error = _placed(Path(f"{output}.json"), sequence)
-    assert angle < 0.2
-    assert aspect == pytest.approx(1.0, abs=0.01)
-    assert error < 1.0
+    _check_upright(output, sequence)
     # The sidecar of that does the same, without looking for anything.
     rdstitch("apply", f"{output}.json", *images, "-o", again)
     assert output.read_bytes() == again.read_bytes()
@@ -128,10 +132,7 @@ def test_the_output_is_cropped_to_the_rectangle(
 def test_a_mosaic_becomes_upright_at_once(facade: tuple[Sequence, list[Path]], rdstitch: Run, tmp_path: Path) -> None:
     output = tmp_path / "up.png"
     rdstitch("mosaic", *facade[1], "-o", output, *KNOWN, "--straighten", "auto", *CACHED)
-    angle, aspect, error = _placed(Path(f"{output}.json"), facade[0])
-    assert angle < 0.2
-    assert aspect == pytest.approx(1.0, abs=0.01)
-    assert error < 1.0
+    _check_upright(output, facade[0])
 
 
 def test_where_nothing_is_straight_nothing_is_turned(rdstitch: Run, tmp_path: Path) -> None:
@@ -153,9 +154,7 @@ def test_an_unknown_focal_length_follows_from_the_rectangle(
     how = ("--lambda", "-0.1", "--reference", paths[0].name, "--model", "homography")
     done = rdstitch("pano", *paths, "-o", output, *how, "--rectangle", _corners(sequence), *CACHED)
     assert "times as wide as high" in done.err  # it is not sure, and says so
-    angle, aspect, _ = _placed(Path(f"{output}.json"), sequence)
-    assert angle < 0.2
-    assert aspect == pytest.approx(1.0, abs=0.03)
+    _check_upright(output, sequence, 0.03)
 
 
 def test_gravity_makes_a_wall_level(facade: tuple[Sequence, list[Path]], rdstitch: Run, tmp_path: Path) -> None:

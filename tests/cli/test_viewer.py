@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.report import svg
@@ -107,14 +108,7 @@ def test_seams_are_where_labels_change() -> None:
     labels = np.full((4, 6), -1, dtype=np.int32)
     labels[:3, :3], labels[:3, 3:5] = 0, 1
     data, box = seam_image(SeamMap(labels, 2), (2, 0), (10, 8))
-    shown = read_shown(data)
+    shown = np.asarray(Image.open(io.BytesIO(data)))[..., 3] > 0
     assert box == (0.0, 0.0, 10.0, 8.0)
     assert shown.shape == (4, 5)
     assert np.argwhere(shown).tolist() == [[0, 1], [1, 1], [2, 1]]  # not where an image ends at nothing
-
-
-def read_shown(data: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Which pixels are opaque."""
-    from PIL import Image
-
-    return np.asarray(np.asarray(Image.open(io.BytesIO(data)))[..., 3] > 0)

@@ -124,9 +124,8 @@ def test_complaints_name_the_field(tmp_path: Path, path: tuple[str | int, ...], 
         holder = holder[key]
     holder[path[-1]] = value
     file = _write(tmp_path, json.dumps(content).encode())
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=rf"^{re.escape(str(file))}: {re.escape(field)}(: | must be )"):
         read_sidecar(file)
-    assert re.match(rf"{re.escape(str(file))}: {re.escape(field)}(: | must be )", str(caught.value))
 
 
 def test_version_1_is_still_read(tmp_path: Path) -> None:

@@ -21,12 +21,8 @@ from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import RadialHomography, transfer
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import SpanningTree, spanning_tree
-from tests.alignment_scenes import Scene, grid, jittered, robot_path, scene
+from tests.alignment_scenes import Scene, aligned, grid, jittered, robot_path, scene
 from tests.sampled import sampled
-
-
-def _run(given: Scene, **options: object) -> Alignment:
-    return align(given.cameras, given.links, AlignmentOptions(**options))  # type: ignore[arg-type]
 
 
 def _pair_errors(found: Alignment, truth: Scene) -> np.ndarray:
@@ -87,7 +83,7 @@ def test_a_robots_grid_is_rigid(
     poses = grid(columns, rows, (0.5, 0.4), math.radians(yaw), rng)
     tilt = (math.radians(tilt[0]), math.radians(tilt[1]))
     given = scene(poses, size=size, focal=focal, distortion=distortion, tilt=tilt, rng=rng)
-    found = _run(given)
+    found = aligned(given)
     assert found.model == "rigid"
     assert found.used.all()
     assert abs(found.distortion - distortion) < 0.001
@@ -104,7 +100,7 @@ def test_a_drone_needs_more_freedom(height: float, tilt: float, model: str) -> N
     rng = np.random.default_rng(2)
     poses = jittered(grid(4, 3, (0.4, 0.3), 0.25, rng), height, math.radians(tilt), rng)
     given = scene(poses, tilt=(0.04, -0.03), focal_source="exif", rng=rng, per_link=120)
-    found = _run(given)
+    found = aligned(given)
     assert found.model == model
     assert abs(found.distortion + 0.25) < 0.001
     assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.2
@@ -118,7 +114,7 @@ def test_focal_length_that_is_guessed_wrong_is_found() -> None:
     rng = np.random.default_rng(4)
     poses = grid(4, 3, (0.5, 0.4), 0.3, rng)
     given = scene(poses, tilt=(0.1, -0.08), guess=690.0, focal_source="guess", rng=rng)
-    found = _run(given)
+    found = aligned(given)
     true = 520.0 / given.cameras[0].scale
     assert found.focal_std < 0.05 * true
     assert abs(found.focal - true) < 4 * found.focal_std
@@ -135,7 +131,7 @@ def test_an_off_centre_lens_is_noticed_and_a_centred_one_left_alone() -> None:
     middle = np.array(given.cameras[0].center)
     np.testing.assert_allclose(np.array(found.cameras[0].center) - middle, shift, atol=1.0)
     assert abs(found.distortion + 0.25) < 0.001
-    np.testing.assert_array_equal(align(given.cameras, given.links).cameras[0].center, middle)
+    np.testing.assert_array_equal(aligned(given).cameras[0].center, middle)
 
 
 @pytest.mark.parametrize("model", ["auto", "homography"])
@@ -144,7 +140,7 @@ def test_wrong_pairs_are_dropped_by_name(model: str) -> None:
     given = scene(robot_path(40, 0.2), tilt=(-0.1, 0.08), rng=rng, overlap=0.3, reach=3, per_link=80)
     wrong = [(2, 35), (10, 30), (20, 38)]
     given = replace(given, links=[*given.links, *(_wrong_link(given, i, j, rng) for i, j in wrong)])
-    found = _run(given, model=model)
+    found = aligned(given, model=model)
     dropped = {(fit.image1, fit.image2) for fit in found.links if not fit.used}
     assert dropped == set(wrong)
     assert all("contradicts" in fit.reason for fit in found.links if not fit.used)
@@ -157,7 +153,7 @@ def test_images_without_connection_are_named() -> None:
     poses = np.concatenate([grid(3, 2, (0.4, 0.3), 0.2, rng), grid(2, 1, (0.4, 0.3), 0.2, rng), np.zeros((1, 6))])
     poses[6:8, X] += 50.0
     poses[8, X] = 100.0
-    found = _run(scene(poses, rng=rng))
+    found = aligned(scene(poses, rng=rng))
     assert found.used.tolist() == [True] * 6 + [False] * 3
     assert found.components == ((0, 1, 2, 3, 4, 5), (6, 7), (8,))
     reasons = {
@@ -182,7 +178,7 @@ def test_turning_on_the_spot_says_nothing_of_the_lens() -> None:
     # A picture needs no lens, and a path only what is known of it.
     wanted = {Purpose.MOSAIC: "detail", Purpose.TRAJECTORY: "warning", Purpose.CALIBRATE: "failure"}
     for purpose, severity in wanted.items():
-        found = align(given.cameras, given.links, AlignmentOptions(purpose=purpose))
+        found = aligned(given, purpose=purpose)
         assert math.isinf(found.distortion_std)
         assert {m.severity for m in found.messages if m.code == "lambda-not-observable"} == {severity}
 
@@ -190,7 +186,7 @@ def test_turning_on_the_spot_says_nothing_of_the_lens() -> None:
 def test_hills_are_noticed() -> None:
     rng = np.random.default_rng(10)
     poses = jittered(grid(4, 3, (0.4, 0.3), 0.2, rng), 0.1, 0.03, rng)
-    found = _run(scene(poses, rng=rng, relief=0.05))
+    found = aligned(scene(poses, rng=rng, relief=0.05))
     assert found.relief.found
     assert found.relief.coherence > 0.6
     assert "not one plane" in found.relief.explanation
@@ -200,7 +196,7 @@ def test_known_lens_and_tilt_are_kept() -> None:
     rng = np.random.default_rng(11)
     given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), tilt=(0.05, -0.04), rng=rng)
     cameras = [replace(camera, distortion=-0.25) for camera in given.cameras]
-    found = _run(replace(given, cameras=cameras), lens_known=True, tilt=(0.05, -0.04))
+    found = aligned(replace(given, cameras=cameras), lens_known=True, tilt=(0.05, -0.04))
     assert found.distortion == -0.25
     assert found.distortion_std == 0.0
     assert found.tilt == pytest.approx((0.05, -0.04), abs=1e-5)
@@ -212,7 +208,7 @@ def test_measured_attitudes_replace_estimated_ones(std: float, model: str) -> No
     poses = jittered(grid(4, 3, (0.4, 0.3), 0.2, rng), 0.1, 0.05, rng)
     given = scene(poses, tilt=(0.03, 0.02), rng=rng)
     attitudes = poses[:, [PSI, THETA]] + std * rng.normal(size=(len(poses), 2))
-    found = _run(given, attitudes=attitudes, attitudes_std=std)
+    found = aligned(given, attitudes=attitudes, attitudes_std=std)
     assert found.model == model
     np.testing.assert_allclose(found.poses.tilt, poses[:, [PSI, THETA]] + (0.03, 0.02), atol=0.005)
     assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.2
@@ -222,16 +218,16 @@ def test_the_reference_image_is_the_frame() -> None:
     rng = np.random.default_rng(13)
     given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng)
     for model in ("similarity", "homography"):
-        found = _run(given, model=model, reference=4)
+        found = aligned(given, model=model, reference=4)
         assert found.reference == 4
     np.testing.assert_allclose(found.homographies[4], np.eye(3), atol=1e-12)
-    rigid = _run(given, model="rigid", reference=4)
+    rigid = aligned(given, model="rigid", reference=4)
     np.testing.assert_allclose([rigid.poses.yaw[4], *rigid.poses.position[4], rigid.poses.height[4]], [0, 0, 0, 1])
 
 
 def test_a_reduced_image_is_the_reference_only_where_it_is_named() -> None:
     given = scene(grid(3, 1, (0.4, 0.3), 0.2, np.random.default_rng(13)), rng=np.random.default_rng(14))
-    middle = _run(given, model="similarity").reference
+    middle = aligned(given, model="similarity").reference
     small = given.cameras[middle].resized((320, 240))
     cameras = [small if k == middle else camera for k, camera in enumerate(given.cameras)]
     half = {True: 0.5, False: 1.0}
@@ -245,8 +241,8 @@ def test_a_reduced_image_is_the_reference_only_where_it_is_named() -> None:
     ]
     reduced = replace(given, cameras=cameras, links=links)
     assert middle == 1
-    assert _run(reduced, model="similarity").reference in (0, 2)
-    assert _run(reduced, model="similarity", reference=middle).reference == middle
+    assert aligned(reduced, model="similarity").reference in (0, 2)
+    assert aligned(reduced, model="similarity", reference=middle).reference == middle
 
 
 def test_any_image_can_become_the_frame_after_the_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,7 +253,7 @@ def test_any_image_can_become_the_frame_after_the_adjustment(monkeypatch: pytest
     adjusted: list[AdjustedImages] = []
     recipe = import_module("rdstitch.alignment.align")  # the package has a function of the module's name
     monkeypatch.setattr(recipe, "build_alignment", adjusted.append)
-    _run(given, model="similarity", reference=0)
+    aligned(given, model="similarity", reference=0)
     for reference in range(len(poses)):
         found = build_alignment(replace(adjusted[0], problem=replace(adjusted[0].problem, reference=reference)))
         own, height = poses[reference], np.exp(poses[reference, LOG_HEIGHT])
@@ -282,7 +278,7 @@ def test_of_links_with_as_many_matches_those_that_overlap_most_are_chained(monke
     rng = np.random.default_rng(5)
     path = robot_path(40, 0.15)
     made = scene(path, tilt=(-0.1, 0.087), noise=0.4, overlap=0.3, reach=5, per_link=150, rng=rng)
-    assert _run(made, model="rigid").used.all()
+    assert aligned(made, model="rigid").used.all()
     assert trees
     assert max(np.abs(tree.parent - tree.child).mean() for tree in trees) < 1.5
 
@@ -290,7 +286,7 @@ def test_of_links_with_as_many_matches_those_that_overlap_most_are_chained(monke
 def test_the_order_of_links_does_not_matter() -> None:
     rng = np.random.default_rng(14)
     given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng)
-    there, back = align(given.cameras, given.links), align(given.cameras, given.links[::-1])
+    there, back = aligned(given), align(given.cameras, given.links[::-1])
     assert there.distortion == pytest.approx(back.distortion, abs=1e-5)
     assert there.model == back.model
 
@@ -332,7 +328,7 @@ def test_mistakes_of_the_caller() -> None:
 
 def test_an_image_that_contradicts_the_others_names_them() -> None:
     rng = np.random.default_rng(11)
-    found = _run(scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng))
+    found = aligned(scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng))
     contradicting = replace(found.links[0], image1=0, image2=2, used=False, reason=Unused.CONTRADICTS)
     whole = replace(
         found, used=np.array([True, True, False]), components=((0, 1), (2,)), links=(*found.links, contradicting)
@@ -347,7 +343,7 @@ def test_small_tilts_do_not_ask_for_a_short_focal_length() -> None:
     rng = np.random.default_rng(3)
     poses = jittered(grid(12, 1, (0.35, 0.1), 0.1, rng), 0.05, math.radians(1.5), rng)
     given = scene(poses, noise=0.5, per_link=60, relief=0.02, reach=2, focal_source=None, rng=rng)
-    found = _run(given, model="tilting", lens="division")
+    found = aligned(given, model="tilting", lens="division")
     assert abs(math.log(found.focal * given.cameras[0].scale / 520.0)) < 0.3
 
 
@@ -360,6 +356,6 @@ def test_matches_off_by_less_than_a_lens_is_exact_agree() -> None:
         angle = rng.uniform(0.0, 2.0 * np.pi, len(first.points2))
         off = first.points2 + size * np.column_stack([np.cos(angle), np.sin(angle)])
         links = [replace(first, points2=off), *given.links[1:]]
-        fit = _run(replace(given, links=links)).links[0]
+        fit = aligned(replace(given, links=links)).links[0]
         assert fit.used
         assert (fit.inliers > 0.9 * fit.count) == agrees

@@ -11,7 +11,8 @@ from rdstitch.alignment import lens_selection
 from rdstitch.alignment.lens_selection import LensChoice
 from rdstitch.alignment.observations import Observations
 from rdstitch.geometry.camera import Camera
-from tests.lens_scenes import FISHEYE, SIZE, aligned, lens_distance, lens_scene
+from tests.alignment_scenes import aligned
+from tests.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
 
 align_module = importlib.import_module("rdstitch.alignment.align")
 

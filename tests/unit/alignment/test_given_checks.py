@@ -10,7 +10,7 @@ from rdstitch.alignment.motion_models import PSI, THETA
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.inputs.sensor_streams import DELAYS
-from tests.alignment_scenes import Scene, grid, jittered, scene
+from tests.alignment_scenes import Scene, aligned, grid, jittered, scene
 
 _ONE = math.radians(1.0)
 
@@ -25,7 +25,7 @@ def windy() -> tuple[Scene, FloatArray]:
 
 
 def _aligned(given: Scene, attitudes: FloatArray | None, std: float) -> Alignment:
-    return align(given.cameras, given.links, AlignmentOptions(lens="division", attitudes=attitudes, attitudes_std=std))
+    return aligned(given, lens="division", attitudes=attitudes, attitudes_std=std)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_attitudes_that_say_less_than_their_scatter_are_no_contradiction() -> No
 def test_a_tilt_of_the_wrong_sign_is_not_used(tilt: tuple[float, float], right: bool) -> None:
     rng = np.random.default_rng(5)
     given = scene(grid(4, 3, (0.5, 0.4), 0.3, rng), tilt=(0.05, -0.03), rng=rng, per_link=80)
-    found = align(given.cameras, given.links, AlignmentOptions(lens="division", tilt=tilt))
+    found = aligned(given, lens="division", tilt=tilt)
     assert (found.messages == ()) == right
     assert found.tilt == pytest.approx((0.05, -0.03), abs=0.002)
     assert right or "they show 2.8" in found.messages[0].text

@@ -16,9 +16,9 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
-from tests.alignment_scenes import Scene, grid, scene
+from tests.alignment_scenes import Scene, aligned, grid, scene
 from tests.alignment_stubs import adjusted, independent_errors, observations
-from tests.lens_scenes import FISHEYE, SIZE, aligned, lens_distance, lens_scene
+from tests.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
 from tests.sampled import sampled
 
 OFF_CENTRE = Camera(SIZE, -0.25, 0.0, (339.0, 229.0))

@@ -15,7 +15,7 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import TrajectoryFrame
 from rdstitch.export.trajectory_files import as_csv
-from tests.alignment_scenes import grid, scene
+from tests.alignment_scenes import aligned, grid, scene
 
 FOCAL = 520.0
 
@@ -50,7 +50,7 @@ def test_standard_deviations_are_what_poses_scatter_by() -> None:
 def test_they_are_not_computed_unless_asked_for() -> None:
     rng = np.random.default_rng(0)
     given = scene(grid(2, 2, (0.3, 0.25), 0.2, rng), rng=rng, per_link=60)
-    found = align(given.cameras, given.links, AlignmentOptions(model="rigid"))
+    found = aligned(given, model="rigid")
     assert Trajectory.from_alignment(found).covariance is None
 
 

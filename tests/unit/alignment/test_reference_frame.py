@@ -5,23 +5,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames import frontal_reference, in_frame_of
 from rdstitch.alignment.motion_models import POSE, PSI, X
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
-from tests.alignment_scenes import scene
+from tests.alignment_scenes import aligned, scene
+
+
+def _tilted() -> Alignment:
+    """Three images, the first of which is oblique."""
+    poses = np.zeros((3, 6))
+    poses[:, X] = (0.0, 0.3, 0.6)
+    found = aligned(scene(poses, rng=np.random.default_rng(4)), model="homography", reference=0)
+    poses[0, PSI] = 1.1
+    to_images = POSE.matrices(poses, POSE.shared_from_physical(np.array([0.0, 0.0, 0.26]))).matrices
+    return replace(found, homographies=np.asarray(np.linalg.inv(to_images), dtype=np.float64))
 
 
 def test_an_oblique_reference_gives_way_to_one_whose_horizon_no_image_crosses() -> None:
-    rng = np.random.default_rng(4)
-    poses = np.zeros((3, 6))
-    poses[:, X] = (0.0, 0.3, 0.6)
-    given = scene(poses, rng=rng)
-    found = align(given.cameras, given.links, AlignmentOptions(model="homography", reference=0))
-    poses[0, PSI] = 1.1
-    to_images = POSE.matrices(poses, POSE.shared_from_physical(np.array([0.0, 0.0, 0.26]))).matrices
-    tilted = replace(found, homographies=np.asarray(np.linalg.inv(to_images), dtype=np.float64))
+    tilted = _tilted()
     oblique = in_frame_of(tilted, 0)
     assert frontal_reference(oblique) in (1, 2)
     frontal = in_frame_of(oblique, 1)
@@ -35,18 +38,12 @@ def test_an_oblique_reference_gives_way_to_one_whose_horizon_no_image_crosses() 
 def test_each_border_is_undistorted_once_whatever_the_number_of_possible_references(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    rng, calls = np.random.default_rng(4), list[int]()
-    poses = np.zeros((3, 6))
-    poses[:, X] = (0.0, 0.3, 0.6)
-    given = scene(poses, rng=rng)
-    found = align(given.cameras, given.links, AlignmentOptions(model="homography", reference=0))
-    poses[0, PSI] = 1.1
-    to_images = POSE.matrices(poses, POSE.shared_from_physical(np.array([0.0, 0.0, 0.26]))).matrices
+    calls, found = list[int](), _tilted()
     many = replace(
         found,
         used=np.ones(60, dtype=np.bool_),
         cameras=found.cameras * 20,
-        homographies=np.tile(np.linalg.inv(to_images), (20, 1, 1)),
+        homographies=np.tile(found.homographies, (20, 1, 1)),
     )
     undistort = Camera.undistort
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment import AlignmentOptions
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.align import from_another_start
 from rdstitch.alignment.motion_models import SIMILARITY
@@ -14,7 +14,7 @@ from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_re
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.choices import Purpose
 from rdstitch.geometry.radial_homography import measurement_whitening
-from tests.alignment_scenes import Scene, grid, scene
+from tests.alignment_scenes import Scene, aligned, grid, scene
 
 
 def _scene(relief: float, seed: int = 0) -> Scene:
@@ -41,7 +41,7 @@ def test_hills_hardly_move_the_lens(relief: float) -> None:
     errors, misses = [], []
     for seed in range(6):
         given = _scene(relief, seed)
-        found = align(given.cameras, given.links, AlignmentOptions(model="similarity"))
+        found = aligned(given, model="similarity")
         errors.append(found.distortion - given.distortion)
         misses.append(abs(errors[-1]) / found.distortion_std)
         assert found.relief.found

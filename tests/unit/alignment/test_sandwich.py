@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.noise import coherence
@@ -16,8 +15,8 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import LENS_STD, Camera
 from rdstitch.geometry.radial_homography import project
 from rdstitch.robust.posterior import Prior
-from tests.alignment_scenes import grid, scene
-from tests.lens_scenes import SIZE, aligned, lens_scene
+from tests.alignment_scenes import aligned, grid, scene
+from tests.lens_scenes import SIZE, lens_scene
 
 LENS, NOISE = Camera((640, 480), distortion=-0.2), 0.4
 KNOWN = (Prior(), Prior(), Prior(((1.0, float(np.log(1.3)), 0.01),)))
@@ -82,7 +81,7 @@ def test_the_stated_deviation_covers_relief(relief: float) -> None:
     for seed in range(16):
         rng = np.random.default_rng(seed)
         given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng, relief=relief)
-        found = align(given.cameras, given.links, AlignmentOptions(model="similarity"))
+        found = aligned(given, model="similarity")
         misses.append(abs(found.distortion - given.distortion) / found.distortion_std)
     assert max(misses) < 3.0
     assert np.median(misses) > 0.33
@@ -112,7 +111,7 @@ def test_a_focal_length_that_no_lens_has_makes_the_lens_less_certain() -> None:
             focal_source=source,
             rng=np.random.default_rng(1),
         )
-        found = align(given.cameras, given.links, AlignmentOptions(model="similarity"))
+        found = aligned(given, model="similarity")
         assert found.focal > 6.0
         std[source] = found.distortion_std
     assert std["guess"] > 2.0 * std["option"]

@@ -19,7 +19,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
 from rdstitch.synthetic.panorama import camera_rotations
-from tests.alignment_scenes import grid, scene
+from tests.alignment_scenes import aligned, grid, scene
 
 SIZE, FOCAL = (640, 480), 520.0
 
@@ -100,7 +100,7 @@ def test_a_camera_that_moves_over_a_plane_does_not_turn(tilt: float) -> None:
     rng = np.random.default_rng(4)
     poses = grid(3, 2, (0.4, 0.35), 0.3, rng)
     given = scene(poses, rng=rng, tilt=(tilt, 0.0), focal_source="guess", per_link=120)
-    found = align(given.cameras, given.links)
+    found = aligned(given)
     assert found.model == "rigid"
     assert found.tilt[0] == pytest.approx(tilt, abs=0.03)
     assert found.distortion == pytest.approx(-0.25, abs=0.01)
@@ -111,7 +111,7 @@ def test_tilts_of_their_own_are_found() -> None:
     poses = grid(3, 3, (0.4, 0.35), 0.3, rng)
     poses[:, PSI] = np.radians([0, 4, -5, 6, -3, 2, -6, 5, 1])
     given = scene(poses, rng=rng, focal_source="guess", per_link=120)
-    assert align(given.cameras, given.links).model == "tilting"
+    assert aligned(given).model == "tilting"
 
 
 def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:

@@ -8,8 +8,8 @@ import pytest
 
 from rdstitch.alignment import Alignment
 from rdstitch.geometry.camera import Camera
-from tests.alignment_scenes import Scene, grid, scene
-from tests.lens_scenes import SIZE, aligned
+from tests.alignment_scenes import Scene, aligned, grid, scene
+from tests.lens_scenes import SIZE
 
 
 def pair(seed: int, *, distortion: float = 0.0, noise: float = 0.5, count: int = 80, depth: float = 0.0) -> Scene:

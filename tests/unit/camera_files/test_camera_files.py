@@ -378,9 +378,8 @@ def test_complaints_name_file_and_field(tmp_path: Path, name: str, old: str, new
         assert old in text
         text = text.replace(old, new)
     (tmp_path / name).write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=re.escape(str(tmp_path / name))) as caught:
+    with pytest.raises(InputError, match=f"{re.escape(str(tmp_path / name))}.*{re.escape(named)}"):
         load_camera(tmp_path / name)
-    assert named in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["camera", "camera.csv", "camera.yml.txt"])
@@ -594,9 +593,8 @@ def test_what_is_wrong_is_named(old: str, new: str, message: str, tmp_path: Path
     text = KNOWN[KNOWN.index("<lensdatabase") :]
     assert old in text
     (tmp_path / "a.xml").write_text(text.replace(old, new), encoding="utf-8")
-    with pytest.raises(InputError, match=r"a\.xml: ") as caught:
+    with pytest.raises(InputError, match=r"a\.xml: .*" + re.escape(message)):
         load_camera(tmp_path / "a.xml", (640, 480))
-    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize("powers", [(4, 3, 2), (3,), (3, 5)])

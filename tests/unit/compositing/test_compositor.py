@@ -11,21 +11,15 @@ import tifffile
 from numpy.typing import NDArray
 
 from examples.judging.comparison import sharpness
-from rdstitch.compositing import CompositeOptions, compose, compose_to_file, plan_canvas
+from rdstitch.compositing import CompositeOptions, compose, compose_to_file
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.source_images import ImageLoader
 from rdstitch.compositing.survey import largest_rectangle
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.geometry.camera import Camera
 from rdstitch.io import Metadata, read_image
-from rdstitch.options.composite_options import ExposureMethod
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import Scene, as_image, gradient, grey, inner, place_images, render
+from tests.compositing_scenes import Scene, as_image, gradient, grey, inner, place_images, render, side_by_side
 from tests.sampled import sampled
-
-
-def _compose(scene: Scene, **options: Any) -> Any:
-    return compose(scene.images, scene.canvas, CompositeOptions(**options))
 
 
 def _seams(scene: Scene, options: CompositeOptions) -> NDArray[np.bool_]:
@@ -51,7 +45,7 @@ def test_unequal_light_leaves_no_visible_seam(gamma: float, seed: int, exposure:
     photometry = Photometry(gain=gains, vignetting=0.4, gamma=gamma, noise=0.004)
     scene = render(3, 3, size=(360, 270), photometry=photometry, seed=seed)
     options = CompositeOptions(exposure=exposure)  # type: ignore[arg-type]
-    result = _compose(scene, exposure=exposure)
+    result = scene.composed(exposure=exposure)
     ok, truth, mine = inner(result.alpha), scene.truth(), grey(result.pixels)
     slope = np.polyfit(truth[ok].astype(float), mine[ok].astype(float), 1)[0]
     seam = _seams(scene, options) & ok
@@ -85,12 +79,9 @@ def test_brightness_stays_near_that_of_the_images() -> None:
         along = scene.rendering.to_plane(k, np.stack([u, v], axis=-1))[..., 0] - scene.rendering.poses.position[k, 0]
         brighter = np.exp(1.6 * along / scene.rendering.texture.size[0])[..., None]
         frames.append(np.clip(np.rint(frame * brighter), 0, 255).astype(np.uint8))
-    sources: list[ImageLoader] = [partial(as_image, frame) for frame in frames]
     white, middle, rise = {}, {}, {}
-    choices: tuple[ExposureMethod, ...] = ("gain", "balanced")
-    for choice in choices:
-        options = CompositeOptions(exposure=choice)
-        result = compose(place_images(sources, scene.cameras, scene.homographies), scene.canvas, options)
+    for choice in ("gain", "balanced"):
+        result = scene.composed(frames, exposure=choice)
         lit = result.pixels[result.alpha > 0]
         white[choice], middle[choice] = _white(lit), float(np.median(lit))
         ends = [result.pixels[60:-60, part].mean() for part in (np.s_[40:140], np.s_[-140:-40])]
@@ -105,12 +96,9 @@ def test_brightness_stays_near_that_of_the_images() -> None:
 def test_brightness_that_drifts_over_an_even_wall_is_evened_out() -> None:
     scene = render(6, 1, size=(300, 220), seed=6)
     grey_wall = [np.full_like(frame, round(110 * gain)) for frame, gain in zip(scene.frames, DRIFT, strict=True)]
-    sources: list[ImageLoader] = [partial(as_image, frame) for frame in grey_wall]
     row = {}
-    choices: tuple[ExposureMethod, ...] = ("none", "gain", "balanced")
-    for choice in choices:
-        options = CompositeOptions(exposure=choice, blend="none")
-        result = compose(place_images(sources, scene.cameras, scene.homographies), scene.canvas, options)
+    for choice in ("none", "gain", "balanced"):
+        result = scene.composed(grey_wall, exposure=choice, blend="none")
         row[choice] = result.pixels[result.pixels.shape[0] // 2, 30:-30, 0].astype(int)
     largest = {choice: np.abs(np.diff(values)).max() for choice, values in row.items()}
     assert largest["none"] > 12
@@ -127,12 +115,9 @@ def test_a_clipped_sky_ends_in_no_step() -> None:
     scene = render(2, 1, size=(320, 240), overlap=0.6, photometry=light, seed=8)
     sky = [frame.copy() for frame in scene.frames]
     sky[0][:100], sky[1][:100] = 255, 240
-    sources: list[ImageLoader] = [partial(as_image, frame) for frame in sky]
     steps = {}
-    choices: tuple[ExposureMethod, ...] = ("gain", "balanced")
-    for choice in choices:
-        options = CompositeOptions(exposure=choice, blend="none", seam="voronoi")
-        result = compose(place_images(sources, scene.cameras, scene.homographies), scene.canvas, options)
+    for choice in ("gain", "balanced"):
+        result = scene.composed(sky, exposure=choice, blend="none", seam="voronoi")
         row = grey(result.pixels)[60, 40:-40]
         steps[choice] = float(np.abs(np.diff(row)).max())
     assert steps["gain"] > 0.1
@@ -152,11 +137,7 @@ def test_what_only_one_image_shows_colours_nothing(share: float, noise: float) -
     frames[1][:header] = 0, 110, 220
     if noise:
         frames = [np.clip(frame + rng.normal(0, noise, frame.shape), 0, 255).astype(np.uint8) for frame in frames]
-    lens = Camera((width, height))
-    places = np.array([np.eye(3), np.eye(3)])
-    places[1, 1, 2] = step / lens.scale
-    images = place_images([partial(as_image, frame) for frame in frames], [lens] * 2, places)
-    result = compose(images, plan_canvas([lens] * 2, places), CompositeOptions(blend="none"))
+    result = side_by_side(frames, [(0, 0), (0, step)], blend="none")
     first, second = frames[0], frames[1]
     np.testing.assert_array_equal(result.pixels[:step], first[:step])
     np.testing.assert_array_equal(result.pixels[height : height + step], second[height - step :])
@@ -175,9 +156,7 @@ def test_gains_are_found_among_what_moved(seed: int, people: int) -> None:
     for frame in frames:
         for x, y in rng.integers(0, (310, 210), (people, 2)):
             frame[y : y + 60, x : x + 50] = rng.integers(0, 255, 3)
-    sources = [partial(as_image, frame) for frame in frames]
-    placed = place_images(sources, scene.cameras, scene.homographies)
-    exposure = compose(placed, scene.canvas, CompositeOptions(exposure="gain")).exposure
+    exposure = scene.composed(frames, exposure="gain").exposure
     assert np.std(exposure.log_gain.mean(axis=1) - np.log(gains)) < 0.005
     np.testing.assert_allclose(np.exp(exposure.vignetting.sum()), 1 - 0.4, atol=0.05)
 
@@ -186,7 +165,7 @@ def test_gains_are_found_among_what_moved(seed: int, people: int) -> None:
 @pytest.mark.parametrize("seam", ["none", "voronoi", "graphcut"])
 def test_every_combination_shows_the_plane(blend: str, seam: str) -> None:
     scene = render(3, 2)
-    result = _compose(scene, blend=blend, seam=seam, exposure="none")
+    result = scene.composed(blend=blend, seam=seam, exposure="none")
     ok = inner(result.alpha)
     mine, truth = grey(result.pixels), scene.truth()
     assert np.sqrt(np.mean((mine[ok] - truth[ok]) ** 2)) < 0.03
@@ -204,10 +183,7 @@ def test_what_moved_is_taken_from_one_image(shift: int) -> None:
     for index, place in enumerate(places):
         x, y = truth.to_image(index, place[None])[0]
         cv2.circle(frames[index], (round(float(x)), round(float(y))), 28, (255, 0, 255), -1)
-    sources = [partial(as_image, frame) for frame in frames]
-    result = compose(
-        place_images(sources, scene.cameras, scene.homographies), scene.canvas, CompositeOptions(exposure="none")
-    )
+    result = scene.composed(frames, exposure="none")
     pink = (result.pixels[..., 0] > 200) & (result.pixels[..., 1] < 60) & (result.pixels[..., 2] > 200)
     for place in places:
         at = scene.canvas.matrix @ np.append(place, 1.0)
@@ -218,7 +194,7 @@ def test_what_moved_is_taken_from_one_image(shift: int) -> None:
 
 def test_crop_keeps_no_hole_and_most_of_the_image() -> None:
     scene = render(3, 2)
-    whole, cropped = _compose(scene), _compose(scene, crop="auto")
+    whole, cropped = scene.composed(), scene.composed(crop="auto")
     assert (cropped.alpha == 255).all()
     assert cropped.messages == ()
     assert cropped.alpha.size > 0.7 * (whole.alpha > 0).sum()
@@ -230,13 +206,9 @@ def test_crop_keeps_no_hole_and_most_of_the_image() -> None:
 
 def test_crop_that_would_keep_little_is_not_done() -> None:
     """Images that meet at their corners only."""
-    lens = Camera((100, 80))
-    steps = [np.array([[1.0, 0.0, 100.0 * k], [0.0, 1.0, 80.0 * k], [0.0, 0.0, lens.scale]]) for k in range(6)]
-    matrices = np.stack([step @ np.diag([lens.scale] * 2 + [1.0]) for step in steps])
-    canvas = plan_canvas([lens] * 6, matrices)
-    sources = [partial(as_image, np.full((80, 100), 50, np.uint8))] * 6
-    result = compose(place_images(sources, [lens] * 6, matrices), canvas, CompositeOptions(crop="auto"))
-    assert result.canvas.size == canvas.size == (600, 480)
+    frames = [np.full((80, 100), 50, np.uint8)] * 6
+    result = side_by_side(frames, [(100 * k, 80 * k) for k in range(6)], crop="auto")
+    assert result.canvas.size == (600, 480)
     assert "not cropped" in result.messages[0].text
 
 
@@ -260,7 +232,7 @@ def test_largest_rectangle_against_all_rectangles(seed: int) -> None:
 @pytest.mark.parametrize("suffix", ["tif", "png", "jpg"])
 def test_file_is_what_memory_is(tmp_path: Path, suffix: str) -> None:
     scene = render(3, 1)
-    result = _compose(scene, tile_size=256)
+    result = scene.composed(tile_size=256)
     told: list[float] = []
     compose_to_file(
         tmp_path / f"a.{suffix}",

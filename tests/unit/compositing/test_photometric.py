@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing import CompositeOptions, compose, gain_compensation, plan_canvas
+from rdstitch.compositing import gain_compensation, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
 from rdstitch.compositing.gain_compensation import compare_overlaps
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
@@ -22,7 +22,7 @@ from rdstitch.compositing.warp import locate, plan_warp
 from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import ground
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import as_image, place_images, render
+from tests.compositing_scenes import as_image, place_images, render, side_by_side
 from tests.sampled import sampled
 
 
@@ -150,18 +150,9 @@ def test_a_seam_runs_where_two_images_look_alike(place: int, swapped: bool) -> N
     for grey, start in ((LEFT, 0), (RIGHT, SHIFT)):
         row = np.where(np.abs(column - place) <= 4, ALIKE, grey)[start : start + SIZE[0]].astype(np.uint8)
         frames.append(np.tile(row[None, :, None], (SIZE[1], 1, 3)))
-    lens = Camera(SIZE)
-    move = np.eye(3)
-    move[0, 2] = SHIFT / lens.scale
-    homographies = np.stack([np.eye(3), move])
-    if swapped:  # whichever is added last
-        frames, homographies = frames[::-1], homographies[::-1]
-    canvas = plan_canvas([lens, lens], homographies)
-    options = CompositeOptions(exposure="none", seam="graphcut", blend="none")
-    found = compose(
-        place_images([partial(as_image, frame) for frame in frames], [lens, lens], homographies), canvas, options
-    )
-    assert canvas.size == (SIZE[0] + SHIFT, SIZE[1])
+    order = slice(None, None, -1 if swapped else 1)  # whichever is added last
+    found = side_by_side(frames[order], [(0, 0), (SHIFT, 0)][order], exposure="none", seam="graphcut", blend="none")
+    assert found.canvas.size == (SIZE[0] + SHIFT, SIZE[1])
     assert (found.pixels[:, : place - 6] == LEFT).all()
     assert (found.pixels[:, place + 7 :] == RIGHT).all()
 
@@ -173,12 +164,8 @@ def test_a_seam_avoids_fine_detail_that_is_off_by_a_pixel() -> None:
     column = np.arange(width + shift)[None, :]
     path = 800 + 60 * np.sin(np.arange(height) / 120)[:, None]
     off = np.where((np.abs(column - path) < 30)[..., None], grain, np.roll(grain, 1, axis=1))
-    frames, lens, move = [grain[:, :width], off[:, shift:]], Camera((width, height)), np.eye(3)
-    move[0, 2] = shift / lens.scale
-    homographies = np.stack([np.eye(3), move])
-    canvas = plan_canvas([lens, lens], homographies)
-    images = place_images([partial(as_image, frame) for frame in frames], [lens, lens], homographies)
-    found = compose(images, canvas, CompositeOptions(exposure="none", blend="none")).pixels
+    frames = [grain[:, :width], off[:, shift:]]
+    found = side_by_side(frames, [(0, 0), (shift, 0)], exposure="none", blend="none").pixels
     left, right = column < path - 30, column > path + 30
     assert (found == grain).all(axis=-1)[left].mean() > 0.99
     assert (found == off).all(axis=-1)[right].mean() > 0.99
@@ -188,18 +175,14 @@ def test_a_seam_avoids_fine_detail_that_is_off_by_a_pixel() -> None:
 @pytest.mark.parametrize("x", [150, 210, 240])
 def test_a_seam_goes_round_what_moves(x: int, taken_by: int) -> None:
     """Somebody, hardly unlike the ground, whom one image shows anywhere in the overlap: seen whole, or not at all."""
-    (width, height), lens, move = SIZE, Camera(SIZE), np.eye(3)
-    move[0, 2] = 120 / lens.scale
+    width, height = SIZE
     texture = (255.0 * ground((width + 120, height), x).region(0, 0, width + 120, height)).astype(np.uint8)
     mask = cv2.ellipse(np.zeros(texture.shape[:2], np.uint8), (x, 105), (28, 60), 0, 0, 360, 1, -1) > 0
     person = np.clip(0.35 * texture + 0.45 * texture.mean(), 0, 255).astype(np.uint8)
     frames = [texture[:, :width].copy(), texture[:, 120:].copy()]
     part = np.s_[:, 120 * taken_by : 120 * taken_by + width]
     frames[taken_by][mask[part]] = person[part][mask[part]]
-    homographies = np.stack([np.eye(3), move])
-    images = place_images([partial(as_image, frame) for frame in frames], [lens, lens], homographies)
-    options = CompositeOptions(exposure="none", blend="none")
-    found = compose(images, plan_canvas([lens, lens], homographies), options).pixels.astype(int)
+    found = side_by_side(frames, [(0, 0), (120, 0)], exposure="none", blend="none").pixels.astype(int)
     away, there = (np.abs(found - what).max(axis=2) for what in (texture, person))
     clear = mask & (np.abs(texture.astype(int) - person).max(axis=2) > 6)
     shown = float((there < away)[clear].mean())
@@ -317,15 +300,6 @@ def _crops(
     return frames
 
 
-def _laid(frames: Sequence[NDArray[np.uint8]], places: Sequence[tuple[int, int]]) -> NDArray[np.uint8]:
-    lens = Camera(PAPER, distortion=0.0)
-    homographies = np.tile(np.eye(3), (len(places), 1, 1))
-    homographies[:, :2, 2] = np.array(places) / lens.scale
-    cameras = [lens] * len(places)
-    images = place_images([partial(as_image, frame) for frame in frames], cameras, homographies)
-    return np.asarray(compose(images, plan_canvas(cameras, homographies), CompositeOptions(blend="none")).pixels)
-
-
 def _paper_in(sheet: NDArray[np.uint8], paper: int, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Where there is nothing but paper, not even near by."""
     other = (sheet != paper).any(axis=2).astype(np.uint8)
@@ -345,7 +319,7 @@ def test_a_coloured_block_in_one_of_two_images_tints_no_paper(
     frames, (x, y) = _crops(sheet, places, (1.0, 1.0)), corner
     shown, left = (frames[1], x - 150) if x > 150 else (frames[0], x + 150)
     shown[y : y + 150, left : left + 110] = block
-    found = _laid(frames, places).astype(int)
+    found = side_by_side(frames, places, blend="none").pixels.astype(int)
     clean = _paper_in(sheet, paper, found.shape) & (np.abs(found - block).max(axis=2) > 30)
     assert np.abs(found - paper)[clean].max() <= 4
 
@@ -356,7 +330,7 @@ SHADES = [(1, 0.88, 1, 1), (1, 1, 0.85, 1), (0.85, 0.85, 1, 1), (1, 0.94, 0.88, 
 @pytest.mark.parametrize(("light", "paper"), sampled(list(product(SHADES, [240, 225])), 3))
 def test_a_sheet_of_which_one_shot_is_darker_is_as_white_everywhere(light: tuple[float, ...], paper: int) -> None:
     sheet = _poster(paper, 4)
-    found = _laid(_crops(sheet, _FOUR, light), _FOUR)
+    found = side_by_side(_crops(sheet, _FOUR, light), _FOUR, blend="none").pixels
     clean = _paper_in(sheet, paper, found.shape)
     # Noise apart.
     levels = [np.median(found[:, x : x + 24][clean[:, x : x + 24]]) for x in range(0, found.shape[1] - 24, 24)]
@@ -368,6 +342,6 @@ def test_a_block_over_half_of_what_a_darker_shot_shares_tints_nothing() -> None:
     sheet, places, block = _poster(255, 4), _FOUR[:3], (40, 160, 220)
     frames = _crops(sheet, places, (1, 0.85, 1))
     frames[1][60:200, 240:310] = block
-    found = _laid(frames, places).astype(int)
+    found = side_by_side(frames, places, blend="none").pixels.astype(int)
     clean = _paper_in(sheet, 255, found.shape) & (np.abs(found - block).max(axis=2) > 60) & (found.max(axis=2) > 0)
     assert (found[clean].min(axis=1) >= 247).all()

@@ -1,6 +1,7 @@
 """Matching descriptors: all of them, those a guess leaves, and those of an overlap."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,17 +10,24 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features import Correspondences, Features, match, match_near, match_overlap
-from rdstitch.features.keypoints import Descriptors
 from rdstitch.features.match import overlapping
 
+SIZE = (800, 600)
 
-def features(descriptors: Descriptors, points: NDArray[np.float64] | None = None, kind: str = "sift") -> Features:
+
+def features(
+    descriptors: NDArray[Any],
+    points: NDArray[np.float64] | None = None,
+    kind: str = "sift",
+    signs: FloatArray | None = None,
+) -> Features:
     """Features with given descriptors, by default each at a place of its own."""
     count = len(descriptors)
     if points is None:
         points = np.column_stack([np.arange(count), np.zeros(count)]).astype(np.float64)
-    zeros = np.zeros(count)
-    return Features(points, descriptors, zeros + 1, zeros, zeros, None, kind)
+    descriptors = descriptors if kind == "akaze" else descriptors.astype(np.float32)
+    zeros, sign = np.zeros(count), None if signs is None else signs.astype(np.int8)
+    return Features(points, descriptors, zeros + 1, zeros, zeros, sign, kind, SIZE)
 
 
 def sift_like(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
@@ -43,9 +51,8 @@ def pair_of(kind: str, seed: int) -> tuple[Features, Features]:
     other = other[rng.permutation(150)][:140]
     if kind == "signed":
         values, other = values / np.float32(512), other / np.float32(512)
-        signs = [np.where(rng.random(n) < 0.5, 1, -1).astype(np.int8) for n in (150, 140)]
-        one, two = features(values, kind="surf"), features(other, kind="surf")
-        return replace(one, laplacian_sign=signs[0]), replace(two, laplacian_sign=signs[1])
+        signs = [np.where(rng.random(n) < 0.5, 1.0, -1.0) for n in (150, 140)]
+        return features(values, kind="surf", signs=signs[0]), features(other, kind="surf", signs=signs[1])
     return features(values), features(other)
 
 
@@ -168,12 +175,6 @@ def test_bad_arguments_are_refused() -> None:
         replace(one, points=one.points * np.nan)
 
 
-def _features(points: FloatArray, descriptors: FloatArray, signs: FloatArray | None = None) -> Features:
-    one = np.ones(len(points))
-    sign = None if signs is None else signs.astype(np.int8)
-    return Features(points, descriptors.astype(np.float32), one, one, one, sign, "surf", (640, 480))
-
-
 def _repeating(seed: int) -> tuple[Features, Features, FloatArray]:
     """A grid of points that look alike in groups, in two images; and the shift between these."""
     rng = np.random.default_rng(seed)
@@ -182,7 +183,7 @@ def _repeating(seed: int) -> tuple[Features, Features, FloatArray]:
     shift = np.array([33.0, 21.0])
     first, second = (looks + rng.normal(scale=0.05, size=looks.shape) for _ in range(2))
     order = rng.permutation(len(grid))
-    return _features(grid, first), _features((grid + shift)[order], second[order]), shift
+    return features(first, grid), features(second[order], (grid + shift)[order]), shift
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -201,9 +202,9 @@ def test_only_what_is_alike_and_near_matches() -> None:
     rng = np.random.default_rng(0)
     points, looks = rng.uniform(0, 400, (50, 2)), rng.normal(size=(50, 64))
     other = rng.normal(size=(50, 64))
-    features1 = _features(points, looks)
+    features1 = features(looks, points)
     known = np.array([[0, 0]])
-    changed = _features(points, np.concatenate([looks[:10], other[10:]]))
+    changed = features(np.concatenate([looks[:10], other[10:]]), points)
     assert match_near(features1, changed, points, 3.0, known).indices[:, 0].tolist() == list(range(10))
     assert len(match_near(features1, features1, points + 200.0, 3.0, known)) < 5
     nowhere = np.full_like(points, np.nan)
@@ -217,14 +218,14 @@ def test_a_rival_within_the_radius_counts_one_at_the_same_place_does_not() -> No
     here = np.array([[100.0, 100.0], [100.0, 100.0]])
     alike = np.concatenate([looks + 1e-2, looks + 1.05e-2])
     known = np.array([[0, 0]])
-    assert len(match_near(_features(points, looks), _features(near_it, alike), points, 5.0, known)) == 0
-    found = match_near(_features(points, looks), _features(here, alike), points, 5.0, known)
+    assert len(match_near(features(looks, points), features(alike, near_it), points, 5.0, known)) == 0
+    found = match_near(features(looks, points), features(alike, here), points, 5.0, known)
     assert found.indices.tolist() == [[0, 0]]
 
 
 def test_signs_must_be_equal_and_the_ratio_in_range() -> None:
     points, looks = np.array([[10.0, 10.0]]), np.eye(1, 64)
-    up, down = (_features(points, looks, np.array([sign])) for sign in (1, -1))
+    up, down = (features(looks, points, "surf", np.array([sign])) for sign in (1, -1))
     known = np.array([[0, 0]])
     assert len(match_near(up, up, points, 5.0, known)) == 1
     assert len(match_near(up, down, points, 5.0, known)) == 0
@@ -232,13 +233,7 @@ def test_signs_must_be_equal_and_the_ratio_in_range() -> None:
         match_near(up, up, points, 5.0, known, ratio=1.5)
 
 
-SIZE = (800, 600)
 SHIFT = np.array([560.0, 0.0])  # three tenths of the first image are in the second
-
-
-def _sift(points: FloatArray, descriptors: FloatArray) -> Features:
-    ones = np.ones(len(points))
-    return Features(points, descriptors.astype(np.float32), ones, 0 * ones, ones, None, "sift", SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -248,7 +243,7 @@ def images() -> tuple[Features, Features]:
     points = rng.uniform((0, 0), (1360, 600), (3000, 2))
     descriptors = rng.uniform(0, 120, (3000, 128)).round()
     left, right = points[:, 0] < SIZE[0], points[:, 0] >= SHIFT[0]
-    return _sift(points[left], descriptors[left]), _sift(points[right] - SHIFT, descriptors[right])
+    return features(descriptors[left], points[left]), features(descriptors[right], points[right] - SHIFT)
 
 
 def _some(found: Correspondences, count: int) -> Correspondences:

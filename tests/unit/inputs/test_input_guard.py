@@ -94,7 +94,6 @@ def test_damage_is_named_or_refused(tmp_path: Path, strict: bool) -> None:
     source.read()
     (message,) = guard.messages
     assert message.images == (str(path),)
-    assert message.images == (str(path),)
 
 
 def test_an_image_that_needs_too_much_memory(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Positions of images: of EXIF, and of files in all their forms."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -130,9 +131,8 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match="positions: ") as caught:
+    with pytest.raises(InputError, match="positions: .*" + re.escape(message)):
         _read(tmp_path, text)
-    assert message in str(caught.value)
 
 
 def test_control_points(tmp_path: Path) -> None:
@@ -179,9 +179,8 @@ def test_projected_numbers_in_other_notations_and_zero_longitude(tmp_path: Path)
 )
 def test_wrong_control_points_are_named(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "gcp").write_text(text, encoding="utf-8")
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=re.escape(message)):
         with_ground_control(_sources(), tmp_path / "gcp")
-    assert message in str(caught.value)
 
 
 def test_subtitles_of_a_video_are_a_track(tmp_path: Path) -> None:

@@ -45,6 +45,8 @@ def test_a_list_has_one_time_of_each_name(tmp_path: Path) -> None:
     file = tmp_path / "list.txt"
     file.write_text("# time name\n1.5 rgb/a b.png\n2.5\trgb/c.png\n", encoding="utf-8")
     assert [frame.timestamp for frame in with_times([Frame(Path("c.png")), Frame(Path("a b.png"))], file)] == [2.5, 1.5]
+    with pytest.raises(InputError, match=r"d\.png"):
+        with_times([Frame(Path("d.png"))], file)
     file.write_text("1.5 a.png\n2.5 a.png\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"line 2: a\.png is here twice"):
         with_times([Frame(Path("a.png"))], file)

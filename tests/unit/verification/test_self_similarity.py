@@ -10,7 +10,14 @@ from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification.photometric_agreement import ComparedImage
-from rdstitch.verification.self_similarity import Ambiguity, draw, drawing_scale, find_ambiguity, placement_ambiguity
+from rdstitch.verification.self_similarity import (
+    Ambiguity,
+    _between_pixels,
+    draw,
+    drawing_scale,
+    find_ambiguity,
+    placement_ambiguity,
+)
 from rdstitch.verification.unique_places import departures, unique_shifts
 
 SIZE = (256, 192)
@@ -47,6 +54,15 @@ def test_a_repeated_pattern_fits_a_period_away(scale: float) -> None:
     assert found.ambiguous
     periods = [math.hypot(50 * i, 40 * j) / 256 for i in range(-2, 3) for j in range(-2, 3)]
     assert min(abs(found.shift - period) for period in periods) < 0.006
+
+
+@pytest.mark.parametrize("place", [(5.0, 4.0), (5.5, 4.4), (5.2, 4.5)])
+def test_a_period_is_no_whole_number_of_pixels(place: tuple[float, float]) -> None:
+    """Without what lies between pixels a repeated pattern seemed to leave more elsewhere than here."""
+    row, column = np.indices((11, 10)).astype(np.float32)
+    peak = np.exp(-((row - place[0]) ** 2 + (column - place[1]) ** 2) / (2.0 * 3.0**2)).astype(np.float32)
+    at = np.unravel_index(int(peak.argmax()), peak.shape)
+    assert _between_pixels(peak, *at) == pytest.approx(1.0, abs=0.002)
 
 
 def test_a_registration_may_be_off_by_three_pixels() -> None:
