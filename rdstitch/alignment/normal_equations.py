@@ -5,7 +5,8 @@ parameters. Which poses the links couple is the pattern of the matrix, the same 
 """
 
 from dataclasses import dataclass, replace
-from typing import Self
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 
@@ -114,7 +115,7 @@ class SparseNormalEquations:
     def responses(self, gradient_poses: FloatArray, gradient_shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The steps, (F, C) and (S, C), for C gradients (F, C) and (S, C) in place of the equations' own."""
         kept = self.coupling.shape[1]
-        reduced, solved = replace(self, gradient_poses=gradient_poses)._eliminate(_LEAST_DAMPING)
+        reduced, solved = self._eliminate(_LEAST_DAMPING, gradient_poses)
         step_shared = _solve_scaled(reduced, self.coupling.T @ solved[:, kept:] - gradient_shared)
         return -solved[:, kept:] - solved[:, :kept] @ step_shared, step_shared
 
@@ -153,20 +154,28 @@ class SparseNormalEquations:
         response: FloatArray = -self._eliminate(_LEAST_DAMPING)[1][:, : self.coupling.shape[1]]
         return response
 
-    def _eliminate(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """The Schur complement (S, S) and ``A⁻¹ [B, gradient]``."""
-        right = np.column_stack([self.coupling, self.gradient_poses])
+    def _eliminate(self, damping: float, gradient: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """The Schur complement (S, S) and ``A⁻¹ [B, gradient]``, of the equations' own gradient if not given."""
+        right = np.column_stack([self.coupling, self.gradient_poses if gradient is None else gradient])
         if self.blocks.free == 0:
             return self.shared, right
+        factor = self._least_damped if damping == _LEAST_DAMPING else self._factorized(damping)
+        solved = factor.solve(right)
+        return self.shared - self.coupling.T @ solved[:, : self.coupling.shape[1]], solved
+
+    @cached_property
+    def _least_damped(self) -> Any:
+        """The factors that all responses have in common."""
+        return self._factorized(_LEAST_DAMPING)
+
+    def _factorized(self, damping: float) -> Any:
         diagonal = self.poses[self.blocks.diagonal]
         floor = max(float(diagonal.max()), 1e-300) * 1e-14
         damped = self.blocks.with_diagonal(self.poses, damping * diagonal + floor)
         options = {"SymmetricMode": True}
-        factor = sparse_linalg.splu(
+        return sparse_linalg.splu(
             self.blocks.matrix(damped), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
         )
-        solved = factor.solve(right)
-        return self.shared - self.coupling.T @ solved[:, : self.coupling.shape[1]], solved
 
 
 def _solve_scaled(matrix: FloatArray, right: FloatArray) -> FloatArray:
