@@ -19,7 +19,7 @@ from rdstitch.alignment.noise import coherence, judge_relief
 from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, ShapeTest, Unused
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.alignment.shape_test import judge_shape
-from rdstitch.alignment.uncertainty import considered_covariance, pose_covariances
+from rdstitch.alignment.uncertainty import considered_covariance, lever_std, pose_covariances
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
@@ -140,6 +140,7 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
         relief=relief,
         shape=_shape(adjustment),
         leverage=adjustment.leverage,
+        lever_std=lever_std(problem, fit) if relief.found and planar and adjustment.covariance is not None else 0.0,
         messages=(*_warnings(adjustment, reference_camera, considered), *adjustment.messages),
     )
 

@@ -206,6 +206,9 @@ class Alignment:
     leverage : mapping
         How far (0 to 1) what is known of the map puts itself where the alignment has it: positions by the index of
         their image, control points by name.
+    lever_std : float
+        How far relief moves the ground in the middles of images against what is below their cameras: standard
+        deviation of a coordinate, in heights of the reference image.
     messages : tuple of Message
         What the user should know of the whole: λ not observable, two cameras, ….
     """
@@ -233,6 +236,7 @@ class Alignment:
     relief: ReliefTest
     shape: ShapeTest | None = None
     leverage: Mapping[int | str, float] = field(default_factory=dict)
+    lever_std: float = 0.0
     messages: tuple[Message, ...] = ()
 
     def __repr__(self) -> str:

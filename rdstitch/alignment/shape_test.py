@@ -360,8 +360,9 @@ def _displacements(answers: _Answers, fit: Fit, count: int, cameras: Sequence[Ca
         return np.concatenate(points), np.repeat(images, len(places))
 
     every = np.arange(len(cameras))
-    corners = ground(*measured(every, grid[[0, _SIDE - 1, -_SIDE, -1]]), here)
-    middle, spread = np.nanmean(corners, axis=0), max(float(np.nanstd(corners)), 1e-12)
+    # Corners alone may all lie beyond what a fisheye shows of the ground.
+    diagonal = ground(*measured(every, grid[:: _SIDE + 1]), here)
+    middle, spread = np.nanmean(diagonal, axis=0), max(float(np.nanstd(diagonal)), 1e-12)
     products, points = [], []
     for images in np.split(every, np.arange(_IMAGES_AT_ONCE, len(every), _IMAGES_AT_ONCE)):
         at, of = measured(images, grid)

@@ -20,6 +20,7 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmen
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, YAW, PlanarModel, X, Y
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.plane_marks import PlaneMarks
 from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.select import Posterior
 from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal
@@ -208,6 +209,28 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
     held = replace(problem, free_lens=np.zeros_like(problem.free_lens))
     lens = np.where(problem.free_lens, weighed, parameters.lens)
     return replace(fit, adjusted=held.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread).adjusted)
+
+
+def lever_std(problem: Problem, fit: Fit) -> float:
+    """How far relief moves the ground in the middle of an image against the camera's foot, by a planar fit.
+
+    Standard deviation of a coordinate, in heights of the reference image: tilts that grow along a flight over hills put
+    all feet right, and make the ground larger or smaller.
+    """
+    adjuster, parameters, model = problem.adjuster_of(fit), fit.adjusted.parameters, fit.model
+    assert isinstance(model, PlanarModel)
+    steps_of_poses, steps_of_shared = _relief(adjuster, fit.adjusted).steps()
+    free, images = adjuster.free.poses, np.arange(problem.count)
+    focal = float(np.exp(parameters.shared[2]))
+    middles = PlaneMarks(images, np.zeros((len(images), 2)), np.zeros((len(images), 2)), np.ones(len(images)))
+    derivative = middles.equations(fit.adjusted.matrices, parameters.lens, adjuster.free.lens, focal)[1]
+    derivative[:, [0, 1], [model.free.index(column) for column in (X, Y)]] -= 1.0
+    moved = derivative[:, :, free.shape[1] :] @ steps_of_shared
+    of_images = np.zeros((*free.shape, steps_of_shared.shape[1]))
+    of_images[free] = steps_of_poses
+    moved += derivative[:, :, : free.shape[1]] @ of_images
+    unit = focal * float(np.exp(parameters.poses[problem.reference, LOG_HEIGHT]))
+    return float(np.sqrt((moved**2).sum(axis=2).mean())) / unit
 
 
 _COLUMNS = 512  # of the inverse at a time

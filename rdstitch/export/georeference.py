@@ -212,6 +212,7 @@ class Located:
     nadirs: Sequence[tuple[float, float, float] | None] = ()  # straight down by each camera's attitude, where known
     control: Sequence[Sequence[GroundControl]] = ()
     relief: float = 0.0  # pixels of the images that neighbours are off together: hills on what is mapped as a plane
+    lever_std: float = 0.0  # how far hills move the ground against what is below the cameras, in heights; 0: not known
     # how far positions, by the number of their image, and control points, by name, put themselves where the images are
     leverage: Mapping[int | str, float] = field(default_factory=dict)
 
@@ -319,7 +320,10 @@ def _placed(
             return None, f"{reason}; --georeference force places it nevertheless"
     residuals = tuple(Residual(n, e.real, e.imag, u) for n, e, u in zip(names, off, used.tolist(), strict=True))
     assumption = _assumption(views, fit) if source == GPS else ""
-    std = None if fit.std is None else math.hypot(fit.std, located.relief * views.pixel * abs(fit.scale))
+    hills = located.relief * views.pixel
+    if located.lever_std and np.isfinite(views.height).any():
+        hills = located.lever_std * float(np.nanmedian(views.height))
+    std = None if fit.std is None else math.hypot(fit.std, hills * abs(fit.scale))
     place = Georeference(
         crs, fit.scale, fit.origin, rms, source, residuals, std, map_scale=map_scale, assumption=assumption
     )

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 from rdstitch.choices import ProjectionName
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Option, documented
+from rdstitch.options.option import documented, option
 from rdstitch.options.upright_options import UprightOptions
 
 ExposureMethod = Literal["auto", "none", "exif", "gain", "blocks", "balanced"]
@@ -18,122 +18,92 @@ Interpolation = Literal["linear", "cubic", "lanczos"]
 class CompositeOptions(UprightOptions):
     """Options of the compositor, and of how the output is turned; the command line has the same names and defaults."""
 
-    exposure: Annotated[
-        ExposureMethod,
-        Option(
-            "Brightness: exif normalises by time, ISO and aperture, for measurements; gain makes all images comparable "
-            "(one factor per image, one vignetting); blocks adds a smooth field per image where needed; balanced also "
-            "keeps what is bright near its own images' brightness; auto: exif for one band of 16 bits, else balanced."
-        ),
-    ] = "auto"
-    seam: Annotated[
-        Literal["none", "voronoi", "graphcut"], Option("Seam finder: around differences, midway, or none.")
-    ] = "graphcut"
-    blend: Annotated[
-        Literal["none", "feather", "multiband"], Option("Blender; none: hard edges, for measurements.")
-    ] = "multiband"
-    crop: Annotated[
-        Literal["none", "auto"],
-        Option(
-            "Crop to --rectangle, otherwise to the largest rectangle without holes, where that keeps a fair part.",
-            flag="--crop/--no-crop",
-        ),
-    ] = "none"
-    projection: Annotated[ProjectionName, Option("Projection of images taken by turning on the spot.")] = "auto"
-    scale: Annotated[
-        float,
-        Option(
-            "Scale of the output; 1 keeps the resolution of the reference image, one of the largest.",
-            least=1e-6,
-            most=1e6,
-        ),
-    ] = 1.0
-    max_size: Annotated[
-        int | None, Option("Longest side of the output, pixels; --scale is reduced to fit.", least=1)
-    ] = None
-    quality: Annotated[int, Option("Quality of JPEG and WebP, 1 to 100.", "Q", least=1, most=100)] = 95
-    max_stretch: Annotated[
-        float,
-        Option("Leave out what an oblique image shows N times coarser than the reference image.", above=1.0),
-    ] = 3.0
-    rotate: Annotated[float, Option("Turn the output clockwise, degrees; north is then not turned up.", "DEG")] = 0.0
-    north_up: Annotated[
-        bool,
-        Option(
-            "Turn north up where three images or more have a GPS position that fits.",
-            flag="--north-up/--no-north-up",
-            default="north up",
-        ),
-    ] = True
-    gsd: Annotated[float | None, Option("Ground sample distance, metres; instead of --scale.", "M", above=0.0)] = None
-    epsg: Annotated[
-        int | None,
-        Option(
-            "Coordinate system of the map, and of x and y in --positions; otherwise UTM (UPS near the poles) on WGS "
-            "84. All but these need rasterio.",
-            "EPSG:N",
-            "--crs",
-            above=0,
-            below=2**16,
-        ),
-    ] = None
-    like: Annotated[
-        str | Path | None,
-        Option("Grid of the output: coordinate system, pixels and extent of this GeoTIFF file.", "FILE"),
-    ] = None
-    extent: Annotated[
-        tuple[float, float, float, float] | None,
-        Option(
-            "Extent of the output on the map, metres: on the pixels of --like, else from the north-west corner on.",
-            "W,S,E,N",
-        ),
-    ] = None
-    georeference: Annotated[
-        Literal["auto", "force", "off"],
-        Option(
-            "Place the output where positions or control points agree with the images, also where these contradict "
-            "them (force), or never."
-        ),
-    ] = "auto"
-    max_memory: Annotated[
-        int | None,
-        Option(
-            "Memory for compositing, as 800M; otherwise a quarter of what is available, at least 400M.",
-            "SIZE",
-            above=0,
-            unit="bytes",
-        ),
-    ] = None
-    interpolation: Annotated[Interpolation, Option("Interpolation kernel.")] = "cubic"
-    background: Annotated[
-        int, Option("Grey level of uncovered pixels in JPEG and .dzi.", "GREY", least=0, most=255)
-    ] = 0
-    bands: Annotated[
-        int | None,
-        Option(
-            "Bands of multiband; the widest transition is about 2**bands pixels. None: by the size of the images.",
-            least=1,
-            most=8,
-            command_line=False,
-        ),
-    ] = None
-    tile_size: Annotated[
-        int | None,
-        Option(
-            "Side of the square tiles that the canvas is worked on in, pixels, a multiple of 256; None: 512 where "
-            "memory allows. It does not change the result.",
-            least=256,
-            command_line=False,
-        ),
-    ] = None
-    workers: Annotated[
-        int | None,
-        Option(
-            "Tiles that are worked on at one time; None: one per processor, up to 4. It does not change the result.",
-            least=1,
-            command_line=False,
-        ),
-    ] = None
+    exposure: ExposureMethod = option(
+        "auto",
+        "Brightness: exif normalises by time, ISO and aperture, for measurements; gain makes all images comparable "
+        "(one factor per image, one vignetting); blocks adds a smooth field per image where needed; balanced also "
+        "keeps what is bright near its own images' brightness; auto: exif for one band of 16 bits, else balanced.",
+    )
+    seam: Literal["none", "voronoi", "graphcut"] = option(
+        "graphcut", "Seam finder: around differences, midway, or none."
+    )
+    blend: Literal["none", "feather", "multiband"] = option("multiband", "Blender; none: hard edges, for measurements.")
+    crop: Literal["none", "auto"] = option(
+        "none",
+        "Crop to --rectangle, otherwise to the largest rectangle without holes, where that keeps a fair part.",
+        flag="--crop/--no-crop",
+    )
+    projection: ProjectionName = option("auto", "Projection of images taken by turning on the spot.")
+    scale: float = option(
+        1.0,
+        "Scale of the output; 1 keeps the resolution of the reference image, one of the largest.",
+        least=1e-6,
+        most=1e6,
+    )
+    max_size: int | None = option(None, "Longest side of the output, pixels; --scale is reduced to fit.", least=1)
+    quality: int = option(95, "Quality of JPEG and WebP, 1 to 100.", "Q", least=1, most=100)
+    max_stretch: float = option(
+        3.0, "Leave out what an oblique image shows N times coarser than the reference image.", above=1.0
+    )
+    rotate: float = option(0.0, "Turn the output clockwise, degrees; north is then not turned up.", "DEG")
+    north_up: bool = option(
+        True,
+        "Turn north up where three images or more have a GPS position that fits.",
+        flag="--north-up/--no-north-up",
+        default="north up",
+    )
+    gsd: float | None = option(None, "Ground sample distance, metres; instead of --scale.", "M", above=0.0)
+    epsg: int | None = option(
+        None,
+        "Coordinate system of the map, and of x and y in --positions; otherwise UTM (UPS near the poles) on WGS "
+        "84. All but these need rasterio.",
+        "EPSG:N",
+        "--crs",
+        above=0,
+        below=2**16,
+    )
+    like: str | Path | None = option(
+        None, "Grid of the output: coordinate system, pixels and extent of this GeoTIFF file.", "FILE"
+    )
+    extent: tuple[float, float, float, float] | None = option(
+        None,
+        "Extent of the output on the map, metres: on the pixels of --like, else from the north-west corner on.",
+        "W,S,E,N",
+    )
+    georeference: Literal["auto", "force", "off"] = option(
+        "auto",
+        "Place the output where positions or control points agree with the images, also where these contradict "
+        "them (force), or never.",
+    )
+    max_memory: int | None = option(
+        None,
+        "Memory for compositing, as 800M; otherwise a quarter of what is available, at least 400M.",
+        "SIZE",
+        above=0,
+        unit="bytes",
+    )
+    interpolation: Interpolation = option("cubic", "Interpolation kernel.")
+    background: int = option(0, "Grey level of uncovered pixels in JPEG and .dzi.", "GREY", least=0, most=255)
+    bands: int | None = option(
+        None,
+        "Bands of multiband; the widest transition is about 2**bands pixels. None: by the size of the images.",
+        least=1,
+        most=8,
+        command_line=False,
+    )
+    tile_size: int | None = option(
+        None,
+        "Side of the square tiles that the canvas is worked on in, pixels, a multiple of 256; None: 512 where "
+        "memory allows. It does not change the result.",
+        least=256,
+        command_line=False,
+    )
+    workers: int | None = option(
+        None,
+        "Tiles that are worked on at one time; None: one per processor, up to 4. It does not change the result.",
+        least=1,
+        command_line=False,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
 from rdstitch.choices import FeatureName
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Option, check_options, documented
+from rdstitch.options.option import check_options, documented, option
 
 WORK_MEGAPIXELS = 0.6
 """10⁶ pixels to which images of a large set are halved unless it is said otherwise."""
@@ -26,25 +26,21 @@ made λ of single pairs of a flight less certain, not more."""
 class FeatureOptions:
     """Choice of the features to detect, and how many."""
 
-    kind: Annotated[FeatureName, Option("Feature detector and descriptor.", flag="--features")] = "rootsift"
-    max_features: Annotated[
-        int | None,
-        Option(
-            "Most features of an image.",
-            least=1,
-            default="2000; of fewer than 8 images 16000 together, at most 4000 each",
-        ),
-    ] = None
-    work_megapixels: Annotated[
-        float | Literal["auto"] | None,
-        Option(
-            "Images are halved until they have no more megapixels before features are detected, once less where that "
-            "shows too few; 0 is full size.",
-            "MP",
-            least=0.0,
-            default="0.6; of fewer than 8 images 4.8 together, at most 2.4 each",
-        ),
-    ] = "auto"
+    kind: FeatureName = option("rootsift", "Feature detector and descriptor.", flag="--features")
+    max_features: int | None = option(
+        None,
+        "Most features of an image.",
+        least=1,
+        default="2000; of fewer than 8 images 16000 together, at most 4000 each",
+    )
+    work_megapixels: float | Literal["auto"] | None = option(
+        "auto",
+        "Images are halved until they have no more megapixels before features are detected, once less where that "
+        "shows too few; 0 is full size.",
+        "MP",
+        least=0.0,
+        default="0.6; of fewer than 8 images 4.8 together, at most 2.4 each",
+    )
     # keep the strongest of each cell of a grid in turn, rather than the strongest of the image
     spread: bool = True
     # grey levels that become 0 and 255; None: those of the set where its images have more than 8 bits, see
@@ -52,10 +48,10 @@ class FeatureOptions:
     stretch: tuple[float, float] | None = None
     # equalize local contrast before detection; None: of a set whose images show too little otherwise
     equalize: bool | None = None
-    aliked_model: Annotated[str | Path | None, Option("ONNX file of the network of --features aliked.", "FILE")] = None
-    aliked_size: Annotated[
-        int, Option("Side of the square image that the network takes, pixels.", least=1, command_line=False)
-    ] = 640
+    aliked_model: str | Path | None = option(None, "ONNX file of the network of --features aliked.", "FILE")
+    aliked_size: int = option(
+        640, "Side of the square image that the network takes, pixels.", least=1, command_line=False
+    )
 
     def __post_init__(self) -> None:
         check_options(self)

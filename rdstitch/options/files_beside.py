@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
 from rdstitch.choices import PosesFrame
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Option, check_options, documented
+from rdstitch.options.option import check_options, documented, option
 from rdstitch.options.shared_options import Height
 from rdstitch.system.progress import StageTimer
 
@@ -18,37 +17,29 @@ _REPORT_SUFFIXES = (".html", ".htm")
 class FilesBeside:
     """What is written beside an image, published together with it; the report of a result that is refused too."""
 
-    report: Annotated[
-        Path | None, Option("Write a report to FILE (.html): graph, votes on λ, matches, residuals.", "FILE")
-    ] = None
-    layers: Annotated[
-        Path | None,
-        Option(
-            "Write each image, warped, with alpha, and its mask into DIR: TIFF, cropped, with the offsets that "
-            "enblend reads.",
-            "DIR",
-        ),
-    ] = None
-    whole_layers: Annotated[bool, Option("With --layers: on the whole canvas instead of cropped.")] = False
-    hugin_project: Annotated[
-        Path | None,
-        Option("Write a project for Hugin (.pto): all images with lens and pose, and control points.", "FILE"),
-    ] = None
-    poses: Annotated[
-        Path | None,
-        Option(
-            "Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does; "
-            "images.txt: COLMAP's; geo.txt: OpenDroneMap's.",
-            "FILE",
-        ),
-    ] = None
-    frame: Annotated[
-        PosesFrame,
-        Option(
-            "Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. map: easting, "
-            "northing and height in metres, where the output is georeferenced."
-        ),
-    ] = "enu"
+    report: Path | None = option(None, "Write a report to FILE (.html): graph, votes on λ, matches, residuals.", "FILE")
+    layers: Path | None = option(
+        None,
+        "Write each image, warped, with alpha, and its mask into DIR: TIFF, cropped, with the offsets that "
+        "enblend reads.",
+        "DIR",
+    )
+    whole_layers: bool = option(False, "With --layers: on the whole canvas instead of cropped.")
+    hugin_project: Path | None = option(
+        None, "Write a project for Hugin (.pto): all images with lens and pose, and control points.", "FILE"
+    )
+    poses: Path | None = option(
+        None,
+        "Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does; "
+        "images.txt: COLMAP's; geo.txt: OpenDroneMap's.",
+        "FILE",
+    )
+    frame: PosesFrame = option(
+        "enu",
+        "Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. first: those of camera, "
+        "and the sidecar has them too: the first image is the reference. map: easting, northing and height in metres, "
+        "where the output is georeferenced.",
+    )
     height: Height = 1.0
     command: str = ""  # the command line, for the report
     timer: StageTimer = field(default_factory=StageTimer)  # the ``progress`` of the recipe, for the report

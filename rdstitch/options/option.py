@@ -1,17 +1,18 @@
-"""An option is declared once, as an annotated field: ``height: Annotated[float, Option("Metres.", above=0)] = 1.0``.
+"""An option is declared once, as an annotated field: ``gsd: float = option(1.0, "Metres a pixel.", "M", above=0)``.
 
+Of one that stands in several classes, or is a parameter, the type says it: ``Annotated[float, Option("Metres.")]``.
 From this its value is checked, the documentation of its class is made, and the command line with its help. Nothing
 large is imported here or by the modules of the options, so that ``--help`` is quick.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
 
 from rdstitch.errors import ArgumentError
 
@@ -46,6 +47,11 @@ class Option:
             return f" from {self.least:g} to {self.most:g}"
         limits = {"of at least": self.least, "above": self.above, "of at most": self.most, "below": self.below}
         return " and".join(f" {words} {value:g}" for words, value in limits.items() if math.isfinite(value))
+
+
+def option(value: Any, text: str, metavar: str = "", flag: str = "", **more: Any) -> Any:
+    """A field of a dataclass: its default, and what :class:`Option` says of it."""
+    return field(default=value, metadata={"option": Option(text, metavar, flag, **more)})
 
 
 @dataclass(frozen=True)
@@ -85,8 +91,9 @@ def declaration(name: str, annotation: Any) -> Declared | None:
 
 def declared(kind: Any) -> dict[str, Declared]:
     """The options among the fields of a dataclass."""
-    found = (declaration(field.name, field.type) for field in fields(kind))
-    return {option.name: option for option in found if option is not None}
+    annotated = {each.name: (each.type, each.metadata.get("option")) for each in fields(kind)}
+    types = {name: kind if said is None else Annotated[kind, said] for name, (kind, said) in annotated.items()}
+    return {name: found for name, kind in types.items() if (found := declaration(name, kind)) is not None}
 
 
 def check_options(options: Any) -> None:

@@ -4,14 +4,14 @@ import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 from rdstitch.choices import CameraFormat, ChannelOrder, LensName, LocalAlignmentMode, ModelName
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.estimation_options import Confidence, EstimationOptions, Iterations, Seed, Solver, Threshold
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.options.option import Option, check_options, documented
+from rdstitch.options.option import check_options, documented, option
 from rdstitch.options.shared_options import Distortion, DryRun, Mask, Overwrite, Strict, Topic, Workers
 from rdstitch.system.machine import processor_count
 
@@ -33,158 +33,118 @@ class StitchOptions:
     """
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
-    ratio: Annotated[
-        float | None,
-        Option(
-            "Largest ratio of the distances to the nearest and second nearest descriptor; None: what suits the "
-            "features.",
-            above=0.0,
-            command_line=False,
-        ),
-    ] = None
-    lightglue_model: Annotated[str | Path | None, Option("LightGlue network (ONNX) for these features.", "FILE")] = None
+    ratio: float | None = option(
+        None,
+        "Largest ratio of the distances to the nearest and second nearest descriptor; None: what suits the features.",
+        above=0.0,
+        command_line=False,
+    )
+    lightglue_model: str | Path | None = option(None, "LightGlue network (ONNX) for these features.", "FILE")
     solver: Solver = "auto"
-    lens: Annotated[
-        LensName,
-        Option("Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient."),
-    ] = "auto"
-    model: Annotated[ModelName, Option("Motion model of the camera.")] = "auto"
+    lens: LensName = option(
+        "auto", "Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient."
+    )
+    model: ModelName = option("auto", "Motion model of the camera.")
     threshold: Threshold = 3.0
     confidence: Confidence = 0.999
     max_iterations: Iterations = 10000
-    camera: Annotated[
-        "Camera | None",
-        Option(
-            "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is not "
-            "estimated.",
-            "FILE",
-            entered=Path | None,
-        ),
-    ] = None
+    camera: "Camera | None" = option(
+        None,
+        "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is not "
+        "estimated.",
+        "FILE",
+        entered=Path | None,
+    )
     distortion: Distortion = None
-    focal: Annotated[
-        float | None, Option("Focal length, pixels; otherwise from EXIF, or a guess.", "PX", above=0.0)
-    ] = None
-    tilt: Annotated[
-        tuple[float, float] | None,
-        Option(
-            "Known tilt of the camera, degrees.",
-            "PSI,THETA",
-            above=-math.pi / 2,
-            below=math.pi / 2,
-            unit="radians",
-        ),
-    ] = None
-    attitude: Annotated[
-        Literal["xmp"] | str | Path | None,
-        Option("Tilt of each image: CSV name,psi,theta in degrees; xmp: from the XMP of drone images.", "FILE|xmp"),
-    ] = None
-    attitude_std: Annotated[
-        float,
-        Option(
-            "Standard deviation of the attitudes, degrees; 0 for exact ones.",
-            "DEG",
-            least=0.0,
-            most=math.pi / 2,
-            unit="radians",
-        ),
-    ] = math.radians(1.0)
-    timestamps: Annotated[
-        str | Path | None,
-        Option(
-            "Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; otherwise those of the "
-            "video, bag or EXIF.",
-            "FILE",
-        ),
-    ] = None
-    odometry: Annotated[
-        "Odometry | str | Path | None",
-        Option(
-            "Wheel odometry, by time: TUM's lines, CSV timestamp,x,y,yaw_deg, or a topic of the bag. It gives the unit "
-            "of positions, and poses of frames without texture.",
-            "FILE|TOPIC",
-            entered=str | None,
-        ),
-    ] = None
-    positions: Annotated[
-        str | Path | None,
-        Option(
-            "Where images were taken, instead of EXIF: CSV name,lat,lon or name,x,y (see --crs), exiftool's -csv or "
-            "-json, OpenDroneMap's geo.txt, or a GPX track.",
-            "FILE",
-        ),
-    ] = None
-    positions_offset: Annotated[
-        float, Option("Seconds from the times of the images to those of the GPX track (UTC).", "S")
-    ] = 0.0
-    position_accuracy: Annotated[
-        float | None,
-        Option("Standard deviation of a horizontal coordinate of positions that tell none, metres.", "M", above=0.0),
-    ] = None
-    gcp: Annotated[
-        str | Path | None,
-        Option(
-            "Ground control points, as OpenDroneMap's gcp_list.txt, or CSV x,y,px,py,image,name,accuracy (see --crs); "
-            "they bend the alignment, and place the output on the Earth.",
-            "FILE",
-        ),
-    ] = None
-    check_points: Annotated[
-        str | Path | None,
-        Option("Points like those of --gcp that are compared with the map, and take no part in it.", "FILE"),
-    ] = None
+    focal: float | None = option(None, "Focal length, pixels; otherwise from EXIF, or a guess.", "PX", above=0.0)
+    tilt: tuple[float, float] | None = option(
+        None, "Known tilt of the camera, degrees.", "PSI,THETA", above=-math.pi / 2, below=math.pi / 2, unit="radians"
+    )
+    attitude: Literal["xmp"] | str | Path | None = option(
+        None, "Tilt of each image: CSV name,psi,theta in degrees; xmp: from the XMP of drone images.", "FILE|xmp"
+    )
+    attitude_std: float = option(
+        math.radians(1.0),
+        "Standard deviation of the attitudes, degrees; 0 for exact ones.",
+        "DEG",
+        least=0.0,
+        most=math.pi / 2,
+        unit="radians",
+    )
+    timestamps: str | Path | None = option(
+        None,
+        "Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; otherwise those of the "
+        "video, bag or EXIF.",
+        "FILE",
+    )
+    odometry: "Odometry | str | Path | None" = option(
+        None,
+        "Wheel odometry, by time: TUM's lines, CSV timestamp,x,y,yaw_deg, or a topic of the bag. It gives the unit of "
+        "positions, and poses of frames without texture.",
+        "FILE|TOPIC",
+        entered=str | None,
+    )
+    positions: str | Path | None = option(
+        None,
+        "Where images were taken, instead of EXIF: CSV name,lat,lon or name,x,y (see --crs), exiftool's -csv or "
+        "-json, OpenDroneMap's geo.txt, or a GPX track.",
+        "FILE",
+    )
+    positions_offset: float = option(0.0, "Seconds from the times of the images to those of the GPX track (UTC).", "S")
+    position_accuracy: float | None = option(
+        None, "Standard deviation of a horizontal coordinate of positions that tell none, metres.", "M", above=0.0
+    )
+    gcp: str | Path | None = option(
+        None,
+        "Ground control points, as OpenDroneMap's gcp_list.txt, or CSV x,y,px,py,image,name,accuracy (see --crs); "
+        "they bend the alignment, and place the output on the Earth.",
+        "FILE",
+    )
+    check_points: str | Path | None = option(
+        None, "Points like those of --gcp that are compared with the map, and take no part in it.", "FILE"
+    )
     mask: Mask = None
-    channel_order: Annotated[
-        ChannelOrder, Option("Order of the channels of arrays that come in or go out.", command_line=False)
-    ] = "bgr"
-    exclude: Annotated[
-        tuple[str, ...],
-        Option("Exclude the image of this name, or all that match a pattern like 'img_49*'; repeatable.", "NAME"),
-    ] = ()
-    include_only: Annotated[
-        tuple[str, ...], Option("Use only the images of this name or pattern; repeatable.", "NAME")
-    ] = ()
+    channel_order: ChannelOrder = option(
+        "bgr", "Order of the channels of arrays that come in or go out.", command_line=False
+    )
+    exclude: tuple[str, ...] = option(
+        (), "Exclude the image of this name, or all that match a pattern like 'img_49*'; repeatable.", "NAME"
+    )
+    include_only: tuple[str, ...] = option((), "Use only the images of this name or pattern; repeatable.", "NAME")
     topic: Topic = None
-    reference: Annotated[str | None, Option("Reference image; otherwise the best connected one.", "NAME")] = None
-    pose_covariance: Annotated[
-        bool, Option("Compute covariances of the poses, for the sidecar and tables of poses.", command_line=False)
-    ] = False
-    local_alignment: Annotated[
-        LocalAlignmentMode,
-        Option(
-            "Smooth displacement of each image where the scene has depth. auto: if held-out matches come nearer; N: "
-            "always, with N cells along an image's longer side.",
-            "auto|off|N",
-            least=2,
-            most=100,
-        ),
-    ] = "auto"
+    reference: str | None = option(None, "Reference image; otherwise the best connected one.", "NAME")
+    pose_covariance: bool = option(
+        False, "Compute covariances of the poses, for the sidecar and tables of poses.", command_line=False
+    )
+    local_alignment: LocalAlignmentMode = option(
+        "auto",
+        "Smooth displacement of each image where the scene has depth. auto: if held-out matches come nearer; N: "
+        "always, with N cells along an image's longer side.",
+        "auto|off|N",
+        least=2,
+        most=100,
+    )
     composite: CompositeOptions = field(default_factory=CompositeOptions)
-    cache: Annotated[
-        Path | None,
-        Option("Folder for features, pairs and alignments, to reuse in later runs; made if missing.", "DIR"),
-    ] = None
+    cache: Path | None = option(
+        None, "Folder for features, pairs and alignments, to reuse in later runs; made if missing.", "DIR"
+    )
     seed: Seed = 0
     workers: Workers = 0
-    scheduler: Annotated[
-        str | None,
-        Option(
-            "Run on a Dask cluster that shares the images and the folder of --cache; local starts one here.",
-            "ADDRESS|local",
-        ),
-    ] = None
+    scheduler: str | None = option(
+        None,
+        "Run on a Dask cluster that shares the images and the folder of --cache; local starts one here.",
+        "ADDRESS|local",
+    )
     overwrite: Overwrite = False
     strict: Strict = False
-    force: Annotated[bool, Option("Write the result even when it fails its own checks.")] = False
-    save_camera: Annotated[Path | None, Option("Write the estimated camera.", "FILE")] = None
-    camera_format: Annotated[
-        CameraFormat,
-        Option(
-            "Format of the camera file written. auto: by its name, .json (rdstitch), .yml (OpenCV), .fisheye.yml, "
-            ".pto (Hugin), .xml (lensfun), cameras.json (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS), "
-            "camchain.yaml (Kalibr).",
-        ),
-    ] = "auto"
+    force: bool = option(False, "Write the result even when it fails its own checks.")
+    save_camera: Path | None = option(None, "Write the estimated camera.", "FILE")
+    camera_format: CameraFormat = option(
+        "auto",
+        "Format of the camera file written. auto: by its name, .json (rdstitch), .yml (OpenCV), .fisheye.yml, "
+        ".pto (Hugin), .xml (lensfun), cameras.json (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS), "
+        "camchain.yaml (Kalibr).",
+    )
     dry_run: DryRun = False
 
     def __post_init__(self) -> None:

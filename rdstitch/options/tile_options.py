@@ -3,12 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 from rdstitch.choices import Origin, ScanOrder, ZPlane
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.options.option import Option, check_options, documented
+from rdstitch.options.option import check_options, documented, option
 from rdstitch.options.shared_options import DryRun, FlatField, Overwrite, Strict, Topic, Workers
 
 if TYPE_CHECKING:
@@ -29,58 +29,42 @@ class TileOptions:
     dict or data frame with x, y or x_um, y_um. By default (``composite``) each sample of the image is one of a tile.
     """
 
-    positions: Annotated[
-        "str | Path | ArrayLike | Mapping[str, ArrayLike] | None",
-        Option(
-            "CSV with name,x,y (pixels) or name,x_um,y_um, or Fiji's TileConfiguration.txt; otherwise what OME-TIFF "
-            "or Micro-Manager say.",
-            "FILE",
-            entered=Path | None,
-        ),
-    ] = None
-    grid: Annotated[
-        str | None,
-        Option(
-            "Part of the file names, with {row} and {col} for numbers and * for anything, such as 'r{row}c{col}'; "
-            "'{letter}{col}' for A01; 'img_{number}' for running numbers.",
-            "PATTERN",
-        ),
-    ] = None
-    columns: Annotated[int | None, Option("With {number}: tiles in a row.", least=1)] = None
-    order: Annotated[ScanOrder, Option("With {number}: how tiles follow each other; snake: to and fro.")] = "rows"
-    origin: Annotated[Origin, Option("With --grid: where the first tile is.")] = "top-left"
-    overlap: Annotated[
-        float, Option("With --grid: overlap of neighbouring tiles.", "PERCENT", least=0.0, below=100.0)
-    ] = 10.0
-    pixel_size: Annotated[float | None, Option("Pixel size, micrometres, if no file states it.", "UM", above=0.0)] = (
-        None
+    positions: "str | Path | ArrayLike | Mapping[str, ArrayLike] | None" = option(
+        None,
+        "CSV with name,x,y (pixels) or name,x_um,y_um, or Fiji's TileConfiguration.txt; otherwise what OME-TIFF "
+        "or Micro-Manager say.",
+        "FILE",
+        entered=Path | None,
     )
-    search: Annotated[
-        float | None,
-        Option(
-            "Search radius around the nominal offset of neighbours.", "PX", above=0.0, default="5 % of a tile's side"
-        ),
-    ] = None
-    channel: Annotated[
-        int | None, Option("Register this channel, from 0; otherwise the mean of all. All are composed.", least=0)
-    ] = None
-    z: Annotated[
-        ZPlane | None,
-        Option("Plane of z stacks, from 0; otherwise the brightest sample of all planes.", "max|N", least=0),
-    ] = None
-    time: Annotated[int | None, Option("Time of a series, from 0; otherwise the first.", least=0)] = None
+    grid: str | None = option(
+        None,
+        "Part of the file names, with {row} and {col} for numbers and * for anything, such as 'r{row}c{col}'; "
+        "'{letter}{col}' for A01; 'img_{number}' for running numbers.",
+        "PATTERN",
+    )
+    columns: int | None = option(None, "With {number}: tiles in a row.", least=1)
+    order: ScanOrder = option("rows", "With {number}: how tiles follow each other; snake: to and fro.")
+    origin: Origin = option("top-left", "With --grid: where the first tile is.")
+    overlap: float = option(10.0, "With --grid: overlap of neighbouring tiles.", "PERCENT", least=0.0, below=100.0)
+    pixel_size: float | None = option(None, "Pixel size, micrometres, if no file states it.", "UM", above=0.0)
+    search: float | None = option(
+        None, "Search radius around the nominal offset of neighbours.", "PX", above=0.0, default="5 % of a tile's side"
+    )
+    channel: int | None = option(
+        None, "Register this channel, from 0; otherwise the mean of all. All are composed.", least=0
+    )
+    z: ZPlane | None = option(
+        None, "Plane of z stacks, from 0; otherwise the brightest sample of all planes.", "max|N", least=0
+    )
+    time: int | None = option(None, "Time of a series, from 0; otherwise the first.", least=0)
     flat_field: FlatField = "auto"
-    save_flat_field: Annotated[
-        str | Path | None, Option("Write flat field and dark field to this TIFF file.", "FILE")
-    ] = None
-    distortion: Annotated[
-        float | Literal["auto"] | None,
-        Option(
-            "Known λ (half-diagonal frame), or auto: estimate it; otherwise 0 unless all overlaps show it.",
-            "L|auto",
-            "--lambda",
-        ),
-    ] = None
+    save_flat_field: str | Path | None = option(None, "Write flat field and dark field to this TIFF file.", "FILE")
+    distortion: float | Literal["auto"] | None = option(
+        None,
+        "Known λ (half-diagonal frame), or auto: estimate it; otherwise 0 unless all overlaps show it.",
+        "L|auto",
+        "--lambda",
+    )
     composite: CompositeOptions = field(default_factory=measured_samples)
     overwrite: Overwrite = False
     strict: Strict = False

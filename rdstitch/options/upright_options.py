@@ -1,10 +1,10 @@
 """How the output is turned between registration and canvas."""
 
 from dataclasses import dataclass, fields
-from typing import Annotated, Literal
+from typing import Literal
 
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Option, check_options
+from rdstitch.options.option import check_options, option
 
 Segment = tuple[float, float, float, float]
 Corners = tuple[float, float, float, float, float, float, float, float]
@@ -14,26 +14,22 @@ Corners = tuple[float, float, float, float, float, float, float, float]
 class UprightOptions:
     """How the output is turned."""
 
-    yaw: Annotated[float, Option("Turn the view of a panorama to the right, before it is projected.", "DEG")] = 0.0
-    pitch: Annotated[float, Option("Turn the view of a panorama up, before it is projected.", "DEG")] = 0.0
-    roll: Annotated[float, Option("Turn the view of a panorama clockwise, before it is projected.", "DEG")] = 0.0
-    rectangle: Annotated[
-        Corners | None,
-        Option(
-            "Four corners, pixels of the reference image as it is read, clockwise: they become an upright rectangle "
-            "of its true aspect ratio, the first one its top left corner.",
-            "X1,Y1,…,X4,Y4",
-        ),
-    ] = None
-    straighten: Annotated[
-        Literal["off", "auto"] | tuple[Segment, ...],
-        Option(
-            "Make horizontal and vertical edges of the scene so in the output. auto: edges detected in the images; "
-            "LINES: 'x1,y1,x2,y2;…', ends in pixels of the reference image as it is read.",
-            "off|auto|LINES",
-        ),
-    ] = "off"
-    level: Annotated[bool, Option("Level the output by gravity (XMP, --attitude), otherwise by most images.")] = False
+    yaw: float = option(0.0, "Turn the view of a panorama to the right, before it is projected.", "DEG")
+    pitch: float = option(0.0, "Turn the view of a panorama up, before it is projected.", "DEG")
+    roll: float = option(0.0, "Turn the view of a panorama clockwise, before it is projected.", "DEG")
+    rectangle: Corners | None = option(
+        None,
+        "Four corners, pixels of the reference image as it is read, clockwise: they become an upright rectangle "
+        "of its true aspect ratio, the first one its top left corner.",
+        "X1,Y1,…,X4,Y4",
+    )
+    straighten: Literal["off", "auto"] | tuple[Segment, ...] = option(
+        "off",
+        "Make horizontal and vertical edges of the scene so in the output. auto: edges detected in the images; "
+        "LINES: 'x1,y1,x2,y2;…', ends in pixels of the reference image as it is read.",
+        "off|auto|LINES",
+    )
+    level: bool = option(False, "Level the output by gravity (XMP, --attitude), otherwise by most images.")
 
     def __post_init__(self) -> None:
         check_options(self)

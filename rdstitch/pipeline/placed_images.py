@@ -82,7 +82,8 @@ class PlacedImages:
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
     relief: float = 0.0  # pixels that neighbours are off together, where the ground is no plane
-    leverage: Mapping[int | str, float] = field(default_factory=dict)  # of positions and control points, see Located
+    lever_std: float = 0.0  # lever_std, leverage: see Located
+    leverage: Mapping[int | str, float] = field(default_factory=dict)
     # pixels that the output is made on, as of an earlier run: from the plane (3, 3), their size, and their place
     grid: tuple[FloatArray, tuple[int, int], Georeference | None] | None = None
 
@@ -100,6 +101,7 @@ class PlacedImages:
             alignment.on_sphere,
             whole=registration.tiles is not None,
             relief=alignment.relief.size if alignment.relief.found else 0.0,
+            lever_std=alignment.lever_std,
             leverage={**alignment.leverage, **{k: alignment.leverage.get(int(i), 0.0) for k, i in enumerate(used)}},
         )
 
@@ -137,6 +139,7 @@ class PlacedImages:
             [source.metadata.nadir for source in self.sources],
             [source.control for source in self.sources],
             self.relief,
+            self.lever_std,
             self.leverage,
         )
 

@@ -18,6 +18,7 @@ from rdstitch.alignment.result import LinkFit, ReliefTest, Unused
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Correspondences
+from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, Named, array_as_image, as_inputs
@@ -373,42 +374,14 @@ def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registr
         )
     cameras = [replace(source.camera, distortion=fitted.distortion) for source in sources]
     places = fitted.places - fitted.places[0]
-    if fitted.distortion == 0.0:
-        # Without a lens to take out every sample can stay as it was measured.
-        places = np.rint(places)
-    # Of tiles of several sizes each has its own frame.
-    scales, centers = (np.array([getattr(c, part) for c in cameras]) for part in ("scale", "center"))
-    homographies = np.tile(np.eye(3), (len(sources), 1, 1))
-    homographies[:, [0, 1], [0, 1]] = (scales / scales[0])[:, None]
-    homographies[:, :2, 2] = (places + centers - centers[0]) / scales[0]
-    pairs, fits = [], []
-    for number, (first, second) in enumerate(links.tiles.tolist()):
-        of_pair = links.pair == number
-        relation = np.eye(3)
-        relation[[0, 1], [0, 1]] = scales[first] / scales[second]
-        off = fitted.places[first] - fitted.places[second] + centers[first] - centers[second]
-        relation[:2, 2] = off / scales[second]
-        agreeing = fitted.squared[of_pair] / fitted.noise < 16.0
-        errors = np.linalg.norm(fitted.residuals[of_pair], axis=1)
-        used = bool(fitted.weights[number] > 0.25)
-        rms = math.sqrt(float((errors[agreeing] ** 2).mean())) if agreeing.any() else math.nan
-        matches = Correspondences(
-            np.tile(np.arange(int(of_pair.sum()), dtype=np.intp)[:, None], 2),
-            links.points1[of_pair],
-            links.points2[of_pair],
-            np.zeros(int(of_pair.sum())),
-        )
-        pair = RadialHomography(
-            relation, cameras[first], cameras[second], agreeing, model="rigid", rms=rms, reason="correlation"
-        )
-        pairs.append(PairRegistration(first, second, StoredMatches.of(matches), pair))
-        reason = Unused.NO if used else Unused.CONTRADICTS
-        fits.append(LinkFit(first, second, len(errors), int(agreeing.sum()), rms if used else math.nan, used, reason))
+    exact = _homographies(cameras, places)
+    pairs, fits = zip(*(_pair(tiled, cameras, exact, number) for number in range(len(links.tiles))), strict=True)
     used_pairs = [fit for fit in fits if fit.used]
     rms = math.sqrt(float(np.mean([fit.rms**2 for fit in used_pairs if fit.inliers] or [math.nan])))
     alignment = Alignment(
         cameras=tuple(cameras),
-        homographies=homographies,
+        # Without a lens to take out every sample can stay as it was measured.
+        homographies=_homographies(cameras, np.rint(places)) if fitted.distortion == 0.0 else exact,
         used=np.ones(len(sources), dtype=np.bool_),
         components=(tuple(range(len(sources))),),
         reference=0,
@@ -426,13 +399,44 @@ def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registr
         parameters=(),
         covariance=np.empty((0, 0)),
         rms=rms,
-        links=tuple(fits),
+        links=fits,
         relief=ReliefTest(False, 0.0, 0.0, "Taken to be flat: tiles on a stage."),
     )
     counts = np.bincount(links.tiles[links.pair].ravel(), minlength=len(sources))
     return Registration(
-        tuple(sources), tuple(counts.tolist()), tuple(pairs), alignment, _messages(sources, tiled), tiles=tiled
+        tuple(sources), tuple(counts.tolist()), pairs, alignment, _messages(sources, tiled), tiles=tiled
     )
+
+
+def _homographies(cameras: Sequence[Camera], places: FloatArray) -> FloatArray:
+    """From each tile's normalized coordinates to those of the first (N, 3, 3); places (N, 2) are its pixels."""
+    # Of tiles of several sizes each has its own frame.
+    scales, centers = (np.array([getattr(camera, part) for camera in cameras]) for part in ("scale", "center"))
+    matrices = np.tile(np.eye(3), (len(cameras), 1, 1))
+    matrices[:, [0, 1], [0, 1]] = (scales / scales[0])[:, None]
+    matrices[:, :2, 2] = (places + centers - centers[0]) / scales[0]
+    return matrices
+
+
+def _pair(
+    tiled: TileRegistration, cameras: Sequence[Camera], homographies: FloatArray, number: int
+) -> tuple[PairRegistration, LinkFit]:
+    """A link between tiles, and how well it fits."""
+    fitted, links = tiled.adjustment, tiled.links
+    first, second = links.tiles[number].tolist()
+    of_pair = np.flatnonzero(links.pair == number)
+    agreeing = fitted.squared[of_pair] / fitted.noise < 16.0
+    errors, used = np.linalg.norm(fitted.residuals[of_pair], axis=1), bool(fitted.weights[number] > 0.25)
+    rms = math.sqrt(float((errors[agreeing] ** 2).mean())) if agreeing.any() else math.nan
+    matrix = np.linalg.solve(homographies[second], homographies[first])
+    relation = RadialHomography(
+        matrix, cameras[first], cameras[second], agreeing, model="rigid", rms=rms, reason="correlation"
+    )
+    indices = np.tile(np.arange(len(of_pair), dtype=np.intp)[:, None], 2)
+    matches = Correspondences(indices, links.points1[of_pair], links.points2[of_pair], np.zeros(len(of_pair)))
+    reason = Unused.NO if used else Unused.CONTRADICTS
+    fit = LinkFit(first, second, len(errors), int(agreeing.sum()), rms if used else math.nan, used, reason)
+    return PairRegistration(first, second, StoredMatches.of(matches), relation), fit
 
 
 def _messages(sources: Sequence[Source], tiled: TileRegistration) -> tuple[Message, ...]:

@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import export_note, load_camera, read_camera_file, save_camera
@@ -42,8 +43,31 @@ def _points(camera: Camera) -> FloatArray:
     return np.column_stack([u.ravel(), v.ravel()])
 
 
+def _apart(seen: FloatArray, camera: Camera) -> FloatArray:
+    """Distances of points from those of the camera, pixels (N,)."""
+    return np.asarray(np.linalg.norm(seen - _points(camera), axis=1))
+
+
+def _rays(camera: Camera) -> FloatArray:
+    """Where the camera's points look, (N, 3)."""
+    straight = camera.undistort(_points(camera))
+    return np.column_stack([(straight - camera.center) / camera.focal, np.ones(len(straight))])
+
+
+def _stated(text: str) -> float:
+    """The largest distance that a file states, pixels."""
+    return float(re.findall(r"fit_largest_px\"?: ([-\d.e]+)", text)[-1])
+
+
+def _saved_by_others(camera: Camera, file: Path) -> str:
+    """Save a camera as anyone else would have written it."""
+    save_camera(camera, file)
+    text = _without_own_node(file.read_text(encoding="utf-8"))
+    file.write_text(text, encoding="utf-8")
+    return text
+
+
 def _without_own_node(text: str) -> str:
-    """The file as anyone else would have written it."""
     if text.startswith("{"):
         content = json.loads(text)
         for holder in (content, *content.values()):
@@ -88,10 +112,7 @@ def test_a_camera_whose_lens_was_not_observable_is_written(tmp_path: Path, name:
 def test_of_a_foreign_file_the_lens_is_fitted_and_the_residual_reported(
     tmp_path: Path, name: str, camera: Camera
 ) -> None:
-    save_camera(camera, tmp_path / name)
-    text = _without_own_node((tmp_path / name).read_text(encoding="utf-8"))
-    assert "lambda" not in text
-    (tmp_path / name).write_text(text, encoding="utf-8")
+    assert "lambda" not in _saved_by_others(camera, tmp_path / name)
     found = read_camera_file(tmp_path / name)
     assert found.camera.image_size == camera.image_size
     np.testing.assert_allclose(found.camera.center, camera.center, atol=1e-6)
@@ -99,15 +120,15 @@ def test_of_a_foreign_file_the_lens_is_fitted_and_the_residual_reported(
     # λ alone stands for λ and μ of the second camera.
     assert found.camera.nearest_distortion == pytest.approx(camera.distortion + camera.distortion2, abs=0.006)
     # The residual is what a user sees: px between the two lenses. The file's own model is off by some px too.
-    apart = np.linalg.norm(found.camera.distort(camera.undistort(_points(camera))) - _points(camera), axis=1)
+    apart = _apart(found.camera.distort(camera.undistort(_points(camera))), camera)
     assert apart.max() < found.fit.largest + 0.002 * camera.scale
     assert found.fit.rms <= found.fit.largest
     assert found.fit.largest < 0.004 * camera.scale
 
 
-def _projected(matrix: FloatArray, values: list[float], rays: FloatArray, *, fisheye: bool) -> FloatArray:
+def _projected(matrix: FloatArray, values: ArrayLike, rays: FloatArray, *, fisheye: bool) -> FloatArray:
     """Where OpenCV sees rays (N, 3)."""
-    none, d = np.zeros(3), np.array(values)
+    none, d = np.zeros(3), np.asarray(values)
     if fisheye:
         seen = cv2.fisheye.projectPoints(rays[None], none, none, matrix, d)[0]
     else:
@@ -123,10 +144,12 @@ def _numbers(values: list[Any]) -> list[float]:
     return [float(value) for value in values]
 
 
-def _camera_info(text: str) -> Parsed:
-    record = parse_yaml(text, "camera_info.yaml")
+def _opencv(text: str) -> Parsed:
+    """Of OpenCV's files, and of ROS's, which look alike."""
+    record = json.loads(text) if text.startswith("{") else parse_yaml(text, "c.yml")
     fx, _, cx, _, fy, cy = _numbers(record["camera_matrix"]["data"])[:6]
-    return ([fx, fy, cx, cy], _numbers(record["distortion_coefficients"]["data"]), record["distortion_model"])
+    model = "equi" if "fisheye_model" in record else record.get("distortion_model", "opencv")
+    return [fx, fy, cx, cy], _numbers(record["distortion_coefficients"]["data"]), model
 
 
 def _camera_chain(text: str) -> Parsed:
@@ -139,22 +162,6 @@ def _colmap(text: str) -> Parsed:
     line = text.splitlines()[-1].split()
     values = [float(value) for value in line[4:]]
     return [*values[:2], values[2] - 0.5, values[3] - 0.5], values[4:], line[1]
-
-
-def _fisheye(text: str) -> Parsed:
-    record = parse_yaml(text, "fisheye.yml")
-    fx, _, cx, _, fy, cy = _numbers(record["camera_matrix"]["data"])[:6]
-    return [fx, fy, cx, cy], _numbers(record["distortion_coefficients"]["data"]), "equi"
-
-
-def _opencv(text: str) -> Parsed:
-    if text.startswith("{"):
-        content = json.loads(text)
-        matrix, values = content["camera_matrix"]["data"], content["distortion_coefficients"]["data"]
-    else:
-        record = parse_yaml(text, "c.yml")
-        matrix, values = (_numbers(record[name]["data"]) for name in ("camera_matrix", "distortion_coefficients"))
-    return [matrix[0], matrix[4], matrix[2], matrix[5]], list(values), "opencv"
 
 
 def _opendronemap(text: str) -> Parsed:
@@ -175,10 +182,10 @@ def _opendronemap(text: str) -> Parsed:
         ("c.yml", _opencv),
         ("opencv.json", _opencv),
         ("cameras.json", _opendronemap),
-        ("camera_info.yaml", _camera_info),
+        ("camera_info.yaml", _opencv),
         ("camchain.yaml", _camera_chain),
         ("cameras.txt", _colmap),
-        ("fisheye.yml", _fisheye),
+        ("fisheye.yml", _opencv),
     ],
 )
 def test_what_is_exported_is_off_by_what_it_states(
@@ -187,12 +194,9 @@ def test_what_is_exported_is_off_by_what_it_states(
     save_camera(camera, tmp_path / name)
     text = (tmp_path / name).read_text(encoding="utf-8")
     (fx, fy, cx, cy), values, model = parse(text)
-    straight = camera.undistort(_points(camera))
-    rays = np.column_stack([(straight - camera.center) / camera.focal, np.ones(len(straight))])
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     fisheye = model in ("equi", "equidistant", "OPENCV_FISHEYE")
-    apart = np.linalg.norm(_projected(matrix, values, rays, fisheye=fisheye) - _points(camera), axis=1).max()
-    stated = float(re.findall(r"fit_largest_px\"?: ([-\d.e]+)", text)[-1])
+    apart, stated = _apart(_projected(matrix, values, _rays(camera), fisheye=fisheye), camera).max(), _stated(text)
     assert 0.3 * stated < apart < 1.05 * stated + 1e-6
     assert stated < 1.0
 
@@ -200,13 +204,11 @@ def test_what_is_exported_is_off_by_what_it_states(
 @pytest.mark.parametrize("name", ["fisheye.yml", "c.yml"])
 def test_a_strong_lens_of_others_takes_more_than_one_coefficient(tmp_path: Path, name: str) -> None:
     camera = CAMERAS[4]
-    save_camera(camera, tmp_path / name)
-    text = _without_own_node((tmp_path / name).read_text(encoding="utf-8"))
-    (tmp_path / name).write_text(text, encoding="utf-8")
+    _saved_by_others(camera, tmp_path / name)
     found = read_camera_file(tmp_path / name)
     assert found.fit.largest < 0.2
     assert found.camera.higher
-    apart = np.linalg.norm(found.camera.distort(camera.undistort(_points(camera))) - _points(camera), axis=1)
+    apart = _apart(found.camera.distort(camera.undistort(_points(camera))), camera)
     assert apart.max() < 0.3
 
 
@@ -225,10 +227,7 @@ def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
     assert found == same
     assert found.kind == "OpenCV"
     assert 0.0 < found.fit.rms < found.fit.largest < 4.0
-    straight = found.camera.undistort(_points(found.camera))
-    rays = np.column_stack([(straight - found.camera.center) / found.camera.focal, np.ones(len(straight))])
-    seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)
-    apart = np.linalg.norm(np.asarray(seen)[:, 0] - _points(found.camera), axis=1)
+    apart = _apart(_projected(matrix, coefficients[0], _rays(found.camera), fisheye=False), found.camera)
     assert np.sqrt(np.mean(apart**2)) == pytest.approx(found.fit.rms, rel=0.35)
 
 
@@ -239,8 +238,7 @@ def test_brown_is_what_opencv_calls_so(count: int) -> None:
     lens = LensModel((700.0, 720.0), (320.0, 242.0), tuple(k.tolist()))
     points = _points(Camera((640, 480)))
     rays = np.column_stack([(points - lens.center) / lens.mean_focal, np.ones(len(points))])
-    seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, k)
-    np.testing.assert_allclose(lens.distort(points), np.asarray(seen)[:, 0], atol=1e-9)
+    np.testing.assert_allclose(lens.distort(points), _projected(matrix, k, rays, fisheye=False), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -265,8 +263,7 @@ def test_hugin_means_what_its_manual_says(tmp_path: Path, camera: Camera, projec
     r = np.linalg.norm(ideal, axis=1, keepdims=True)
     center = (width - 1) / 2 + d, (height - 1) / 2 + e
     seen = ideal * (a * r**3 + b * r**2 + c * r + 1 - a - b - c) * unit + center
-    apart = np.linalg.norm(seen - _points(camera), axis=1).max()
-    stated = float(re.findall(r"fit_largest_px\"?: ([-\d.e]+)", text)[-1])
+    apart, stated = _apart(seen, camera).max(), _stated(text)
     assert 0.3 * stated < apart < 1.05 * stated + 1e-6
 
 
@@ -322,12 +319,9 @@ def test_cameras_of_colmap_and_kalibr_mean_what_opencv_says(tmp_path: Path, mode
     for file, kind in zip(found, ("COLMAP", "Kalibr"), strict=False):
         assert file.kind == kind
         assert file.camera.image_size == size
-        points = _points(file.camera)
-        focal = np.sqrt(focals[0] * focals[-1])
-        assert file.camera.focal == pytest.approx(focal)
-        rays = np.column_stack([(file.camera.undistort(points) - (810.0, 590.0)) / focal, np.ones(len(points))])
-        apart = np.linalg.norm(_projected(matrix, padded, rays, fisheye=fisheye) - points, axis=1)
-        assert apart.max() < 0.15
+        assert file.camera.focal == pytest.approx(np.sqrt(focals[0] * focals[-1]))
+        assert file.camera.center == pytest.approx((810.0, 590.0))
+        assert _apart(_projected(matrix, padded, _rays(file.camera), fisheye=fisheye), file.camera).max() < 0.15
 
 
 @pytest.mark.parametrize(
@@ -370,8 +364,7 @@ def test_what_colmap_and_kalibr_know_and_rdstitch_does_not_is_named(tmp_path: Pa
     ],
 )
 def test_complaints_name_file_and_field(tmp_path: Path, name: str, old: str, new: str, named: str) -> None:
-    save_camera(CAMERAS[0], tmp_path / name)
-    text = _without_own_node((tmp_path / name).read_text(encoding="utf-8"))
+    text = _saved_by_others(CAMERAS[0], tmp_path / name)
     if new == '"k1": 1':
         text = re.sub(r'"k1": [-\d.e]+', '"k1": -30.0', text)
     else:

@@ -192,7 +192,7 @@ def test_bad_arguments_are_refused(image: NDArray[np.uint8]) -> None:
     for options in (
         {"kind": "surfing"},
         {"max_features": 0},
-        {"work_megapixels": 0.0},
+        {"work_megapixels": -1.0},
     ):
         with pytest.raises(ArgumentError):
             FeatureOptions(**options)
