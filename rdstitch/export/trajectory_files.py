@@ -1,11 +1,12 @@
 """Trajectories as files: a table, a drawing, and the formats of the TUM and KITTI benchmarks, which ``evo`` reads.
 
-The plane lies at z = 0; at the first frame x, y and yaw are zero. Three frames of reference, all right-handed:
+The plane lies at z = 0; at the first frame x, y and yaw are zero. Four frames of reference, all right-handed:
 
 ========= ============================================================= ==================
 "enu"     x to the right and y to the top of the first image, z up      the camera above 0
 "ros"     x to the top and y to the left of the first image, z up       the camera above 0
 "camera"  x to the right and y to the bottom of the first image, z down the camera below 0
+"first"   the same; a mosaic's sidecar and plane have it too            the camera below 0
 ========= ============================================================= ==================
 
 The yaw, in all files, is the heading of the camera, counterclockwise as seen from above (as in ROS's REP 103): φ of
@@ -27,6 +28,7 @@ from rdstitch.choices import TrajectoryFrame
 AXES: dict[TrajectoryFrame, FloatArray] = {
     "enu": np.array([[1.0, 0.0], [0.0, -1.0]]),
     "camera": np.eye(2),
+    "first": np.eye(2),
     "ros": np.array([[0.0, -1.0], [-1.0, 0.0]]),
 }
 """x and y by those of the first image, to its right and its bottom."""

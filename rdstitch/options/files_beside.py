@@ -36,8 +36,9 @@ class FilesBeside:
     )
     frame: PosesFrame = option(
         "enu",
-        "Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. map: easting, "
-        "northing and height in metres, where the output is georeferenced.",
+        "Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. first: those of camera, "
+        "and the sidecar has them too: the first image is the reference. map: easting, northing and height in metres, "
+        "where the output is georeferenced.",
     )
     height: Height = 1.0
     command: str = ""  # the command line, for the report

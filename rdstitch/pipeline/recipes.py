@@ -275,6 +275,8 @@ def _stitch_found(
     sources, unread = read_inputs(frames, options, skip_bad=not pano)
     check_world_files(images, sources, options.overwrite)
     check_map(sources, options.composite)
+    if beside.frame == "first":
+        options = replace(options, reference=sources[0].name)
     purpose = Purpose.PANO if pano else Purpose.MOSAIC
     with options.executor(len(sources)) as executor:
         known = [*unread, *listed.messages]

@@ -32,7 +32,7 @@ log f, guessed          1.2 ± 30 %; 1.5 ± 70 % (0.1) half diagonals: phones, d
 log f, from EXIF        ± 5 %; as guessed (0.1)      rounded to a millimetre, mostly right; wrong by any factor
                                                      where a program has resized the image
 log f, given            ± 1 %, or as stated; live,   the user, or a camera file; of another lens, another zoom or
-                        any ± 20 % (0.05)            another size of image
+                        any ± 20 % (0.02)            another size of image
 tilt of a plane         0 ± 20°; 0 ± 45° (0.2)       what is laid flat is looked at from above; robots look ahead
 ======================= ============================ ==========================================================
 """
@@ -151,7 +151,7 @@ LENS = (
 )
 """Priors on :data:`rdstitch.geometry.camera.LENS_PARAMETERS`."""
 
-WRONG_GIVEN_FOCAL = 0.05, 0.2
+WRONG_GIVEN_FOCAL = 0.02, 0.2
 """How often a given focal length is that of something else, and by how much its logarithm is off then."""
 
 TILT = Prior(((0.8, 0.0, math.radians(20.0)), (0.2, 0.0, math.radians(45.0))))

@@ -68,12 +68,13 @@ class ShownCamera:
     delay_std: float
 
 
-def shown_camera(pairs: SeenPairs) -> ShownCamera:
-    """The tilt, and the focal length, by which the motions between frames are rigid."""
+def shown_camera(pairs: SeenPairs, tilt: tuple[float, float] | None = None) -> ShownCamera:
+    """The tilt, about as given if it is, and the focal length, by which the motions between frames are rigid."""
     count, points = pairs.rays.shape[1:3]
     base = [_PSI, _THETA] if pairs.attitudes is None else [_PSI, _THETA, _DELAY]
     with np.errstate(all="ignore"):  # beyond the horizon
-        fits = [_fitted(pairs, np.array([*start, 0.0, 0.0]), base) for start in _TILT_STARTS]
+        starts = _TILT_STARTS if tilt is None else (tilt,)
+        fits = [_fitted(pairs, np.array([*start, 0.0, 0.0]), base) for start in starts]
         camera, value, slope = min(fits, key=lambda fit: _cost(fit[1]))
         if not np.isfinite(slope).all():
             return ShownCamera((0.0, 0.0), math.inf, math.inf, 0.0, math.inf, (0.0, 0.0), 0.0, DELAY_STD)

@@ -448,7 +448,8 @@ class Tracker:
                 rays.append((camera.undistort(points) - camera.center) / (self._focal * camera.scale))
                 attitudes.append(frame.attitude)
         measured = [attitude for attitude in attitudes if attitude is not None]
-        return shown_camera(SeenPairs.of(rays, measured if len(measured) == len(rays) else []))
+        tilt = None if self._plane is None else self._plane.tilt
+        return shown_camera(SeenPairs.of(rays, measured if len(measured) == len(rays) else []), tilt)
 
     def _with_shown_focal(self, frame: TrackedFrame, shown: ShownCamera) -> list[Tracked]:
         """The map by the focal length that the images show, instead of the one that was given."""

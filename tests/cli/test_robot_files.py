@@ -1,5 +1,6 @@
 """What robots load: a map of nav2, odometry in a bag, all in one frame."""
 
+import json
 import math
 import sys
 from pathlib import Path
@@ -50,6 +51,22 @@ def test_map_poses_and_odometry_lie_in_one_frame(rdstitch: Run, frames: list[Pat
         assert (at.x, at.y, at.z) == pytest.approx((x, y, 0.42), abs=1e-3)
         assert 2.0 * math.atan2(turn.z, turn.w) == pytest.approx(math.radians(yaw), abs=1e-6)
         assert message.pose.covariance.shape == (36,)
+
+
+def test_the_first_image_gives_the_frame_of_path_mosaic_and_sidecar(
+    rdstitch: Run, frames: list[Path], tmp_path: Path
+) -> None:
+    known = ("--focal", "380", "--height", "0.42", "--frame", "first", *CACHED)
+    rdstitch("trajectory", *frames, "-o", tmp_path / "path.csv", *known)
+    beside = ("--poses", tmp_path / "poses.csv", "--map-server", tmp_path / "maps")
+    rdstitch("mosaic", *frames, "-o", tmp_path / "f.png", *beside, *known)
+    path = _poses(tmp_path / "path.csv")
+    np.testing.assert_allclose(_poses(tmp_path / "poses.csv"), path, atol=1e-3)
+    content = json.loads((tmp_path / "f.png.json").read_text(encoding="utf-8"))
+    poses = [image["pose"] for image in content["images"]]
+    of_sidecar = np.array([[0.42 * pose["x"], 0.42 * pose["y"], pose["yaw_deg"]] for pose in poses])
+    np.testing.assert_allclose(of_sidecar, path, atol=1e-3)
+    assert (of_sidecar[0] == 0.0).all()
 
 
 def test_of_several_bands_the_first_one_is_the_map(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

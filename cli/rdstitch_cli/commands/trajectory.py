@@ -47,8 +47,8 @@ def trajectory(
         TrajectoryFrame | None,
         Option(
             "Axes of positions. enu: x to the right and y to the top of the first image, z up; default of csv and tum. "
-            "ros: x to the top, y to the left, z up; default of bag. camera: x to the right, y to the bottom, z down; "
-            "default of kitti. yaw_deg is counterclockwise as seen from above in all."
+            "ros: x to the top, y to the left, z up; default of bag. camera, or first: x to the right, y to the "
+            "bottom, z down; default of kitti. yaw_deg is counterclockwise as seen from above in all."
         ),
     ] = None,
     height: Height = 1.0,

@@ -117,7 +117,7 @@ def test_with_lens_and_tilt_the_second_frame_has_a_pose_and_errors_are_as_large_
         assert pose.map == 0
     # A focal length that was given is only as good as what the images have confirmed of it.
     stated = second.length_std, poses[11].length_std
-    assert 0.03 < stated[0] < 0.1
+    assert 0.02 < stated[0] < 0.1
     assert 0.002 < stated[1] < 0.012
     for pose in poses.values():
         x, y, _ = pose.position
