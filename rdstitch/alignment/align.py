@@ -14,7 +14,7 @@ from rdstitch.alignment.adjustment_problem import (
     thin_for_selection,
 )
 from rdstitch.alignment.alignment_options import AlignmentOptions
-from rdstitch.alignment.build_result import AdjustedImages, build_alignment
+from rdstitch.alignment.build_result import AdjustedImages, GivenImages, build_alignment
 from rdstitch.alignment.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
@@ -77,12 +77,8 @@ def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOp
 
 
 @dataclass(frozen=True, eq=False)
-class AlignmentTask:
+class AlignmentTask(GivenImages):
     """Images to be aligned, as :func:`align` takes them: a draft, and the result, each computed when it is wanted."""
-
-    cameras: Sequence[Camera]
-    links: Sequence[Link]
-    options: AlignmentOptions
 
     @cached_property
     def draft(self) -> Alignment:
@@ -97,7 +93,7 @@ class AlignmentTask:
     @cached_property
     def _chosen(self) -> AdjustedImages:
         _check(self.cameras, self.links, self.options)
-        return _chosen(self.cameras, self.links, self.options)
+        return _chosen(self)
 
 
 def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
@@ -111,8 +107,9 @@ def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
     return int(full[np.argmax(trust)])
 
 
-def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> AdjustedImages:
+def _chosen(task: GivenImages) -> AdjustedImages:
     """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
+    cameras, links, options = task.cameras, task.links, task.options
     known = options.camera_priors(cameras)
     everything, read = _observations(links, cameras, _matches_of_a_link(len(links), options))
     few = everything.thinned(thin_for_selection(len(links)))
@@ -144,22 +141,16 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
     shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
     problem = replace(problem, overdispersion=shared)
     if (doubt := check_attitudes(problem, options)) is not None:
-        without = _chosen(cameras, links, doubt[0])
+        without = _chosen(replace(task, options=doubt[0]))
         return replace(without, messages=(doubt[1], *without.messages))
-    choice = select_model(
-        problem,
-        options.models,
-        chosen.refinements,
-        options.purpose,
-    )
+    choice = select_model(problem, options.models, chosen.refinements, options.purpose)
     choice, images, wrong = _drop_wrong_pairs(whole, problem, images, choice, wrong)
     problem, _ = whole.part(~wrong, images)
     choice = choose_over_relief(problem, choice, options.models, options.purpose)
     free_lens = choice.fit.free_lens
     whole = replace(whole, observations=everything, free_lens=free_lens, min_gain=MIN_GAIN)
     return AdjustedImages(
-        cameras,
-        links,
+        task,
         images,
         ~wrong,
         whole,
@@ -168,17 +159,16 @@ def _chosen(cameras: Sequence[Camera], links: Sequence[Link], options: Alignment
         chosen.refined(free_lens),
         observable,
         depth,
-        options,
     )
 
 
 def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
     """Adjusted to all matches."""
-    choice, options, links = chosen.choice, chosen.options, chosen.links
+    choice, options, links = chosen.choice, chosen.given.options, chosen.given.links
     whole = chosen.whole
     if choice.fit.model.on_sphere and most_matches_read(len(links), options) is None:
         # Few images of a turn hardly determine the focal length; all their matches are used.
-        every, _ = _observations(links, chosen.cameras, _MATCHES_OF_A_TURN // len(links))
+        every, _ = _observations(links, chosen.given.cameras, _MATCHES_OF_A_TURN // len(links))
         whole = replace(whole, observations=every)
     problem, _ = whole.part(chosen.right, chosen.images)
     # What errors share weighs the more, the more of them there are.
@@ -215,16 +205,18 @@ def _checked_focal(told: AdjustedImages, given: AlignmentOptions) -> AdjustedIma
     """Without the focal length that was given, where it gave way and the images by themselves show another one."""
     if told.covariance is None or not is_strained(told.whole.camera_priors, told.choice.fit):
         return told
-    cameras = [replace(camera, focal=None, focal_std=None, focal_source=None).with_focal() for camera in told.cameras]
+    task = told.given
+    cameras = [replace(camera, focal=None, focal_std=None, focal_source=None).with_focal() for camera in task.cameras]
     # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
-    options = told.options if told.options.attitudes is not None else replace(told.options, tilt=None)
+    options = task.options if task.options.attitudes is not None else replace(task.options, tilt=None)
+    without = GivenImages(cameras, task.links, options)
     try:
-        shown = _adjusted(_chosen(cameras, told.links, options))
-        doubt = check_focal(told.cameras[shown.images[0]], shown.choice.fit, shown.covariance)
+        shown = _adjusted(_chosen(without))
+        doubt = check_focal(task.cameras[shown.images[0]], shown.choice.fit, shown.covariance)
         if doubt is None:
             return told
         if options != given:  # what seemed to be wrong may have been so with the wrong focal length only
-            shown = _adjusted(_chosen(cameras, told.links, given))
+            shown = _adjusted(_chosen(replace(without, options=given)))
     except (RegistrationError, ImpossibleCameraError, np.linalg.LinAlgError):
         return told  # by themselves the images determine nothing
     return replace(shown, messages=(*shown.messages, doubt))

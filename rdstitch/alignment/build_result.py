@@ -47,12 +47,20 @@ _CONFIDENT = 2.0
 """Standard deviations within which the lens is taken to be known: 95 %."""
 
 
+@dataclass(frozen=True, eq=False)
+class GivenImages:
+    """Images to be aligned."""
+
+    cameras: Sequence[Camera]
+    links: Sequence[Link]
+    options: AlignmentOptions
+
+
 @dataclass(frozen=True)
 class AdjustedImages:
     """What the adjustment found, and what it was made from."""
 
-    cameras: Sequence[Camera]
-    links: Sequence[Link]
+    given: GivenImages
     images: IntArray  # (N,): the images aligned, ascending; the problem numbers them 0 … N-1
     right: BoolArray  # (L,): links not taken for wrong
     whole: Problem  # of all links and images, with the matches that they are adjusted by in the end
@@ -61,7 +69,6 @@ class AdjustedImages:
     lens: LensChoice  # the lens, with the distortion centre if the motion model freed it
     observable: bool  # whether λ is observable, or known
     depth: bool  # whether that is because what few images show has depth
-    options: AlignmentOptions
     positions_disagree: str = ""  # why the positions were not used; empty where they were, or where there are none
     leverage: Mapping[int | str, float] = field(default_factory=dict)  # see Alignment
     messages: tuple[Message, ...] = ()  # on what was given
@@ -109,11 +116,11 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
         return replace(result, tilt=tilt, tilt_std=tilt_std)
 
     # Most images are of one camera.
-    adjusted_cameras = {camera: adjusted_camera(camera) for camera in dict.fromkeys(adjustment.cameras)}
-    cameras = tuple(adjusted_cameras[camera] for camera in adjustment.cameras)
+    adjusted_cameras = {camera: adjusted_camera(camera) for camera in dict.fromkeys(adjustment.given.cameras)}
+    cameras = tuple(adjusted_cameras[camera] for camera in adjustment.given.cameras)
     reference_camera = cameras[int(adjustment.images[problem.reference])]
     groups = _groups(adjustment)
-    used = np.zeros(len(adjustment.cameras), dtype=np.bool_)
+    used = np.zeros(len(adjustment.given.cameras), dtype=np.bool_)
     used[adjustment.images] = True
     homographies, poses = _in_frame_of_reference(adjustment)
     return Alignment(
@@ -151,7 +158,7 @@ def _shape(adjustment: AdjustedImages) -> ShapeTest | None:
     if fit.model.on_sphere or not adjustment.observable or adjustment.covariance is None:
         return None
     images = adjustment.images
-    judged = judge_shape(adjustment.problem, fit, [adjustment.cameras[k] for k in images])
+    judged = judge_shape(adjustment.problem, fit, [adjustment.given.cameras[k] for k in images])
     return replace(judged, image=int(images[judged.image]))
 
 
@@ -212,12 +219,12 @@ def _in_frame_of_reference(adjustment: AdjustedImages) -> tuple[FloatArray, Plan
 
     def of_all(values: FloatArray) -> FloatArray:
         """Of all images, NaN for those that are not aligned."""
-        result = np.full((len(adjustment.cameras), *values.shape[1:]), np.nan)
+        result = np.full((len(adjustment.given.cameras), *values.shape[1:]), np.nan)
         result[adjustment.images] = values
         return result
 
     if fit.model.on_sphere:
-        given = adjustment.options.gravity
+        given = adjustment.given.options.gravity
         gravity = None if given is None else np.asarray(given, dtype=np.float64)[adjustment.images]
         return of_all(levelled(matrices, reference, gravity)), None
     if not isinstance(fit.model, PlanarModel):
@@ -231,7 +238,7 @@ def _in_frame_of_reference(adjustment: AdjustedImages) -> tuple[FloatArray, Plan
     )
     frame = rigid_in_plane(yaw[reference], position[reference], height[reference])
     poses = PlanarPoses(yaw, position, height, tilt).relative_to(reference)
-    wanted = adjustment.options.pose_covariance and adjustment.covariance is not None
+    wanted = adjustment.given.options.pose_covariance and adjustment.covariance is not None
     covariances = pose_covariances(adjustment.problem, fit) if wanted else ()
     aligned_poses = (poses.yaw, poses.position, poses.height, poses.tilt, *covariances)
     return of_all(frame @ inverses(matrices)), PlanarPoses(*map(of_all, aligned_poses))
@@ -239,8 +246,8 @@ def _in_frame_of_reference(adjustment: AdjustedImages) -> tuple[FloatArray, Plan
 
 def _groups(adjustment: AdjustedImages) -> tuple[tuple[int, ...], ...]:
     """Connected groups of images by the links not taken for wrong, the aligned one first."""
-    right = [link for link, right in zip(adjustment.links, adjustment.right, strict=True) if right]
-    groups = connected_components(len(adjustment.cameras), [k.image1 for k in right], [k.image2 for k in right])
+    right = [link for link, right in zip(adjustment.given.links, adjustment.right, strict=True) if right]
+    groups = connected_components(len(adjustment.given.cameras), [k.image1 for k in right], [k.image2 for k in right])
     aligned = set(adjustment.images.tolist())
     ordered = sorted(groups, key=lambda group: group[0] not in aligned)
     return tuple(tuple(group) for group in ordered)
@@ -256,7 +263,7 @@ def _link_fits(adjustment: AdjustedImages, squared: FloatArray, agreeing: BoolAr
         for row, (i, j) in enumerate(zip(observations.image1, observations.image2, strict=True))
     }
     result = []
-    for link, right in zip(adjustment.links, adjustment.right, strict=True):
+    for link, right in zip(adjustment.given.links, adjustment.right, strict=True):
         row = rows.get(frozenset((link.image1, link.image2)))
         if row is None or not right:
             why = Unused.ELSEWHERE if right else Unused.CONTRADICTS
@@ -286,7 +293,7 @@ def _warnings(adjustment: AdjustedImages, camera: Camera, considered: FloatArray
     """What the user should know of the whole, with the covariance (5, 5) of all parameters of a lens."""
     result: list[Message] = []
     # An image can be right whatever the lens is, and a path by what is known of the lens.
-    image_only, severity = adjustment.options.purpose.picture, adjustment.options.purpose.unknown_lens
+    image_only, severity = adjustment.given.options.purpose.picture, adjustment.given.options.purpose.unknown_lens
     if adjustment.depth or not adjustment.observable:
         cause, remedy = "the images hardly move, or only turn about the optical axis", "images that overlap by less"
         if adjustment.depth:

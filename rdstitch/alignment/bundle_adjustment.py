@@ -161,13 +161,9 @@ class BundleAdjuster:
     def run(self, start: Parameters, revise: Revision | None = None) -> BundleAdjustmentResult:
         """Adjust.
 
-        Parameters
-        ----------
-        start : Parameters
-        revise : callable, optional
-            Takes the adjuster, a solution, its scatter and its whitened errors (M, 2) to the adjuster to go on with;
-            the same one ends the adjustment. Then the loss is as wide in the beginning as most links need, and again
-            after each revision; otherwise the scatter of the first errors decides.
+        ``revise``: takes the adjuster, a solution, its scatter and its whitened errors (M, 2) to the adjuster to go on
+        with; the same one ends the adjustment. Then the loss is as wide in the beginning as most links need, and again
+        after each revision; otherwise the scatter of the first errors decides.
         """
 
         def widest(squared: FloatArray, sigma: float) -> float:

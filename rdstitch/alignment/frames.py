@@ -7,38 +7,101 @@ the distortion centre is mirrored too, which one lens of all cannot show.
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
-from rdstitch.geometry.exif_orientation import inverse, turning_matrix
+from rdstitch.geometry.exif_orientation import inverse, quarter_turn, turning_matrix
 from rdstitch.geometry.planar_motion import rigid_in_plane, rotation_from_tilt, tilt_from_normal
+from rdstitch.inputs.source import Source
 from rdstitch.matching.links import Link
 
 
-def turns(orientations: Sequence[int]) -> FloatArray:
+@dataclass(frozen=True)
+class QuarterTurns:
+    """By which quarter turns of EXIF (1, 3, 6, 8) images became upright: what is known of them as the camera stored
+    them, and back.
+    """
+
+    upright: tuple[int, ...]
+
+    @classmethod
+    def of(cls, sources: Sequence[Source]) -> Self:
+        """Of images by their headers."""
+        return cls(tuple(quarter_turn(source.metadata.orientation) for source in sources))
+
+    @cached_property
+    def back(self) -> tuple[int, ...]:
+        """What leads back from upright images."""
+        return tuple(inverse(orientation) for orientation in self.upright)
+
+    @property
+    def matrices_back(self) -> FloatArray:
+        """Rotations (N, 3, 3) about the optical axis from upright images."""
+        return _turns(self.back)
+
+    def stored_camera(self, camera: Camera, image: int) -> Camera:
+        """The camera of an image."""
+        return camera.turned(self.back[image])
+
+    def stored_tilts(self, tilts: FloatArray) -> FloatArray:
+        """Tilts (ψ, θ) (N, 2), radians, of the cameras."""
+        return _turned_tilts(tilts, self.back)
+
+    def upright_tilts(self, tilts: FloatArray) -> FloatArray:
+        """Tilts (ψ, θ) (N, 2), radians, of the upright images."""
+        return _turned_tilts(tilts, self.upright)
+
+    def stored_directions(self, directions: FloatArray) -> FloatArray:
+        """Directions (N, 3), one in the axes of each upright image, in those of the cameras."""
+        turned: FloatArray = np.einsum("nij,nj->ni", _turns(self.back), directions)
+        return turned
+
+    def stored_point(self, point: FloatArray, image: int) -> FloatArray:
+        """A point (2,), from the middle of an upright image."""
+        turned: FloatArray = turning_matrix(self.back[image]) @ point
+        return turned
+
+    def stored_link(self, link: Link, cameras: Sequence[Camera]) -> Link:
+        """Correspondences of upright images of these cameras."""
+        return _turned_link(link, cameras, self.back)
+
+    def stored_alignment(self, alignment: Alignment) -> Alignment:
+        """An alignment of upright images."""
+        return _turned_alignment(alignment, self.back, None)
+
+    def upright_alignment(self, alignment: Alignment, gravity: ArrayLike | None) -> Alignment:
+        """An alignment of images as the camera stored them; gravity (N, 3) is down in the axes of the cameras."""
+        down = None if gravity is None else np.einsum("nij,nj->ni", _turns(self.upright), np.asarray(gravity))
+        return _turned_alignment(alignment, self.upright, down)
+
+
+def _turns(orientations: Sequence[int]) -> FloatArray:
     """Rotations (N, 3, 3) about the optical axis by orientations 1, 3, 6 and 8."""
     matrices = np.tile(np.eye(3), (len(orientations), 1, 1))
     matrices[:, :2, :2] = [turning_matrix(orientation) for orientation in orientations]
     return matrices
 
 
-def turned_tilts(tilts: FloatArray, orientations: Sequence[int]) -> FloatArray:
+def _turned_tilts(tilts: FloatArray, orientations: Sequence[int]) -> FloatArray:
     """Tilts (ψ, θ) (N, 2), radians, of images after orientations 1, 3, 6 and 8."""
     normals = rotation_from_tilt(tilts)[..., 2]
     turned = np.array(orientations)[:, None] != 1
-    return np.where(turned, tilt_from_normal(np.einsum("nij,nj->ni", turns(orientations), normals)), tilts)
+    return np.where(turned, tilt_from_normal(np.einsum("nij,nj->ni", _turns(orientations), normals)), tilts)
 
 
-def turned_link(link: Link, cameras: Sequence[Camera], orientations: Sequence[int]) -> Link:
+def _turned_link(link: Link, cameras: Sequence[Camera], orientations: Sequence[int]) -> Link:
     """The same correspondences in images, of the cameras given, after orientations 1, 3, 6 and 8."""
     pair = orientations[link.image1], orientations[link.image2]
     if pair == (1, 1):
         return link
-    first, second = turns(pair)
+    first, second = _turns(pair)
     relation = link.relation
     return replace(
         link,
@@ -59,14 +122,14 @@ def _turned_points(points: FloatArray, camera: Camera, orientation: int) -> Floa
     return camera.turned(orientation).denormalize(camera.normalize(points) @ turning_matrix(orientation).T)
 
 
-def turned_alignment(alignment: Alignment, orientations: Sequence[int], gravity: FloatArray | None) -> Alignment:
+def _turned_alignment(alignment: Alignment, orientations: Sequence[int], gravity: FloatArray | None) -> Alignment:
     """The same alignment of the images after orientations 1, 3, 6 and 8, in the frame of the reference as it is then.
 
     Gravity (N, 3) is down in the axes of the cameras of the turned images; NaN where it is not known.
     """
     if all(orientation == 1 for orientation in orientations):
         return alignment
-    turn, used, reference = turns(orientations), alignment.used, alignment.reference
+    turn, used, reference = _turns(orientations), alignment.used, alignment.reference
     turn_of_reference, poses, tilt = turn[reference], alignment.poses, alignment.tilt
     homographies = np.array(alignment.homographies)
     if alignment.on_sphere:
@@ -113,11 +176,6 @@ def _turned_covariance(alignment: Alignment, turn: FloatArray) -> FloatArray:
             jacobian[np.ix_(index, index)] = turn
     covariance: FloatArray = jacobian @ alignment.covariance @ jacobian.T
     return covariance
-
-
-def stored(orientations: Sequence[int]) -> tuple[int, ...]:
-    """What leads back from upright images."""
-    return tuple(inverse(orientation) for orientation in orientations)
 
 
 _POINTS_PER_SIDE = 8

@@ -42,15 +42,9 @@ class MetricPoses:
 def metric_upgrade(homographies: FloatArray, reference: int, log_focal: float, log_focal_std: float) -> MetricPoses:
     """The poses of one camera that come nearest to plane-to-image homographies.
 
-    Parameters
-    ----------
-    homographies : ndarray of shape (N, 3, 3)
-        From any frame of the plane to undistorted coordinates of the images, half diagonals, with positive third
-        coordinates in front of the camera.
-    reference : int
-        Image that lies at the origin of the plane, at height one.
-    log_focal, log_focal_std : float
-        Prior on the logarithm of the focal length in half diagonals.
+    ``homographies`` (N, 3, 3): from any frame of the plane to undistorted coordinates of the images, half diagonals,
+    with positive third coordinates in front of the camera; ``reference``: image that lies at the origin of the plane,
+    at height one; ``log_focal, log_focal_std``: prior on the logarithm of the focal length in half diagonals.
     """
     relative = homographies @ inverses(homographies[reference : reference + 1])[0]
     angles = np.linspace(-_MAX_TILT, _MAX_TILT, _TILT_STEPS)

@@ -26,30 +26,15 @@ class Unused(StrEnum):
 
 @dataclass(frozen=True)
 class LinkFit:
-    """How well one link agrees with the whole.
+    """How well one link agrees with the whole."""
 
-    Attributes
-    ----------
-    image1, image2 : int
-        Indices of the images.
-    count : int
-        Correspondences given.
-    inliers : int
-        Correspondences that agree with the alignment.
-    rms : float
-        Root mean square error of those, pixels; NaN where the link was not used.
-    used : bool
-    reason : Unused
-        Why the link was not used.
-    """
-
-    image1: int
+    image1: int  # image1, image2: indices of the images
     image2: int
-    count: int
-    inliers: int
-    rms: float
+    count: int  # correspondences given
+    inliers: int  # correspondences that agree with the alignment
+    rms: float  # root mean square error of those, pixels; NaN where the link was not used
     used: bool
-    reason: Unused = Unused.NO
+    reason: Unused = Unused.NO  # why the link was not used
 
     @property
     def images(self) -> tuple[int, int]:
@@ -59,26 +44,14 @@ class LinkFit:
 
 @dataclass(frozen=True)
 class PlanarPoses:
-    """Where the camera was for each image, in a metric plane.
+    """Where the camera was for each image, in a metric plane."""
 
-    Attributes
-    ----------
-    yaw : ndarray of shape (N,)
-        φ, radians.
-    position : ndarray of shape (N, 2)
-        (x, y) in the plane, in units of the reference image's height above it.
-    height : ndarray of shape (N,)
-        Height above the plane in the same unit.
-    tilt : ndarray of shape (N, 2)
-        (ψ, θ), radians.
-    covariance, with_first : ndarray of shape (N, 4, 4), or None
-        Of x, y, height and yaw: of each image, and of each with the first that is used; where they were asked for.
-    """
-
-    yaw: FloatArray
-    position: FloatArray
-    height: FloatArray
-    tilt: FloatArray
+    yaw: FloatArray  # (N,): φ, radians
+    position: FloatArray  # (N, 2): (x, y) in the plane, in units of the reference image's height above it
+    height: FloatArray  # (N,): height above the plane in the same unit
+    tilt: FloatArray  # (N, 2): (ψ, θ), radians
+    # covariance, with_first: (N, 4, 4): of x, y, height and yaw: of each image, and of each with the first that is
+    # used, where they were asked for
     covariance: FloatArray | None = None
     with_first: FloatArray | None = None
 
@@ -101,54 +74,27 @@ class PlanarPoses:
 
 @dataclass(frozen=True)
 class ReliefTest:
-    """Whether the scene is the plane that it is taken for.
+    """Whether the scene is the plane that it is taken for."""
 
-    Attributes
-    ----------
-    found : bool
-        The residuals of neighbouring points agree too well to be noise.
-    coherence : float
-        Mean correlation of the residuals of neighbouring points, 0 for noise, 1 for a smooth surface.
-    size : float
-        Root mean square of the coherent part of the residuals, pixels.
-    explanation : str
-        One sentence; what it means for λ.
-    """
-
-    found: bool
-    coherence: float
-    size: float
-    explanation: str
+    found: bool  # the residuals of neighbouring points agree too well to be noise
+    coherence: float  # mean correlation of the residuals of neighbouring points, 0 for noise, 1 for a smooth surface
+    size: float  # root mean square of the coherent part of the residuals, pixels
+    explanation: str  # one sentence; what it means for λ
 
 
 @dataclass(frozen=True)
 class ShapeTest:
-    """Whether the overlaps hold the shape of the whole, or it may be off where they agree.
+    """Whether the overlaps hold the shape of the whole, or it may be off where they agree."""
 
-    Attributes
-    ----------
-    doubtful : bool
-        An image may be off by more than is tolerable.
-    shown : bool
-        The errors show that something is left out; otherwise the images only fail to exclude it.
-    gain : float
-        By how many squared standard deviations the errors would be smaller with what is left out.
-    image : int
-        The image that may be off the most.
-    shift, shift_std : float
-        How far that image would move with what is left out, and the standard deviation of that, pixels; up to one
-        homography of the whole. The latter grows with ``gain``: what is left out is more than what was tried.
-    cause : str
-        What is most likely to be left out.
-    """
-
-    doubtful: bool
-    shown: bool
-    gain: float
-    image: int
+    doubtful: bool  # an image may be off by more than is tolerable
+    shown: bool  # the errors show that something is left out; otherwise the images only fail to exclude it
+    gain: float  # by how many squared standard deviations the errors would be smaller with what is left out
+    image: int  # the image that may be off the most
+    # shift, shift_std: how far that image would move with what is left out, and the standard deviation of that, pixels;
+    # up to one homography of the whole. The latter grows with ``gain``: what is left out is more than what was tried
     shift: float
     shift_std: float
-    cause: str
+    cause: str  # what is most likely to be left out
 
 
 @dataclass(frozen=True, repr=False)
@@ -308,7 +254,7 @@ class Alignment:
     def transfer(self, image1: int, image2: int, points: FloatArray) -> FloatArray:
         """Where points (N, 2) of one image, pixels, are in another; NaN where its lens cannot see them."""
         if self.on_sphere:
-            # What both images show may lie behind the plane that is before them.
+            # what both images show may lie behind the plane that is before them.
             seen = to_plane(self.cameras[image1], self.relation(image1, image2), points)
             return from_plane(self.cameras[image2], np.eye(3), seen)
         plane = to_plane(self.cameras[image1], self.homographies[image1], points)

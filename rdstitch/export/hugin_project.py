@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 
-from rdstitch.alignment.frames import stored, turned_alignment, turns
+from rdstitch.alignment.frames import QuarterTurns
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.camera_files.polynomials import HEAD, hugin_lens
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.exif_orientation import quarter_turn, turning_matrix
+from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import nearest_rotation, rotation_from_tilt
 from rdstitch.results.registration import Registration
 
@@ -28,16 +28,14 @@ def project_of_hugin(registration: Registration, canvas: Canvas) -> str:
     sources = registration.sources
     if any(source.frame is not None and source.frame.number is not None for source in sources):
         raise ArgumentError("Hugin opens image files, not frames of videos; write them as files first")
-    orientations = [quarter_turn(source.metadata.orientation) for source in sources]
-    alignment = turned_alignment(registration.alignment, stored(orientations), None)
+    quarters = QuarterTurns.of(sources)
+    alignment = quarters.stored_alignment(registration.alignment)
     if alignment.poses is None and not alignment.on_sphere:
         raise ArgumentError("Hugin knows no images with a homography of their own; --model pose gives poses")
     # The axes of the output are those of the upright reference image.
     k = alignment.reference
     matrix = (
-        alignment.homographies[k]
-        @ turns(stored(orientations))[k]
-        @ np.linalg.inv(registration.alignment.homographies[k])
+        alignment.homographies[k] @ quarters.matrices_back[k] @ np.linalg.inv(registration.alignment.homographies[k])
     )
     if alignment.poses is not None and canvas.orientation is not None:
         matrix = matrix @ np.linalg.inv(canvas.orientation)
@@ -62,7 +60,7 @@ def project_of_hugin(registration: Registration, canvas: Canvas) -> str:
         if ends in alignment.support and set(ends) <= number.keys():
             link = pair.link().thinned(_CONTROL_POINTS)
             points = [
-                _in_file(points, registration.alignment.cameras[k], alignment.cameras[k], orientations[k])
+                _in_file(points, registration.alignment.cameras[k], alignment.cameras[k], quarters.upright[k])
                 for points, k in zip((link.points1, link.points2), ends, strict=True)
             ]
             control += [

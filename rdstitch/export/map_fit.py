@@ -155,23 +155,11 @@ def fit_map(
     map_scale: float = 1.0,
     leverage: FloatArray | float = 0.0,
 ) -> MapFit:
-    """Fit positions of cameras or points.
+    """Fit places (N,) of cameras or points, easting + i northing, and altitudes (N,), m; NaN where these are not known.
 
-    Parameters
-    ----------
-    views : Views
-        Of N images or points.
-    places : ndarray of shape (N,), complex
-        Easting + i northing, m.
-    altitude : ndarray of shape (N,)
-        m; NaN where not known.
-    std : ndarray of shape (N, 2)
-        Standard deviations of one horizontal coordinate and of the altitude, m; NaN where not known. Where the
-        residuals are larger, these count.
-    map_scale : float
-        Metres of the map per metre on the ground.
-    leverage : ndarray of shape (N,)
-        How far the place has put itself already where the views have it, 0 to 1.
+    ``std`` (N, 2) are standard deviations of one horizontal coordinate and of the altitude, NaN where not known; where
+    residuals are larger, these count. ``map_scale`` is metres of the map per metre on the ground, ``leverage`` (N,) how
+    far places have put themselves where the views are already, 0 to 1.
     """
     leverage = np.broadcast_to(leverage, len(places))
     declared = bool(np.isfinite(std).any())

@@ -45,13 +45,8 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
     positions ask for more: images that follow one another where the order means something, those that were taken
     nearest to each other, a few that each image is most alike to, and those that are most alike of all.
 
-    Parameters
-    ----------
-    features : FeatureStore
-        Of the images, in the order in which the images were taken, if there is one.
-    seed : int
-    positions : ndarray of shape (N, 2) or (N, 3), optional
-        Where each image was taken, in any unit; NaN where that is not known.
+    ``features``: of the images, in the order in which the images were taken, if there is one; ``positions`` (N, 2) or
+    (N, 3): where each image was taken, in any unit; NaN where that is not known.
     """
     count = len(features)
     if count <= EXHAUSTIVE_UP_TO:
@@ -101,12 +96,7 @@ def pairs_that_matter(
     numbers of matches in its cells. So partners with many matches come first, but rather around the image than
     all on one side of it. Of a survey in which each image overlaps twenty others, a third of the pairs is left.
 
-    Parameters
-    ----------
-    shared : mapping of (int, int) to StoredMatches
-        Some matches of each pair (i, j).
-    cameras : sequence of Camera
-        One an image; only their sizes are used.
+    ``shared``: some matches of each pair (i, j); ``cameras``: one an image; only their sizes are used.
     """
     partners: dict[int, list[tuple[tuple[int, int], FloatArray]]] = {}
     for pair, matches in shared.items():
@@ -132,16 +122,8 @@ def neighbours(
 
     It does not need a pair of images that both have their partners, one of them in common: that closes no loop.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-    homographies : ndarray of shape (N, 3, 3)
-        From undistorted normalized coordinates of each image to the plane, or to directions; NaN for images without a
-        pose.
-    tried : set of (int, int)
-        Pairs (i, j), i < j.
-    on_sphere : bool
-        Whether they lead to directions.
+    ``homographies`` (N, 3, 3): from undistorted normalized coordinates of each image to the plane, or to directions;
+    NaN for images without a pose; ``tried``: pairs (i, j), i < j; ``on_sphere``: whether they lead to directions.
     """
     middles = homographies[:, :, 2]
     with np.errstate(invalid="ignore"):

@@ -32,12 +32,8 @@ class Consensus:
 def vote(distortion: ArrayLike, std: ArrayLike) -> Consensus:
     """The λ that the pairs agree on.
 
-    Parameters
-    ----------
-    distortion : array_like of shape (L,)
-        λ of each pair.
-    std : array_like of shape (L,)
-        Its standard deviation; pairs with a value that is not finite have no vote.
+    ``distortion`` (L,): λ of each pair; ``std`` (L,): its standard deviation; pairs with a value that is not finite
+    have no vote.
     """
     values, errors = np.asarray(distortion, dtype=np.float64), np.asarray(std, dtype=np.float64)
     count = len(values)

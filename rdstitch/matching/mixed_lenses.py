@@ -75,12 +75,8 @@ class Votes:
     def fitted(self, which: IntArray, lenses: FloatArray) -> FloatArray:
         """λ of the lenses that the votes miss by the least, by reweighted least squares.
 
-        Parameters
-        ----------
-        which : ndarray of shape (L, 2), intp
-            The lens of each image of each pair.
-        lenses : ndarray of shape (K,)
-            λ to start from; that of a lens without votes stays.
+        ``which`` (L, 2): the lens of each image of each pair; ``lenses`` (K,): λ to start from; that of a lens without
+        votes stays.
         """
         count, every = len(lenses), np.arange(len(lenses))
         both = np.broadcast_arrays(which[:, :, None], which[:, None, :])
@@ -153,11 +149,7 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     scattered votes can always be divided somehow. Two lenses must therefore explain what pairs of both see far better
     than one lens does, the more so the fewer pairs there are; and they must differ by enough to be seen in the result.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        One an image; only their sizes are used.
-    votes : Votes
+    ``cameras``: one an image; only their sizes are used.
     """
     if not len(votes):
         return None
@@ -194,15 +186,8 @@ def separate_lenses(
 
     None where one lens will do or λ is known; none are left out where it is not clear which belong together.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        One an image.
-    pairs : list of PairRegistration
-    threshold : float
-        Largest transfer error of an inlier, pixels.
-    known_distortion : float or None
-        λ in the half-diagonal frame, where the user gave it.
+    ``cameras``: one an image; ``threshold``: largest transfer error of an inlier, pixels; ``known_distortion``: λ in
+    the half-diagonal frame, where the user gave it.
     """
     mixed = None if known_distortion is not None else two_lenses(cameras, Votes.of(pairs, threshold))
     return mixed, {} if mixed is None else _of_the_other_lens(mixed, pairs)

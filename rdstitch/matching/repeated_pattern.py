@@ -47,15 +47,8 @@ def repetition(features: Features) -> float:
 def match_pattern(features1: Features, features2: Features) -> Correspondences:
     """Matches by the motion of the whole image that most keypoints have a likely partner for.
 
-    Parameters
-    ----------
-    features1, features2 : Features
-        With orientations and descriptors of numbers; of others nothing is matched.
-
-    Returns
-    -------
-    Correspondences
-        In the order of their distance from where that motion puts them; none where it finds few.
+    ``features1, features2``: with orientations and descriptors of numbers; of others nothing is matched; gives in the
+    order of their distance from where that motion puts them; none where it finds few.
     """
     nothing = Correspondences.of(features1, features2, np.empty((0, 2), dtype=np.intp), np.empty(0))
     if features1.binary or features2.binary or min(len(features1), len(features2)) <= _PARTNERS:

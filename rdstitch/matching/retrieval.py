@@ -88,11 +88,7 @@ class Vocabulary:
 def similarity(features: FeatureStore, seed: int) -> Similarity | None:
     """How alike the images are whose features these are; None where they show too little to say.
 
-    Parameters
-    ----------
-    features : FeatureStore
-        One an image, in the order in which the images were taken, if there is one; read twice, one at a time.
-    seed : int
+    ``features``: one an image, in the order in which the images were taken, if there is one; read twice, one at a time.
     """
     weights = _weighted_words(features, seed)
     return None if weights is None else _compare(weights)

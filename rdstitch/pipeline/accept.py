@@ -1,8 +1,7 @@
 """Stage: check a registration; what fails a check is left out by name, and the rest is aligned anew."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 
 import numpy as np
 
@@ -22,9 +21,6 @@ from rdstitch.verification.findings import Finding, Kind, Scope, messages_of
 from rdstitch.verification.limits import limit
 from rdstitch.verification.second_motion import planes_of_pairs
 from rdstitch.verification.verdict import RefusedError, judge
-
-OTHER_MODELS = ("rotation", "pose", "homography")
-"""What a camera can have done: turned, moved over a plane, or anything that joins images of a plane."""
 
 _MAX_ROUNDS = 20  # times that something is left out; each takes one adjustment
 
@@ -49,13 +45,8 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
 
     current, findings = registration, checked(registration)
     first, first_findings = registration, findings
-    if _fails(findings) and not options.force:
-        # What the matches hardly tell apart, the pixels do; not the periods of a pattern.
-        unlike = purpose.picture and all(found.kind is Kind.UNLIKE for found in findings if found.fails)
-        for other in chain([undamaged], _by_other_models(registration, aligner) if unlike else ()):
-            if other is not None and not _fails(judged := checked(other)):
-                current, findings = other, judged
-                break
+    if _fails(findings) and undamaged is not None and not _fails(judged := checked(undamaged)):
+        current, findings = undamaged, judged
     if _fails(findings) and not options.force:
         another = not purpose.lens_only and _may_be_another_plane(findings)
         plane = plane_of_most(registration, options, aligner) if another else None
@@ -83,16 +74,6 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
     if options.strict and accepted.left_out:
         raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
     return accepted
-
-
-def _by_other_models(registration: Registration, aligner: Aligner) -> Iterator[Registration]:
-    """The same images by other motions of a camera, where the user left the choice open."""
-    used, options = registration.alignment.used, aligner.options
-    names = [name for name in OTHER_MODELS if name != registration.alignment.model and options.model == "auto"]
-    for name in names:
-        other = realigned(registration, replace(aligner, options=replace(options, model=name)))
-        if other is not None and (other.alignment.used >= used).all():
-            yield other
 
 
 def aligner_of(registration: Registration, options: StitchOptions, purpose: Purpose) -> Aligner:

@@ -11,13 +11,12 @@ import numpy as np
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cut_outs import common_size, cut_alignment, framed_camera, framed_link
-from rdstitch.alignment.frames import stored, turned_alignment, turned_link, turned_tilts, turns
+from rdstitch.alignment.frames import QuarterTurns
 from rdstitch.alignment.plane_marks import Sighting
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.exif_orientation import inverse, quarter_turn, turning_matrix
 from rdstitch.inputs.measurements import metres_around_median, positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
@@ -85,9 +84,7 @@ class Aligner:
     cache: Cache
     threshold: float  # largest transfer error of an inlier, pixels
     needs_poses: bool = False  # whether every alignment must have metric poses, see :meth:`metric`
-    # by which quarter turns of EXIF (1, 3, 6, 8) the images became upright; ``options`` are of the stored ones. All
-    # upright as they are if empty
-    orientations: tuple[int, ...] = ()
+    quarters: QuarterTurns | None = None  # by which the images became upright; ``options`` are of the stored ones
 
     @classmethod
     def of(
@@ -101,14 +98,13 @@ class Aligner:
         paths = tuple(str(source.path) for source in sources)
         megapixels = options.features.for_images(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
-        orientations = tuple(quarter_turn(source.metadata.orientation) for source in sources)
         control = _sightings(sources, cameras)
         decided = replace(alignment_options(sources, options), purpose=purpose, control=control)
-        return cls(paths, cameras, decided, cache, options.threshold, orientations=orientations)
+        return cls(paths, cameras, decided, cache, options.threshold, quarters=QuarterTurns.of(sources))
 
     @property
-    def _turns(self) -> tuple[int, ...]:
-        return self.orientations or (1,) * len(self.cameras)
+    def _quarters(self) -> QuarterTurns:
+        return self.quarters or QuarterTurns((1,) * len(self.cameras))
 
     @property
     def exact_tilts(self) -> list[tuple[float, float]] | None:
@@ -116,7 +112,7 @@ class Aligner:
         tilts = self.options.exact_tilts(len(self.cameras))
         if not tilts:
             return tilts
-        return [(psi, theta) for psi, theta in turned_tilts(np.array(tilts), self._turns).tolist()]
+        return [(psi, theta) for psi, theta in self._quarters.upright_tilts(np.array(tilts)).tolist()]
 
     def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
         """Align the images by the pairs that were registered; from an earlier run where the cache has it."""
@@ -163,10 +159,10 @@ class Aligner:
             raise RegistrationError(_no_overlap(self.paths, pairs))
         copies = copies_of(pairs)
         related = distinct(pairs, copies) or distinct(pairs, copies := {})
-        most, back = most_matches_read(len(related), self.options), stored(self._turns)
-        cameras = tuple(camera.turned(turn) for camera, turn in zip(self.cameras, back, strict=True))
+        most, quarters = most_matches_read(len(related), self.options), self._quarters
+        cameras = tuple(quarters.stored_camera(camera, k) for k, camera in enumerate(self.cameras))
         named = (replace(pair.link().thinned(most), image1=i, image2=j) for (i, j), pair in related.items())
-        links = tuple(turned_link(link, self.cameras, back) for link in named)
+        links = tuple(quarters.stored_link(link, self.cameras) for link in named)
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
@@ -193,13 +189,11 @@ class Aligner:
     def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Alignment]) -> Alignment:
         """An alignment of the upright images; from an earlier run where the cache has it."""
         inputs = (task.cameras, self.cache.digest(task.links), task.options)
-        gravity = task.options.gravity
-        down = None if gravity is None else np.einsum("nij,nj->ni", turns(self._turns), np.asarray(gravity))
         alignment = self.cache.recall(stage, inputs, compute)
-        sizes = [c.turned(turn).image_size for c, turn in zip(self.cameras, stored(self._turns), strict=True)]
+        sizes = [self._quarters.stored_camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)
-        return turned_alignment(alignment, self._turns, down)
+        return self._quarters.upright_alignment(alignment, task.options.gravity)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""
@@ -265,10 +259,10 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
 
     Measured attitudes that are not exact leave the mount's tilt open.
     """
-    back = stored([quarter_turn(source.metadata.orientation) for source in sources])
+    quarters = QuarterTurns.of(sources)
     attitudes = [source.attitude for source in sources if source.attitude is not None]
     delayed = [source.attitude_by_delay for source in sources if source.attitude_by_delay is not None]
-    timed = delayed and len(delayed) == len(sources) and set(back) == {1}
+    timed = delayed and len(delayed) == len(sources) and set(quarters.back) == {1}
     exact = bool(attitudes) and options.attitude_std == 0.0
     places = [source.metadata.gps for source in sources]
     return AlignmentOptions(
@@ -277,10 +271,10 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
         lens=options.lens,
         lens_known=options.known_distortion is not None,
         tilt=options.tilt or ((0.0, 0.0) if exact else None),
-        attitudes=turned_tilts(np.array(attitudes), back) if attitudes else None,
+        attitudes=quarters.stored_tilts(np.array(attitudes)) if attitudes else None,
         delayed_attitudes=np.array(delayed) if timed else None,
         attitudes_std=options.attitude_std,
-        gravity=_gravity(sources, back),
+        gravity=_gravity(sources, quarters),
         positions=positions_of(sources) if sources else None,
         positions_std=[math.nan if p is None or p.std is None else p.std[0] for p in places] or None,
         pose_covariance=options.pose_covariance,
@@ -291,22 +285,20 @@ def _sightings(sources: Sequence[Source], cameras: Sequence[Camera]) -> tuple[Si
     """Ground control points in the images as the camera stored them, of the size that features are detected at."""
     shown = [(k, point) for k, source in enumerate(sources) for point in source.control if not point.check]
     metres = metres_around_median([point.place for _, point in shown])
-    sightings = []
+    sightings, quarters = [], QuarterTurns.of(sources)
     for (k, point), (east, north) in zip(shown, metres.tolist(), strict=True):
-        stored_turn = turning_matrix(inverse(quarter_turn(sources[k].metadata.orientation)))
-        x, y = (stored_turn @ sources[k].camera.normalize(point.pixel) * cameras[k].scale).tolist()
+        x, y = quarters.stored_point(sources[k].camera.normalize(point.pixel) * cameras[k].scale, k).tolist()
         sightings.append(Sighting(k, (x, y), point.name, (east, north), point.std))
     return tuple(sightings)
 
 
-def _gravity(sources: Sequence[Source], back: Sequence[int]) -> FloatArray | None:
+def _gravity(sources: Sequence[Source], quarters: QuarterTurns) -> FloatArray | None:
     """Direction down in the axes of each camera, (N, 3), by its attitude or its XMP; None where all lack both."""
     known = [source.down for source in sources]
     if all(down is None for down in known):
         return None
     directions = np.array([(np.nan,) * 3 if down is None else down for down in known])
-    gravity: FloatArray = np.einsum("nij,nj->ni", turns(back), directions)
-    return gravity
+    return quarters.stored_directions(directions)
 
 
 def _reference(sources: Sequence[Source], name: str | None) -> int | None:

@@ -7,13 +7,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from rdstitch.alignment.frames import stored, turned_alignment
+from rdstitch.alignment.frames import QuarterTurns
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.errors import OutputError, RdstitchError, RegistrationError
 from rdstitch.export.odometry_bag import check_bag, write_bag, write_bag_folder
 from rdstitch.export.trajectory_files import WRITERS, frame_of, has_times, path_as_svg
-from rdstitch.geometry.exif_orientation import quarter_turn
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.selection import selected
@@ -387,8 +386,8 @@ def trajectory(
             registration = at_full_size(_accepted(sources, known, options, executor, progress, Purpose.TRAJECTORY))
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
-    back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])
-    path = Trajectory.from_alignment(turned_alignment(registration.alignment, back, None), height)
+    stored = QuarterTurns.of(registration.sources).stored_alignment(registration.alignment)
+    path = Trajectory.from_alignment(stored, height)
     if options.odometry is not None:
         path, notes = along_odometry(path, sources, options.odometry, keep_unit=height != 1.0)
         registration = registration.with_messages(notes)

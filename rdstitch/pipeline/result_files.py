@@ -112,9 +112,9 @@ def write_layers(
 def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float = 1.0) -> str:
     """The table that ``rdstitch trajectory`` writes, of a mosaic; with covariances where ``options`` asked for them.
 
-    ``height`` is that of the first image, in the unit that positions shall have. In the frame "map" they are
-    easting, northing and the height above the ground in metres, with yaw zero where the top of an image is north,
-    and covariances relative to the reference image; how well that is placed, the georeference says.
+    Frames are those of :mod:`rdstitch.export.trajectory_files`, ``height`` that of the first image in the unit that
+    positions shall have; or "map": easting, northing and the height above the ground in metres, with yaw zero where the
+    top of an image is north, and covariances relative to the reference image.
     """
     registration = result.registration
     path = Trajectory.from_alignment(registration.alignment, height)

@@ -9,13 +9,11 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.match_graph import spanning_tree
 from rdstitch.results.registration import Registration
-from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
+from rdstitch.robust.loss import RAYLEIGH_MEDIAN
+from rdstitch.robust.posterior import Evidence, freedom_cost
 
 _RESOLVED = 0.1
 """Standard deviation of the shift of a pair, pixels, up to which its matches can say that it is whole."""
-
-_EXACTNESS = 1.0 / 32.0
-"""Pixels that resampling rounds to."""
 
 _FREEDOM = 4
 """Parameters of an image that whole pixels take the place of: two of the shift, turn and scale."""
@@ -30,8 +28,8 @@ _REASON = "moved by whole pixels, as parts of one image are"
 def on_whole_pixels(registration: Registration) -> Registration:
     """The same registration, with motion by whole pixels and no lens where that explains the matches as well.
 
-    Its freedom is paid for by the Bayesian information criterion, and the shifts of pairs must agree in every loop. A
-    lens that was given, and a turn on the spot, stay.
+    They are compared by their posterior, and the shifts of pairs must agree in every loop. A lens that was given, and a
+    turn on the spot, stay.
     """
     alignment = registration.alignment
     given = alignment.lens_given and any(any(camera.coefficients) for camera in alignment.cameras)
@@ -89,7 +87,7 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
         pairs.append((number[pair.image1], number[pair.image2]))
         shifts.append(shift)
         spread.append(float(np.median(np.linalg.norm(fitted, axis=1))) / RAYLEIGH_MEDIAN / math.sqrt(len(moved)))
-        left.append(((whole**2).sum(axis=1), (fitted**2).sum(axis=1)))
+        left.append((link.points1, whole, fitted))
     if not pairs or max(spread) > _RESOLVED:
         return None
     first, second = np.array(pairs, dtype=np.intp).T
@@ -100,7 +98,15 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
     places = np.rint(tree.chained(motions, first, np.eye(3))[:, :2, 2])
     if (places[second] - places[first] != shifts).any():
         return None
-    squared, fit = (np.concatenate([errors[k] for errors in left]) for k in (0, 1))
-    sigma = math.hypot(math.sqrt(float(np.median(fit))) / RAYLEIGH_MEDIAN, _EXACTNESS)
-    worse = float((robust_cost(squared, ALIGNMENT_WIDTH * sigma) - robust_cost(fit, ALIGNMENT_WIDTH * sigma)).sum())
-    return places if worse <= _FREEDOM * (len(places) - 1) * math.log(len(fit)) * sigma**2 else None
+    points, whole, fitted = (np.concatenate(parts) for parts in zip(*left, strict=True))
+    evidence = Evidence.of(
+        np.repeat(np.arange(len(left)), [len(part) for part, *_ in left]),
+        points,
+        np.zeros(len(left), dtype=np.intp),
+        np.array([float(np.median(np.linalg.norm(fitted, axis=1))) / RAYLEIGH_MEDIAN]),
+        np.array([alignment.cameras[alignment.reference].scale]),
+        np.array([min(1.0, (len(places) - 1) / len(left))]),
+    )
+    by_model = evidence.cost(fitted)
+    freedom = freedom_cost(_FREEDOM * (len(places) - 1), by_model.count)
+    return places if evidence.cost(whole).cost[0] <= (by_model.cost + freedom)[0] else None

@@ -19,16 +19,8 @@ def covariances(
     matches in a cell (White's estimator with clusters), but in no direction less than ``noise² A⁻¹``, what independent
     errors give. Infinite where a parameter is not determined.
 
-    Parameters
-    ----------
-    information : ndarray of shape (B, P, P)
-    influence : ndarray of shape (B, N, E)
-        Each match's share of the gradient by other parameters.
-    chain : ndarray of shape (B, E, P)
-        Derivatives of these.
-    noise : ndarray of shape (B,)
-        Standard deviation of the errors per axis, pixels.
-    data : Measurements
+    ``information`` (B, P, P); ``influence`` (B, N, E): each match's share of the gradient by other parameters;
+    ``chain`` (B, E, P): derivatives of these; ``noise`` (B,): standard deviation of the errors per axis, pixels.
     """
     result = np.full(information.shape, np.inf)
     scale = np.sqrt(np.einsum("bpp->bp", information))

@@ -119,10 +119,7 @@ def damping_by_gain(damping: float, failures: int, gain: float) -> tuple[float, 
     Where the loss has a curved valley, as focal length, tilts and lens together have, tenfold changes go to and fro
     between steps that are too short and steps that fail.
 
-    Parameters
-    ----------
-    gain : float
-        By how much the last step made the loss smaller, in units of what was predicted.
+    ``gain``: by how much the last step made the loss smaller, in units of what was predicted.
     """
     if gain > 0.0:
         return max(damping * max(1.0 / 3.0, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3), _MIN_DAMPING), 0

@@ -73,11 +73,7 @@ def differentiate(homography: FloatArray, lens: PairLenses, data: Measurements) 
     and that of u by λ at fixed d is ``-d ρ² / g²``. With M the derivative of u by the measured point of image 1, unit
     noise in both images gives the error the covariance ``A A' + M M'``.
 
-    Parameters
-    ----------
-    homography : ndarray of shape (B, 3, 3)
-    lens : PairLenses
-    data : Measurements
+    ``homography`` (B, 3, 3).
     """
     first = lens.distortion[:, None]
     second = first if lens.own_distortion is None else lens.own_distortion[:, None]
@@ -188,13 +184,7 @@ def _weighted(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The columns that are free, (B, C, 2, N), and their products with the weights and the derivatives of u.
 
-    Returns
-    -------
-    columns : ndarray of shape (B, C, 2, N)
-    by_z : ndarray of shape (B, 3 + C, 3, N)
-        Of ``z`` and the columns with ``z``.
-    left : ndarray of shape (B, C, 2, N)
-        The columns times their weights.
+    The columns, (B, 3 + C, 3, N) of ``z`` and the columns with ``z``, and the columns times their weights.
     """
     columns = transferred.columns if free_lens else transferred.columns[:, -1:]
     weight = transferred.precision * factor[:, None]

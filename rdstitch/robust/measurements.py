@@ -18,27 +18,14 @@ _MIN_WIDTH = 16
 
 @dataclass(frozen=True)
 class Measurements(Rows):
-    """Matches of B pairs of images, normalized by half the diagonal of their image, padded to N a pair.
+    """Matches of B pairs of images, normalized by half the diagonal of their image, padded to N a pair."""
 
-    Attributes
-    ----------
-    x1, x2 : ndarray of shape (B, 2, N)
-        Normalized measured points; zeros where ``present`` is False.
-    present : ndarray of shape (B, N), bool
-        Which are matches; the rest is padding, or matches that are left out.
-    count : ndarray of shape (B,), intp
-        Matches of each pair: they come before the padding.
-    pixels : ndarray of shape (B,)
-        Pixels of image 2 in one normalized unit.
-    px_ratio : ndarray of shape (B,)
-        Pixels of image 2 that one pixel of image 1 becomes when normalized coordinates are kept.
-    """
-
-    x1: FloatArray
+    x1: FloatArray  # x1, x2: (B, 2, N): measured points; zeros where ``present`` is False
     x2: FloatArray
-    present: BoolArray
-    count: IntArray
-    px: FloatArray
+    present: BoolArray  # (B, N) bool: Which are matches; the rest is padding, or matches that are left out
+    count: IntArray  # (B,): Matches of each pair: they come before the padding
+    px: FloatArray  # (B,): pixels of image 2 in one normalized unit
+    # (B,): Pixels of image 2 that one pixel of image 1 becomes when normalized coordinates are kept
     px_ratio: FloatArray
 
     @classmethod

@@ -35,16 +35,8 @@ class MinimalSolver:
 def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortion: float | None) -> list[MinimalSolver]:
     """The solvers that the known quantities allow, those with the fewest points first.
 
-    Parameters
-    ----------
-    focal : float
-        Focal length in half diagonals.
-    focal_std : float
-        Standard deviation of its logarithm.
-    tilts_known : bool
-        Whether the tilts of both images are known.
-    distortion : float or None
-        Known λ in the half-diagonal frame.
+    ``focal``: focal length in half diagonals; ``focal_std``: standard deviation of its logarithm; ``tilts_known``:
+    whether the tilts of both images are known; ``distortion``: known λ in the half-diagonal frame.
     """
     rigid = PlanarPairModel(focal, focal_std, tilts_known)
     similarity = PlanarPairModel(focal, focal_std, tilts_known, height_free=True)

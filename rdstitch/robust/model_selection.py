@@ -133,14 +133,7 @@ def _score(fitted: _Fitted, evidence: Evidence, row: IntArray, column: IntArray,
 def _finished(fitted: _Fitted, pairs: PairSelection, reasons: list[str]) -> Iterator[PairFit]:
     """The chosen model with its covariance, and without λ where that is not observable.
 
-    Parameters
-    ----------
-    fitted : _Fitted
-        To all matches.
-    pairs : PairSelection
-        Standing at the fits.
-    reasons : list of str
-        Why this model was chosen, for each pair.
+    ``fitted``: to all matches; ``pairs``: standing at the fits; ``reasons``: why this model was chosen, for each pair.
     """
     described = [_described(fitted, pairs)]
     std = np.zeros(len(reasons)) if pairs.fixed_distortion else np.sqrt(described[0][2][:, 0, 0])

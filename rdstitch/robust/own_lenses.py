@@ -37,14 +37,8 @@ class OwnLenses:
 def own_lenses(relations: Sequence[RadialHomography], data: Measurements, threshold: float) -> list[OwnLenses]:
     """Free λ of each image of pairs, from the relations that one λ gave.
 
-    Parameters
-    ----------
-    relations : sequence of RadialHomography
-        One a pair.
-    data : Measurements
-        Also of what one λ could not explain.
-    threshold : float
-        Largest transfer error of an inlier, pixels.
+    ``relations``: one a pair; ``data``: also of what one λ could not explain; ``threshold``: largest transfer error of
+    an inlier, pixels.
     """
     count, lens = len(data), len(_OWN_STD)
     parameters = np.zeros((count, lens + 9))

@@ -91,16 +91,8 @@ def ransac(
     but assume more of the motion: they join where it would need many. All share the best model so far, so that as soon
     as one of them is confident, and each has explored a little, the pair is done.
 
-    Parameters
-    ----------
-    solvers : list of MinimalSolver
-    data : Measurements
-        Every pair has at least as many matches as the largest sample.
-    ordered : ndarray of shape (B,), bool
-        Whether the best matches of a pair come first.
-    tilts : ndarray of shape (B, 2, 2) or None
-        Known tilts (ψ, θ) of both images, radians.
-    options : EstimationOptions
+    ``data``: every pair has at least as many matches as the largest sample; ``ordered`` (B,) bool: whether the best
+    matches of a pair come first; ``tilts`` (B, 2, 2): known tilts (ψ, θ) of both images, radians.
     """
     quick = _subset(data)
     lanes = [_Lane(solver, data, quick, ordered, tilts, options, index) for index, solver in enumerate(solvers)]

@@ -145,15 +145,8 @@ def refine_pairs(
 ) -> tuple[Fits, PairEquations]:
     """Fit the model and λ by at most so many steps; the fits, and the equations there.
 
-    Parameters
-    ----------
-    problems : PairProblems
-        Of B pairs.
-    start : Fits
-        Their ``distortion`` is kept where it is fixed.
-    iterations : int
-    rough : bool
-        Another refinement goes on from there.
+    ``problems``: of B pairs; ``start``: their ``distortion`` is kept where it is fixed; ``rough``: another refinement
+    goes on from there.
     """
     parameters, equations = descend(problems, start.parameters, iterations, rough=rough)
     state = parameters[:, 1:]

@@ -15,13 +15,7 @@ class Sampler:
     All pairs share one stream of random numbers, so that what a pair draws depends on no other pair, nor on the size of
     the batches.
 
-    Parameters
-    ----------
-    sample_size : int
-        Matches in one sample.
-    growth : int
-        Number of samples after which PROSAC draws from all matches.
-    seed : int or sequence of int
+    ``sample_size``: matches in one sample; ``growth``: number of samples after which PROSAC draws from all matches.
     """
 
     def __init__(self, sample_size: int, growth: int, seed: int | list[int]) -> None:
@@ -32,16 +26,8 @@ class Sampler:
     def draw(self, start: IntArray, batch: int, counts: IntArray, ordered: BoolArray) -> IntArray:
         """Places in each pair of the matches of some of its samples, shape (B, batch, sample_size).
 
-        Parameters
-        ----------
-        start : ndarray of shape (B,), intp
-            Number of the first sample of each pair.
-        batch : int
-            Samples of each pair.
-        counts : ndarray of shape (B,), intp
-            Matches of each pair, at least ``sample_size``.
-        ordered : ndarray of shape (B,), bool
-            Whether its best matches come first.
+        ``start`` (B,): number of the first sample of each pair; ``batch``: samples of each pair; ``counts`` (B,):
+        matches of each pair, at least ``sample_size``; ``ordered`` (B,) bool: whether its best matches come first.
         """
         sample_size = self._numbers.shape[1]
         missing = int(start.max(initial=0)) + batch - len(self._numbers)

@@ -25,14 +25,7 @@ def transfer_errors2(homography: FloatArray, distortion: FloatArray, pair: IntAr
     Written out for speed: with ``z = H p(λ)`` the distorted point is
     ``2 z_xy / (z_w + sqrt(z_w² - 4 λ |z_xy|²))``.
 
-    Parameters
-    ----------
-    homography : ndarray of shape (M, 3, 3)
-    distortion : ndarray of shape (M,)
-    pair : ndarray of shape (M,), intp
-        The pair that each belongs to.
-    data : Measurements
-        Of B pairs.
+    ``homography`` (M, 3, 3); ``distortion`` (M,); ``pair`` (M,): the pair that each belongs to; ``data``: of B pairs.
     """
     basis = np.empty((len(data), 4, data.present.shape[1]))
     basis[:, :2], basis[:, 2], basis[:, 3] = data.x1, 1.0, data.radius2

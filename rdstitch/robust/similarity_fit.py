@@ -32,12 +32,8 @@ def fit_similarity(source: Points, target: Points, std: float) -> SimilarityFit:
 
     Least quantile of squares: Rousseeuw and Leroy, Robust Regression and Outlier Detection (1987), section 3.4.
 
-    Parameters
-    ----------
-    source, target : ndarray of shape (N,), complex
-        Two or more points.
-    std : float
-        Standard deviation that targets have at least; the median residual counts where that is more.
+    ``source, target`` (N,): two or more points; ``std``: standard deviation that targets have at least; the median
+    residual counts where that is more.
     """
     count = len(source)
     anchors = np.unique(np.linspace(0, count - 1, min(count, _ANCHORS)).astype(np.intp))

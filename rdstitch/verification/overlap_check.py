@@ -59,13 +59,8 @@ class CheckedLink:
 class ComparedImages:
     """The images of a set as they are compared, each of them read once.
 
-    Parameters
-    ----------
-    sources : sequence of Source
-    stretch : (float, float) or None
-        Grey levels of black and white.
-    threads : int
-        Images that are read and pairs that are compared at the same time.
+    ``stretch``: grey levels of black and white; ``threads``: images that are read and pairs that are compared at the
+    same time.
     """
 
     def __init__(self, sources: Sequence[Source], stretch: tuple[float, float] | None, threads: int = 1) -> None:

@@ -52,17 +52,8 @@ def find_second_motions(
 ) -> list[SecondMotion]:
     """Search the matches that the alignment does not explain for a second motion, pair by pair.
 
-    Parameters
-    ----------
-    pairs : sequence of PairRegistration
-        With all their matches, right and wrong.
-    threshold : float
-        Largest transfer error of an inlier, pixels.
-
-    Returns
-    -------
-    list of SecondMotion
-        One for every pair of aligned images that have matches in common.
+    ``pairs``: with all their matches, right and wrong; ``threshold``: largest transfer error of an inlier, pixels;
+    gives one for every pair of aligned images that have matches in common.
     """
     errors = {
         pair.images: pair.errors(alignment.transfer)
@@ -171,10 +162,7 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
     Each pair decides for itself: where two motions are about as strong, some pairs were registered by one and some by
     the other, and no alignment holds both.
 
-    Returns
-    -------
-    list of PairRegistration or None
-        None where no pair has a motion that fills less.
+    Gives none where no pair has a motion that fills less.
     """
     alignment, pairs = registration.alignment, [pair for pair in registration.pairs if pair.relation]
     images = ComparedImages(registration.sources, registration.stretch)

@@ -49,18 +49,9 @@ def unique_shifts(
 ) -> dict[tuple[int, int], UniqueShift]:
     """By how much the first image of each pair must be moved for what is unique in both to agree.
 
-    Parameters
-    ----------
-    placed : mapping of int to ComparedImage
-        The images, on a plane where a period of the pattern is the same shift everywhere (a metric or an affine one).
-    pairs : sequence of (int, int)
-    workers : int
-        Images that are compared at the same time.
-
-    Returns
-    -------
-    dict of (int, int) to UniqueShift
-        Of the pairs of which that decides, in units of the plane.
+    ``placed``: the images, on a plane where a period of the pattern is the same shift everywhere (a metric or an affine
+    one); ``workers``: images that are compared at the same time; gives of the pairs of which that decides, in units of
+    the plane.
     """
     images = sorted({k for pair in pairs for k in pair})
     if not images:
@@ -90,10 +81,7 @@ def unique_shifts(
 def departures(pixels: Grey) -> Grey | None:
     """How far each pixel (h, w) of a drawing departs from the image's own pattern, in spreads of its copies.
 
-    Returns
-    -------
-    ndarray of shape (h, w), float32, or None
-        0 where it does not; NaN where nothing is known. None for an image that shows too few periods.
+    Gives (h, w): 0 where it does not; NaN where nothing is known. None for an image that shows too few periods.
     """
     peaks = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
     periods = peaks.shift[np.hypot(*peaks.shift.T) > _MIN_SHIFT]

@@ -39,10 +39,7 @@ class RefusedError(RegistrationError):
 def judge(evidence: Evidence) -> tuple[Finding, ...]:
     """Check an alignment against the pairs that it was made from, and against the pixels.
 
-    Returns
-    -------
-    tuple of Finding
-        Failures, with the images that they concern where that is clear, and warnings; none for a good result.
+    Gives failures, with the images that they concern where that is clear, and warnings; none for a good result.
     """
     lens_only = evidence.purpose.lens_only
     count = len(evidence.registration.sources)

@@ -11,47 +11,25 @@ from rdstitch.arrays import BoolArray, FloatArray
 
 @dataclass(frozen=True)
 class ModelMatrices:
-    """Plane-to-image homographies of N images with their derivatives.
+    """Plane-to-image homographies of N images with their derivatives."""
 
-    Attributes
-    ----------
-    matrices : ndarray of shape (N, 3, 3)
-    by_pose : ndarray of shape (N, D, 3, 3)
-        By a step of the D pose parameters, as :meth:`MotionModel.retract` takes it.
-    by_shared : ndarray of shape (N, S, 3, 3)
-        By the S shared parameters.
-    """
-
-    matrices: FloatArray
-    by_pose: FloatArray
-    by_shared: FloatArray
+    matrices: FloatArray  # (N, 3, 3)
+    by_pose: FloatArray  # (N, D, 3, 3): By a step of the D pose parameters, as :meth:`MotionModel.retract` takes it
+    by_shared: FloatArray  # (N, S, 3, 3): By the S shared parameters
 
 
 class MotionModel(ABC):
-    """A motion model, as the adjustment uses it.
+    """A motion model, as the adjustment uses it."""
 
-    Attributes
-    ----------
-    name : str
-        One word for it.
-    pose_size : int
-        Free parameters per image, D.
-    shared_names : tuple of str
-        Parameters that all images share, S of them, without those of the lens.
-    on_sphere : bool
-        Whether images lie around one centre, not over a plane.
-    one_camera : bool
-        Whether all images are of one camera with one focal length, the last of the shared parameters.
-    free_tilts, any_tilt : bool
-        Whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one.
-    """
-
-    name: str
-    pose_size: int
-    shared_names: tuple[str, ...] = ()
-    on_sphere: bool = False
+    name: str  # One word for it
+    pose_size: int  # Free parameters per image, D
+    shared_names: tuple[str, ...] = ()  # Parameters that all images share, S of them, without those of the lens
+    on_sphere: bool = False  # Whether images lie around one centre, not over a plane
+    # Whether all images are of one camera with one focal length, the last of the shared parameters
     one_camera: bool = True
+    # Whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one
     free_tilts: bool = False
+    # Whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one
     any_tilt: bool = False
 
     @property

@@ -150,7 +150,7 @@ def test_what_is_requested_of_the_map_is_checked_before_the_work(
     for paths, options, message in (
         (plain, CompositeOptions(gsd=0.1), "gsd needs GPS positions of 3 images"),
         (located[0], CompositeOptions(epsg=4326), "EPSG:4326 is not a projected coordinate system"),
-        (located[0], CompositeOptions(epsg=99999), "EPSG:99999 is not known"),
+        (located[0], CompositeOptions(epsg=60000), "EPSG:60000 is not known"),
     ):
         with pytest.raises(ArgumentError, match=message):
             mosaic(paths, options=replace(cached, composite=options))
