@@ -280,6 +280,10 @@ def _stitch_found(
     with options.executor(len(sources)) as executor:
         known = [*unread, *listed.messages]
         accepted = _accepted(sources, known, options, executor, progress, purpose, beside)
+        first = accepted.alignment.used.tolist().index(True)
+        if beside.frame == "first" and accepted.alignment.reference != first:  # those before it were left out
+            options = replace(options, reference=accepted.sources[first].name)
+            accepted = _accepted(sources, known, options, executor, progress, purpose, beside)
         progress("laying out", 0, 1)
         chosen = choose_layout(accepted, options, aligner_of(accepted, options, purpose), pano=pano)
         return compose_registration(chosen, executor, output, options, progress, beside, outputs)
