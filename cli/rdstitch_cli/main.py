@@ -61,7 +61,8 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context | None, cmd_name: str) -> click.Command | None:
         """A command by its name."""
         if cmd_name in _COMMANDS and cmd_name not in self.commands:
-            self.add_command(getattr(import_module(f"rdstitch_cli.commands.{cmd_name}"), cmd_name))
+            of_module = {} if cmd_name == "help" else vars(import_module(f"rdstitch_cli.commands.{cmd_name}"))
+            self.add_command(of_module.get(cmd_name, help_command))
         return self.commands.get(cmd_name)
 
     def load_all(self) -> dict[str, click.Command]:
@@ -103,9 +104,6 @@ class Commands(click.Group):
 def cli(context: click.Context, debug: bool) -> None:
     """Stitch images of a flat scene, and find the lens distortion from the images themselves."""
     context.obj = debug
-
-
-cli.add_command(help_command)
 
 
 def main() -> None:

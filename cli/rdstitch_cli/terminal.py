@@ -66,12 +66,12 @@ class Reporter:
         self._bars = verbosity >= 0 and sys.stderr.isatty()
         self._bar: tqdm[Never] | None = None
         self._stage = ""
-        self._began = time.perf_counter()
+        self._began = self._stage_began = time.perf_counter()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` steps of a stage are done."""
         if stage != self._stage:
-            self.finish()
+            self._end_stage()
             self._stage = stage
             self.log(f"{stage} ({total})")
             if self._bars:
@@ -107,8 +107,20 @@ class Reporter:
             self._bar.close()
             self._bar = None
 
+    def _end_stage(self) -> None:
+        """Log what the stage took, of time and of this process's memory."""
+        self.finish()
+        now = time.perf_counter()
+        if self._stage and self._verbosity >= 1:
+            from rdstitch.system.process_memory import forget_peak_memory, peak_memory
+
+            self.log(f"{self._stage}: {now - self._stage_began:.1f} s, at most {peak_memory():.0f} MB")
+            forget_peak_memory()
+        self._stage, self._stage_began = "", now
+
     def made(self, text: str) -> None:
         """End by saying what was made, and how long it took."""
+        self._end_stage()
         if self._verbosity >= 0:
             self._line(f"{text}, {time.perf_counter() - self._began:.1f} s")
 

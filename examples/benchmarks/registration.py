@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 import rdstitch
-from examples.benchmarks.driver import StageTimes, peak_memory, run, timed
+from examples.benchmarks.driver import StageTimes, run, timed
 from examples.judging import registration_error
 from examples.paper.common.estimators import lomsac_estimators
 from examples.paper.common.stitchers import installed_stitchers, run_all
@@ -23,6 +23,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import read_image
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.synthetic import Sequence
+from rdstitch.system.process_memory import peak_memory
 from tests.correspondences import correspondences
 from tests.floor_drives import floor_drive
 

@@ -1,38 +1,59 @@
 """Cost and accuracy by the number of frames: ``python -m examples.benchmarks.scale [COUNT …]``.
 
-A drone's survey of 480 x 360 frames, one lane beside the other, is rendered frame by frame into a temporary folder (60
-kB a frame) and stitched by one worker in a process of its own. Printed are processor time and peak memory by stage, the
-error of λ, and the largest position error of any frame, also as a share of the path. Times depend on the machine: only
-those of one run compare.
+A drone's survey of 480 x 360 frames, or of another ``--size``, one lane beside the other, is rendered frame by frame
+into a temporary folder (60 kB a frame) and stitched by one worker in a process of its own. Printed are processor time
+and peak memory by stage, the error of λ, and the median and largest position error of the frames, also as a share of
+the path. Times depend on the machine: only those of one run compare.
+
+``--drawn``: matches are drawn instead of found, and nothing is composited, so that alignment, loop closure, checks by
+matches and local alignment of 10,000 frames take minutes.
 """
 
 import json
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 import rdstitch
+from examples.benchmarks.drawn_matches import DrawnMatches
 from examples.benchmarks.driver import StagePeaks, StageTimes, apart, costliest, processor_time, run
 from examples.judging import registration_error
+from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.source import read_sources
+from rdstitch.io import DecodedImage, Metadata
 from rdstitch.io.write import write_image
-from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.pipeline.aligner import Aligner, close_loops
+from rdstitch.pipeline.placed_images import align_registration_locally
+from rdstitch.pipeline.working_size import at_full_size
+from rdstitch.results.registration import Registration
+from rdstitch.synthetic import Photometry, Sequence, blank, ground, sequence_over, survey_poses
+from rdstitch.system.cache import Cache
+from rdstitch.system.process_memory import forget_peak_memory
+from rdstitch.system.progress import Progress
+from rdstitch.verification.evidence import Evidence
+from rdstitch.verification.rules import OF_MATCHES, disagreeing_pairs
 
-COUNTS = (100, 300, 1000, 3000)
+COUNTS = (300, 1000, 3000, 10_000)
 DISTORTION = -0.25
-SIZE = (480, 360)
+SIZE = "480x360"
 _SEED = 19
 _GRID = (5, 4)  # points of a frame at which its place is compared
 
 
-def survey(count: int) -> Sequence:
+def survey(count: int, size: str = SIZE, *, rendered: bool = True) -> Sequence:
     """A drone's survey of ``count`` frames that overlap by 70 % along a lane and by 50 % across."""
-    lens = Camera(SIZE, DISTORTION, focal=0.8 * SIZE[0])
+    width, height = map(int, size.split("x"))
+    lens = Camera((width, height), DISTORTION, focal=0.8 * width)
     poses = survey_poses(lens, count, attitude_jitter=0.01, tilt=(0.02, -0.03), seed=_SEED)
-    return sequence_over(partial(ground, seed=_SEED), lens, poses, photometry=Photometry(noise=0.01), seed=_SEED)
+    plane = partial(ground, seed=_SEED) if rendered else lambda size: blank((1, 1))
+    return sequence_over(plane, lens, poses, photometry=Photometry(noise=0.01), seed=_SEED)
 
 
 def frame_order(count: int, shuffled: bool) -> list[int]:
@@ -46,16 +67,21 @@ def write_frames(sequence: Sequence, order: list[int], folder: Path) -> None:
         write_image(folder / f"frame_{place:05d}.jpg", sequence.frame(index))
 
 
-def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> dict[str, Any]:
+def measure(folder: Path, sequence: Sequence, order: list[int], *, register_only: bool, drawn: bool) -> dict[str, Any]:
     """Stitch a folder of rendered frames in this process; what that cost, and how near it came to the truth."""
+    count, matches = len(sequence), DrawnMatches(sequence)
+    pairs = matches.first() if drawn else []
     stages, peaks, before = StageTimes(), StagePeaks(), processor_time()
+    forget_peak_memory()
 
     def note(stage: str, done: int, total: int) -> None:
         stages(stage, done, total)
         peaks(stage, done, total)
 
     options = rdstitch.StitchOptions(workers=1, overwrite=True, force=True)
-    if register_only:
+    if drawn:
+        registration = aligned_by_drawn(matches, pairs, options, note)
+    elif register_only:
         registration = rdstitch.calibrate([folder], options, progress=note)
     else:
         with TemporaryDirectory() as output:
@@ -63,7 +89,6 @@ def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> di
     seconds = processor_time() - before
     note("the rest", 0, 0)
     alignment = registration.alignment
-    sequence, order = survey(count), frame_order(count, shuffled)
     error = registration_error(alignment, sequence, "similarity", order, _GRID)
     positions = sequence.poses.position / sequence.poses.height[0] * sequence.lens.focal
     path = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
@@ -80,6 +105,37 @@ def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> di
         "stages": stages.spent,
         "peaks": peaks.held,
     }
+
+
+def aligned_by_drawn(
+    matches: DrawnMatches, pairs: list[PairRegistration], options: rdstitch.StitchOptions, note: Progress
+) -> Registration:
+    """The stages after matching that look at no pixels."""
+    size, count = matches.sequence.lens.image_size, len(matches.sequence)
+    metadata = Metadata(size)
+    frames = [Frame(Path(f"frame_{k:05d}.jpg"), load=_no_pixels, metadata=metadata) for k in range(count)]
+    sources = read_sources(frames, skip_bad=False)[0]
+    options = options.for_images(count)
+    aligner = Aligner.of(sources, options, Cache())
+    aligned = aligner.draft(pairs)
+    note("draft", 1, 1)
+    aligned = close_loops(aligner, cast(Pairing, matches), aligned, matches.pairs)
+    note("closing loops", 1, 1)
+    aligned = aligner.completed(aligned)
+    note("aligning", 1, 1)
+    keypoints = tuple(len(points) for points, _ in matches.keypoints)
+    registration = Registration(tuple(sources), keypoints, tuple(aligner.used(aligned)), aligned.alignment, ())
+    evidence = Evidence(registration, options.threshold)
+    for find in (*OF_MATCHES, disagreeing_pairs):
+        list(find(evidence))
+    note("checking matches", 1, 1)
+    align_registration_locally(at_full_size(registration), "auto")
+    note("local alignment", 1, 1)
+    return registration
+
+
+def _no_pixels() -> DecodedImage:
+    raise InputError("drawn matches have no pixels")
 
 
 def print_row(row: dict[str, Any], first: dict[str, Any]) -> None:
@@ -99,11 +155,18 @@ def print_row(row: dict[str, Any], first: dict[str, Any]) -> None:
 
 
 def main(
-    counts: tuple[int, ...] = COUNTS, *, shuffled: bool = False, register: bool = False, folder: Path | None = None
+    counts: tuple[int, ...] = COUNTS,
+    *,
+    size: str = SIZE,
+    shuffled: bool = False,
+    register: bool = False,
+    drawn: bool = False,
+    folder: Path | None = None,
 ) -> None:
     """Print the table; or, in a process of its own, one row of it as JSON."""
     if folder is not None:
-        print(json.dumps(measure(folder, counts[0], shuffled, register)))
+        sequence, order = survey(counts[0], size, rendered=False), frame_order(counts[0], shuffled)
+        print(json.dumps(measure(folder, sequence, order, register_only=register, drawn=drawn)))
         return
     columns = ("s", "ms/frame", "ratio", "MB", "MB/frame", "used", "pairs/fr.", "Δλ", "median", "largest", "% of path")
     widths = (10, 10, 8, 10, 10, 8, 10, 11, 9, 9, 10)
@@ -111,9 +174,10 @@ def main(
     first: dict[str, Any] | None = None
     for count in counts:
         with TemporaryDirectory() as rendered:
-            write_frames(survey(count), frame_order(count, shuffled), Path(rendered))
-            options = ["--shuffled"] * shuffled + ["--register"] * register
-            row = apart("scale", str(count), "--folder", rendered, *options)
+            if not drawn:
+                write_frames(survey(count, size), frame_order(count, shuffled), Path(rendered))
+            options = ["--shuffled"] * shuffled + ["--register"] * register + ["--drawn"] * drawn
+            row = apart("scale", str(count), "--folder", rendered, "--size", size, *options)
         first = first or row
         print_row(row, first)
 

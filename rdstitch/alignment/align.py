@@ -43,7 +43,7 @@ _UNCONFIRMED = 0.1
 _MATCHES_OF_A_TURN = 5000
 """Correspondences of all links together that the final adjustment of a turn on the spot uses at least, if there are."""
 
-_MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 500_000, 60
+_MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 500_000, 40
 """Correspondences of all links together that are enough, and of a link that are used nevertheless."""
 
 _ROUNDS = 3

@@ -105,7 +105,7 @@ class BundleAdjustmentResult:
         """``|r|²`` of each correspondence (M,), px², whitened; inf where it cannot be transferred."""
         return self.adjuster.squared(self.parameters)
 
-    @cached_property
+    @property
     def equations(self) -> LinkEquations:
         """At the solution."""
         return self.adjuster.linearized(self.parameters, ALIGNMENT_WIDTH * self.sigma).equations

@@ -7,7 +7,6 @@ as good for finding the minimum; for how far the minimum moves, it is too large 
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -50,36 +49,36 @@ class LinearResponse:
 
     def steps_of(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray]:
         """By how much poses (F, C) and shared parameters (S, C) move when the errors change by so many ``fields``."""
-        derivative = self._derivative
-        links = np.empty((*derivative.shape[:2], columns))
-        start = self.adjuster.observations.start
+        start, blocks = self.adjuster.observations.start, self.normal.blocks
+        pair, padded = blocks.column.shape[1], np.zeros((blocks.free + 1, columns))
+        of_shared = np.zeros((len(self.normal.gradient_shared), columns))
         for part in self.parts():
             weighted = fields(part) * (self.curvature * self.weight[part.rows])[:, None, None]
+            derivative = self._derivative(part)
+            answers = np.empty((*derivative.shape[:2], columns))
             for link in range(part.first, part.last):
                 rows = slice(start[link] - part.rows.start, start[link + 1] - part.rows.start)
                 jacobian = part.jacobian[rows].reshape(-1, derivative.shape[1])
-                links[link] = jacobian.T @ weighted[rows].reshape(-1, columns)
-        local = np.swapaxes(derivative, 1, 2) @ links
-        blocks = self.normal.blocks
-        pair = blocks.column.shape[1]
-        return self.normal.responses(blocks.sums(local[:, :pair]), local[:, pair:].sum(axis=0))
+                answers[link - part.first] = jacobian.T @ weighted[rows].reshape(-1, columns)
+            local = np.swapaxes(derivative, 1, 2) @ answers
+            np.add.at(padded, blocks.column[part.first : part.last], local[:, :pair])
+            of_shared += local[:, pair:].sum(axis=0)
+        return self.normal.responses(padded[:-1], of_shared)
 
     def changes(self, part: LinearizedErrors, poses: FloatArray, shared: FloatArray) -> FloatArray:
         """By how much the errors change, (m, 2, C), with steps of the poses (F, C) and the shared parameters (S, C)."""
         start, column = self.adjuster.observations.start, self.normal.blocks.column
         columns = shared.shape[1]
         padded = np.concatenate([poses, np.zeros((1, columns))])
-        change = np.empty((*part.errors.shape, columns))
+        change, derivative = np.empty((*part.errors.shape, columns)), self._derivative(part)
         for link in range(part.first, part.last):
             rows = slice(start[link] - part.rows.start, start[link + 1] - part.rows.start)
-            step = self._derivative[link] @ np.concatenate([padded[column[link]], shared])
+            step = derivative[link - part.first] @ np.concatenate([padded[column[link]], shared])
             change[rows] = part.jacobian[rows] @ step
         return change
 
-    @cached_property
-    def _derivative(self) -> FloatArray:
-        """Of each link's homography and the free lens by its own parameters, see :func:`link_derivatives`."""
+    def _derivative(self, part: LinearizedErrors) -> FloatArray:
+        """Of some links' homographies and the free lens by their own parameters, see :func:`link_derivatives`."""
+        adjusted, links = self.adjusted, slice(part.first, part.last)
         lens_count = int(self.adjuster.free.lens.sum())
-        return link_derivatives(
-            self.adjuster.observations, self.adjusted.matrices, self.adjusted.homographies, lens_count
-        )
+        return link_derivatives(self.adjuster.observations, adjusted.matrices, adjusted.homographies, lens_count, links)

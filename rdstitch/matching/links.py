@@ -78,6 +78,8 @@ class Link:
 
     def thinned(self, most: int | None) -> Self:
         """About ``most`` of the correspondences at the most, well spread over the overlap; the number stays."""
+        if most is None or len(self.points1) <= most:
+            return replace(self, count=len(self))
         kept = spread_choice(self.points1, most)
         return replace(self, points1=self.points1[kept], points2=self.points2[kept], count=len(self))
 

@@ -218,6 +218,7 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
         pairs = tuple(sorted([*(selected or pairs), *more], key=lambda pair: pair.images))
         if selected is None and not any(pair.relation for pair in more):
             return replace(aligned, pairs=pairs)
+        pairing.progress("aligning", 0, 1)
         aligned = aligner.draft(pairs)
     return aligned
 

@@ -133,27 +133,29 @@ def _others(
 ) -> Iterator[Registration]:
     """Other registrations that use every image that this one does."""
     alignment = registration.alignment
+    # What breaks along seams may have moved, and proves nothing against a layout that fits; an absurd one is no layout.
+    absurd = first is None or _is_stretched(first.layout)
+    allowed = max(options.threshold * absurd, _MISFIT * alignment.rms)
     names = [name for name in _MODELS if name != alignment.model] if options.model == "auto" else []
     if first is not None and first.layout.placed.has_place:  # a map needs a plane with a metric
         names = [name for name in names if name == "pose"]
     for name in names:
         other = realigned(registration, replace(aligner, options=replace(aligner.options, model=name)))
-        if other is not None and _joins(other.alignment, alignment, options.threshold):
+        if other is not None and _joins(other.alignment, alignment, allowed):
             reason = f"{other.alignment.model_reason.removesuffix('; as requested')}; seams break less than with a "
             reason += f"{alignment.model} model"
             yield replace(other, alignment=replace(other.alignment, model_reason=reason))
     if first is None or first.layout.seams.contradicted:
         plane = plane_of_most(registration, options, aligner)
-        if plane is not None and _joins(plane.alignment, alignment, options.threshold):
+        if plane is not None and _joins(plane.alignment, alignment, max(options.threshold, allowed)):
             yield plane
 
 
-def _joins(other: Alignment, alignment: Alignment, threshold: float) -> bool:
-    """Whether another alignment uses all images of one, and its matches are inliers, or hardly worse than of the first.
-
-    Local alignment makes seams hold that nothing else does.
+def _joins(other: Alignment, alignment: Alignment, allowed: float) -> bool:
+    """Whether another alignment uses all images of one, with errors that are allowed: local alignment makes seams hold
+    that nothing else does.
     """
-    return bool((other.used >= alignment.used).all()) and other.rms <= max(threshold, _MISFIT * alignment.rms)
+    return bool((other.used >= alignment.used).all()) and other.rms <= allowed
 
 
 def _is_stretched(layout: Layout) -> bool:

@@ -280,6 +280,7 @@ def _stitch_found(
     with options.executor(len(sources)) as executor:
         known = [*unread, *listed.messages]
         accepted = _accepted(sources, known, options, executor, progress, purpose, beside)
+        progress("laying out", 0, 1)
         chosen = choose_layout(accepted, options, aligner_of(accepted, options, purpose), pano=pano)
         return compose_registration(chosen, executor, output, options, progress, beside, outputs)
 
@@ -427,6 +428,7 @@ def _accepted(
     """
     try:
         registration = register(sources, options, executor, purpose=purpose, progress=progress)
+        progress("checking", 0, 1)
         return accept(registration.with_messages(known), options, purpose)
     except RegistrationError as error:
         unread = [message for message in known if message.severity == "left out"]

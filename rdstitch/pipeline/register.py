@@ -79,12 +79,14 @@ def register(
     pairing, pairs = moving or (pairing, pairs)
     pairs = pairing.match_repeated_patterns(pairs) if purpose.lens_only else pairs
     mixed, other_lens = separate_lenses(aligner.cameras, pairs, options.threshold, options.known_distortion)
+    progress("aligning", 0, 1)
     aligned = aligner.draft([pair for pair in pairs if not {*pair.images} & other_lens.keys()])
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
     aligned = close_loops(aligner, pairing, aligned, candidates)
     if purpose.poses:
         aligner = replace(aligner, needs_poses=True)
         aligned = aligner.metric(aligned)
+    progress("aligning", 0, 1)
     aligned = aligner.completed(aligned)
     settle = match_crossings if purpose.lens_only else settle_repeated_pattern
     aligned, undecided = settle(aligner, pairing, aligned, sources, detected.stretch, options.threads)

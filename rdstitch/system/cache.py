@@ -16,6 +16,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from enum import Enum
 from functools import cache
 from pathlib import Path
 from threading import Lock
@@ -35,7 +36,7 @@ _HEAD = len(_MAGIC) + hashlib.sha256().digest_size
 _ABANDONED_SECONDS = 3600.0  # since a process last wrote into an unfinished entry; it was killed
 _MAX_ENTRY = 2**31  # bytes
 _CAPACITY = 16 * 2**20  # bytes of files whose content is kept in memory
-_PACKAGE = Path(__file__).parent
+_PACKAGE = Path(__file__).parents[1]
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
 _PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
 _NUMPY = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
@@ -272,7 +273,7 @@ def _write_at_once(file: Path, data: bytes) -> None:
 
 
 def pack(value: Any) -> bytes:
-    """A value as bytes: plain values, paths, arrays, and dataclasses of rdstitch."""
+    """A value as bytes: plain values, paths, arrays, and dataclasses and enumerations of rdstitch."""
     body = pickle.dumps(value, protocol=5)
     return _MAGIC + hashlib.sha256(body).digest() + body
 
@@ -292,7 +293,7 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         known = module.split(".")[0] in ("rdstitch", "numpy", "pathlib")
         named = super().find_class(module, name) if known else None
-        if isinstance(named, type) and (dataclasses.is_dataclass(named) or issubclass(named, Path)):
+        if isinstance(named, type) and (dataclasses.is_dataclass(named) or issubclass(named, (Path, Enum))):
             return named
         if module.split(".")[0] == "numpy" and name in _NUMPY:
             return named

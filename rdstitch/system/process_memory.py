@@ -1,8 +1,10 @@
 """Memory of this process: how what earlier stages have freed goes back to the system, or is kept for the next."""
 
 import ctypes
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from threading import Condition
 
 _MMAP_THRESHOLD, _TRIM_THRESHOLD, _ARENA_MAX = -3, -1, -8  # of mallopt
@@ -51,6 +53,28 @@ def reuse_freed_memory() -> None:
 def _choose(parameter: int, value: int) -> None:
     for mallopt in _mallopt:
         mallopt(parameter, value)
+
+
+def peak_memory() -> float:
+    """Most memory that this process has held, MB (10⁶ bytes); on Linux since :func:`forget_peak_memory`.
+
+    ``ru_maxrss``, for other systems, is never less than what the parent held when it started this process.
+    """
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024 / 1e6
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
+
+
+def forget_peak_memory() -> None:
+    """Begin the peak anew with what is held now, where the system can (proc(5))."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 class _Scratch:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from rdstitch.inputs.sensor_streams import DELAY_STD, at_delay, smooth
 from rdstitch.robust.posterior import WRONG_GIVEN_FOCAL
 
 _POINTS = 32  # of a pair
+_OUTLIER = 3.0  # medians of the errors
 _TILT_STARTS = (0.0, 0.0), (0.35, 0.0), (-0.35, 0.0), (0.0, 0.35), (0.0, -0.35)
 _STEPS, _DIFFERENCE, _SETTLED = 15, 1e-5, 1e-6  # radians
 _MAX_CONDITION, _HALVINGS = 1e6, 6
@@ -26,13 +27,14 @@ class SeenPairs:
 
     rays: FloatArray  # (2, K, M, 2): undistorted, in focal lengths
     attitudes: FloatArray | None  # (2, K, S, 2): ψ and θ as measured at so many delays, radians
+    weights: FloatArray  # (K, M): 0 for points that do not move with the plane, else 1
 
     @classmethod
     def of(cls, rays: Sequence[FloatArray], attitudes: Sequence[FloatArray]) -> "SeenPairs":
         """From the rays (N, 2) of the one and the other frame of the first pair, of the second, and so on."""
         chosen = [some[np.linspace(0, len(some) - 1, _POINTS).astype(np.intp)] for some in rays]
         measured = smooth(np.array([attitudes[::2], attitudes[1::2]])) if attitudes else None
-        return cls(np.array([chosen[::2], chosen[1::2]]), measured)
+        return cls(np.array([chosen[::2], chosen[1::2]]), measured, np.ones((len(chosen) // 2, _POINTS)))
 
     def errors(self, camera: FloatArray) -> FloatArray:
         """How far (2 K M,) points on the plane are from a rigid motion, focal lengths; inf beyond the horizon.
@@ -47,11 +49,20 @@ class SeenPairs:
         seen = rays @ rotation_from_tilt(tilts)
         depth = np.where(seen[..., 2] > _HORIZON, seen[..., 2], np.nan)
         places = np.nan_to_num((seen[..., 0] + 1j * seen[..., 1]) / depth, nan=np.inf)
-        one, two = places - places.mean(axis=-1, keepdims=True)
+        weights = self.weights
+        middles = (places * weights).sum(axis=-1, keepdims=True) / weights.sum(axis=-1)[:, None]
+        one, two = (places - middles) * weights
         turn = (one * two.conj()).sum(axis=-1, keepdims=True)
         # In given focal lengths, as the points were measured: a longer one makes no errors smaller.
         errors = (one - turn / np.maximum(abs(turn), 1e-300) * two) * longer
         return np.concatenate([errors.real.ravel(), errors.imag.ravel()])
+
+    def without_outliers(self, errors: FloatArray) -> "SeenPairs":
+        """Without the points whose errors, as above, are out of proportion to those of most."""
+        size = np.hypot(*errors.reshape(2, *self.weights.shape))
+        good = size <= _OUTLIER * np.median(size)
+        enough = good.sum(axis=1, keepdims=True) >= _POINTS / 2
+        return replace(self, weights=np.where(enough, good, 1.0))
 
 
 @dataclass(frozen=True)
@@ -70,12 +81,15 @@ class ShownCamera:
 
 def shown_camera(pairs: SeenPairs, tilt: tuple[float, float] | None = None) -> ShownCamera:
     """The tilt, about as given if it is, and the focal length, by which the motions between frames are rigid."""
-    count, points = pairs.rays.shape[1:3]
+    count = pairs.rays.shape[1]
     base = [_PSI, _THETA] if pairs.attitudes is None else [_PSI, _THETA, _DELAY]
     with np.errstate(all="ignore"):  # beyond the horizon
         starts = _TILT_STARTS if tilt is None else (tilt,)
         fits = [_fitted(pairs, np.array([*start, 0.0, 0.0]), base) for start in starts]
         camera, value, slope = min(fits, key=lambda fit: _cost(fit[1]))
+        if np.isfinite(value).all():
+            pairs = pairs.without_outliers(value)
+            camera, value, slope = _fitted(pairs, camera, base)
         if not np.isfinite(slope).all():
             return ShownCamera((0.0, 0.0), math.inf, math.inf, 0.0, math.inf, (0.0, 0.0), 0.0, DELAY_STD)
         free = [*base, _LOG_FOCAL]
@@ -90,7 +104,7 @@ def shown_camera(pairs: SeenPairs, tilt: tuple[float, float] | None = None) -> S
     return ShownCamera(
         (float(camera[_PSI]), float(camera[_THETA])),
         math.sqrt(max(float(np.linalg.eigvalsh(variance[:2, :2])[-1]), 0.0)),
-        math.sqrt(_cost(value) / max(count * points, 1)),
+        math.sqrt(_cost(value) / max(float(pairs.weights.sum()), 1.0)),
         float(longer[_LOG_FOCAL]) if known else 0.0,
         math.sqrt(float(freer[-1, -1])),
         (float(longer[_PSI]), float(longer[_THETA])),

@@ -433,7 +433,7 @@ class Tracker:
             if wrong > _CONTRADICTED:
                 return self._with_shown_focal(frame, shown)
         pixels = self._focal * frame.camera.scale
-        if self._mapped or not (shown.tilt_std * pixels < MATCH_ERROR / 2.0 and shown.rms * pixels < MATCH_ERROR):
+        if self._mapped or not (shown.tilt_std * pixels < MATCH_ERROR and shown.rms * pixels < MATCH_ERROR):
             return []
         self._plane = MetricPlane(self._focal, shown.tilt, rigid=True)
         return self._placed_anew(frame, 1.0)
@@ -633,7 +633,12 @@ class Tracker:
             if not relative:
                 return None
             known = np.zeros((4, 4))
-        place = (relative * math.hypot(pose.x, pose.y)) ** 2
+        far = math.hypot(pose.x, pose.y)
+        if self._plane is not None and math.isfinite(self._length_std):
+            # A tilted camera with a wrong focal length is one with a wrong tilt, by which paths bend.
+            relative = math.hypot(relative, self._length_std * math.hypot(*self._plane.tilt))
+            yaw_std = math.hypot(yaw_std, self._length_std * math.hypot(*self._plane.tilt))
+        place = (relative * far) ** 2
         if frame.attitude is not None:
             # The foot of the camera is off by the error of its tilt, and so is that of the first frame.
             place += 2.0 * (pose.height * self._attitude_std(frame)) ** 2

@@ -22,6 +22,10 @@ MAX_WARNINGS = 3
 """Lines of one run."""
 
 
+_TELLING = 0.1
+"""Share of overlaps that may be wrong, below which a sample of them says something."""
+
+
 def disagreeing_pairs(evidence: Evidence) -> Iterator[Finding]:
     """Pairs of whose matches most do not fit into the whole."""
     for fit in evidence.used:
@@ -136,7 +140,7 @@ def _unlike(evidence: Evidence) -> Iterator[Finding]:
 def _looked_at(evidence: Evidence) -> Iterator[Finding]:
     """How many of many overlaps were compared in their pixels, and what that says of the others."""
     checked, share = evidence.checked, wrong_at_most(evidence.checked)
-    if share < 1.0:
+    if share < _TELLING:
         sampled = sum(link.sampled for link in checked)
         values = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": share}
         yield Finding(Kind.LOOKED_AT, (), "detail", values)

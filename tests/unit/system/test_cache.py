@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+import rdstitch
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
@@ -30,6 +31,10 @@ def _forget_software() -> Iterator[None]:
     cache.software.cache_clear()
     yield
     cache.software.cache_clear()
+
+
+def test_results_depend_on_the_sources_of_the_whole_package() -> None:
+    assert Path(rdstitch.__file__).parent == cache._PACKAGE
 
 
 @pytest.fixture
