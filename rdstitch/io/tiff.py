@@ -11,10 +11,10 @@ import struct
 import tempfile
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
+from html import escape
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
-from xml.sax.saxutils import escape
 
 import numpy as np
 from numpy.typing import NDArray

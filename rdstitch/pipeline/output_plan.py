@@ -4,16 +4,10 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
-from rdstitch.export.hugin_project import project_of_hugin
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import image_files
-from rdstitch.pipeline.result_files import (
-    layer_files,
-    make_folder,
-    poses_file,
-    write_layers,
-)
+from rdstitch.pipeline.result_files import layer_files, make_folder, poses_file, write_layers
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
@@ -40,8 +34,7 @@ def stage_beside(beside: FilesBeside, outputs: Outputs, result: StitchResult | R
     attempt(beside.report, lambda file: _report(beside, file, outputs, result))
     if isinstance(result, StitchResult) and result.plan is None:
         how = {"whole": beside.whole_layers, "overwrite": result.options.overwrite}
-        project = partial(project_of_hugin, result.registration, result.canvas)
-        attempt(beside.hugin_project, lambda file: outputs.write(file, text_bytes(project())))
+        attempt(beside.hugin_project, lambda file: _hugin_project(file, outputs, result))
         table = partial(poses_file, result, frame=beside.frame, height=beside.height)
         attempt(beside.poses, lambda file: outputs.write(file, text_bytes(table(file))))
         attempt(beside.layers, lambda folder: write_layers(result, folder, **how, outputs=outputs))
@@ -60,6 +53,13 @@ def _report(beside: FilesBeside, file: Path, outputs: Outputs, result: StitchRes
     from rdstitch.report import write_report
 
     write_report(file, result, beside.timer.stages, beside.command, outputs=outputs)
+
+
+def _hugin_project(file: Path, outputs: Outputs, result: StitchResult) -> None:
+    # Imported late: most runs have none.
+    from rdstitch.export.hugin_project import project_of_hugin
+
+    outputs.write(file, text_bytes(project_of_hugin(result.registration, result.canvas)))
 
 
 def check_run(

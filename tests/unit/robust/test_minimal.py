@@ -36,6 +36,8 @@ def test_exact_samples_give_the_truth(tilts_known: bool, known: float | None) ->
     probes = np.random.default_rng(4).uniform(-0.5, 0.5, (30, 2))
     expected = transfer(truth, DISTORTION, probes)
     for solver in minimal_solvers(FOCAL, 0.1, tilts_known, known):
+        if solver.name.startswith("rotation"):
+            continue  # for cameras that only turn
         if level and solver.name in ("three_point_similarity", "two_point_similarity"):
             continue  # without known tilts these take the camera to be level
         if tilts_known and solver.name == "four_point":
@@ -63,7 +65,7 @@ def test_the_whole_range_of_lenses_is_searched(distortion: float) -> None:
     x1 = np.random.default_rng(5).uniform(-0.45, 0.45, (60, 2))
     x2 = transfer(truth, distortion, x1)
     for solver in minimal_solvers(FOCAL, 0.1, False, None):
-        if solver.name in ("three_point_similarity", "four_point_dlt"):
+        if solver.name in ("three_point_similarity", "four_point_dlt", "rotation_two_point"):
             continue
         size = solver.sample_size
         found = solver.solve(x1.reshape(-1, size, 2), x2.reshape(-1, size, 2), None)
