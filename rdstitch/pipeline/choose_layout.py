@@ -60,9 +60,12 @@ class LaidOut:
 
     @property
     def faults(self) -> tuple[bool, int]:
-        """What speaks against it: overlaps that do not look alike; and broken seams and stretched places, 0 to 2."""
+        """What speaks against it: overlaps that do not look alike; and broken seams, stretched places, and local
+        alignment whose seams lie nowhere where they could be judged, 0 to 3.
+        """
         seams = self.layout.seams
-        return seams.contradicted, int(seams.seen) + int(_is_stretched(self.layout))
+        unjudged = bool(self.local.fields) and not len(seams.places)
+        return seams.contradicted, int(seams.seen) + int(_is_stretched(self.layout)) + int(unjudged)
 
     @property
     def clipped(self) -> int:

@@ -47,6 +47,13 @@ def test_what_a_homography_stretches_is_laid_out_as_a_turn(shared_data: Callable
     assert result.registration.alignment.used.all()
 
 
+def test_local_alignment_whose_seams_nobody_can_judge_is_left_out(shared_data: Callable[[str], Path]) -> None:
+    """Fields bend the table towards the wall, and the seam runs where one image ends."""
+    result = pano([shared_data("classical/DFW_desk")])
+    assert len(result.seams.places) > 20
+    assert not result.seams.broken.any()
+
+
 def test_a_passing_vehicle_makes_no_turn_of_a_plane(tmp_path: Path) -> None:
     """It breaks the seams of a plane that fits to 0.16 pixels; those of a turn of 0.56 go round it, 1.6 pixels off."""
     assert judge_set(trust_set(12, "vehicle"), tmp_path).right
