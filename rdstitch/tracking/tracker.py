@@ -117,6 +117,7 @@ class Tracker:
         self._length_std = math.nan
         # Of positions, relative to their distance from the first, and of yaw, by a lens that is still estimated.
         self._shape_std = (0.0, 0.0)
+        self._origin_std = 0.0  # by how much an alignment has moved the first frame from the origin, in heights
         self._focal: float | None = None  # half diagonals: that of the map, whose lengths it determines
         self._stated_std = 0.0  # of the logarithm of the focal length that was given
         self._delay, self._delay_std = 0.0, DELAY_STD  # s, of attitudes
@@ -581,6 +582,9 @@ class Tracker:
             self._length_std = alignment.length_std
         for keyframe, placement in placed:
             keyframe.place, keyframe.aligned = move.applied(placement), True
+        first = placed[0][0]
+        if self._map.whole and first is self._map.keyframes[0] and first.place is not None and first.place.pose:
+            self._origin_std = math.hypot(first.place.pose.x, first.place.pose.y)
         self._focal = self._focal if kept else alignment.focal
         self._learn(alignment, keyframes)
         aligned = {id(keyframe) for keyframe, _ in placed}
@@ -638,7 +642,7 @@ class Tracker:
             # A tilted camera with a wrong focal length is one with a wrong tilt, by which paths bend.
             relative = math.hypot(relative, self._length_std * math.hypot(*self._plane.tilt))
             yaw_std = math.hypot(yaw_std, self._length_std * math.hypot(*self._plane.tilt))
-        place = (relative * far) ** 2
+        place = (relative * far) ** 2 + self._origin_std**2
         if frame.attitude is not None:
             # The foot of the camera is off by the error of its tilt, and so is that of the first frame.
             place += 2.0 * (pose.height * self._attitude_std(frame)) ** 2
