@@ -211,8 +211,6 @@ def _held(problem: Problem, fit: Fit, sides: list[_Side]) -> Held:
         ]
         if max(moved) < _SETTLED:
             break
-    for side in sides:
-        known, similar, excess = side.drawn(known, refined)
     growth = math.hypot(refined.adjusted.sigma, EXACTNESS) / math.hypot(fit.adjusted.sigma, EXACTNESS)
     side, (similar, excess) = sides[0], drawn[0]
     off, usual = float(np.median(similar.residuals)), max(float(np.median(side.std)), POSITION_STD)
