@@ -285,7 +285,7 @@ def plan_canvas(
     placed = [outline @ linear.T for outline in outlines]
     low = np.min([outline.min(axis=0) for outline in placed], axis=0)
     high = np.max([outline.max(axis=0) for outline in placed], axis=0)
-    _refuse_absurd(cameras, placed, high - low, scale, called)
+    _refuse_disproportionate(cameras, placed, high - low, scale, called)
     refuse_scale(cameras, high - low)
     return replace(canvas_between(low, high, linear, placed), near=tuple(near))
 
@@ -352,7 +352,7 @@ def _refuse_mirrored(px_per_unit: FloatArray, names: Sequence[str]) -> None:
             raise LimitError(f"{name}: would be mirrored (folded) in the output; leave it out")
 
 
-def _refuse_absurd(
+def _refuse_disproportionate(
     cameras: Sequence[Camera], outlines: Sequence[FloatArray], extent: FloatArray, scale: float, names: Sequence[str]
 ) -> None:
     """Refuse a canvas, or an image in it, that is out of all proportion to the input."""

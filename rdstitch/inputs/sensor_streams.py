@@ -43,10 +43,8 @@ _ODOMETRY_COLUMNS = {"timestamp": _TIME} | {
     name: name.replace("_", "")
     for name in ("x", "y", "yaw", "yaw_deg", "qx", "qy", "qz", "qw", "cov_x_x", "cov_y_y", "cov_yaw_deg_yaw_deg")
 }
-_SLIP, _STANDING = (
-    0.02,
-    1e-4,
-)  # of distances and turns, and of a body at rest: what wheels are off by if they say nothing
+# What wheels are off by if they do not say: a share of distances and turns, and of a body at rest, metres and radians.
+_SLIP, _STANDING = 0.02, 1e-4
 _MAX_TILT = math.radians(80.0)  # beyond, hardly an image shows ground, and more likely angles mean something else
 
 

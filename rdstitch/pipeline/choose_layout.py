@@ -136,9 +136,9 @@ def _others(
 ) -> Iterator[Registration]:
     """Other registrations that use every image that this one does."""
     alignment = registration.alignment
-    # What breaks along seams may have moved, and proves nothing against a layout that fits; an absurd one is no layout.
-    absurd = first is None or _is_stretched(first.layout)
-    allowed = max(options.threshold * absurd, _MISFIT * alignment.rms)
+    # What breaks along seams may have moved, and proves nothing against a layout that fits; one that is stretched does.
+    stretched = first is None or _is_stretched(first.layout)
+    allowed = max(options.threshold * stretched, _MISFIT * alignment.rms)
     names = [name for name in _MODELS if name != alignment.model] if options.model == "auto" else []
     if first is not None and first.layout.placed.has_place:  # a map needs a plane with a metric
         names = [name for name in names if name == "pose"]
