@@ -195,7 +195,7 @@ def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
 
 
 def frontal_reference(alignment: Alignment) -> int:
-    """The reference image, or, where its frame stretches another one out of proportion, the one that stretches least."""
+    """The reference image, or, where its frame stretches another out of proportion, the one that stretches least."""
     used = np.flatnonzero(alignment.used)
     borders = np.stack([_border_on_plane(alignment, int(k)) for k in used])
     present = _nearest_to_horizon(borders, alignment.homographies[[alignment.reference]])
