@@ -159,13 +159,13 @@ def _score(evidence: Evidence, observations: Observations, fit: BundleAdjustment
     """-2 log of the posterior of a lens, up to a constant.
 
     A parameter costs what Laplace says, by how much narrower it is than its prior: one that is hardly seen, such as the
-    next term of a series, costs next to nothing.
+    next term of a series, costs next to nothing, and never less.
     """
     lens, free = fit.parameters.lens, fit.adjuster.free.lens
     seen = evidence.cost(whitened_errors(observations, fit.homographies, lens))
     shared = 2.0 * len(observations.points1) / float(seen.count[0])
     relative = fit.covariance * shared / np.outer(LENS_STD[free], LENS_STD[free])
-    narrowed = -np.linalg.slogdet(relative)[1]
+    narrowed = -np.log(np.clip(np.linalg.eigvalsh(relative), 1e-300, 1.0)).sum()
     return float(seen.cost[0]) + costs(LENS, lens) + float(narrowed)
 
 

@@ -171,11 +171,9 @@ class ErrorCost:
 class Evidence:
     """Cells of the overlaps of links, by which hypotheses on the same matches are compared, for G problems at once."""
 
-    cell: (
-        IntArray  # cell, block, group: (M,), (C,) and (K,): cell of each match, block of each cell, problem of a block
-    )
-    block: IntArray
-    group: IntArray
+    cell: IntArray  # (M,): of each match
+    block: IntArray  # (C,): of each cell
+    group: IntArray  # (K,): problem of each block
     counts: FloatArray  # (C,): matches in each cell
     noise: FloatArray  # (G,): standard deviation of a coordinate of a keypoint's error, pixels
     farthest: FloatArray  # (G,): pixels that an error counts as at most
