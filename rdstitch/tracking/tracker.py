@@ -465,6 +465,7 @@ class Tracker:
             )
         self._focal, self._stated_std = found / frame.camera.scale, math.inf  # from now on it is what they show
         self._length_std = std
+        self._alignment = None  # one that is under way was begun with the old focal length
         self._plane = MetricPlane(self._focal, shown.tilt_by_itself, rigid=True)
         return self._placed_anew(frame, math.exp(-shown.log_focal))
 
