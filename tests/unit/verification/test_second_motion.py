@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.worlds.correspondences import stored
 from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
@@ -26,7 +27,7 @@ from rdstitch.verification.second_motion import (
     share_of,
 )
 from rdstitch.verification.self_similarity import Ambiguity
-from tests.registrations import registration, stored
+from tests.registrations import registration
 
 SIZE = (400, 300)
 LENS = Camera(SIZE)
