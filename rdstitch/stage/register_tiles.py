@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.stage.adjustment import Adjustment, LinkedPoints, adjust
+from rdstitch.stage.adjustment import Adjustment, adjust
 from rdstitch.stage.correlation import (
     CoarseTile,
     Overlap,
@@ -24,6 +24,7 @@ from rdstitch.stage.correlation import (
     wide_peaks,
 )
 from rdstitch.stage.grid import TileGrid
+from rdstitch.stage.linked_points import LinkedPoints
 from rdstitch.stage.refinement import BlockMatches, Transfer, refine
 from rdstitch.system.late_imports import csgraph, sparse
 from rdstitch.system.progress import Progress, silent
@@ -118,7 +119,7 @@ def register_tiles(
     candidates, lens = finder.candidates(read, known, progress)
     chosen, rough = _chosen(grid, pairs, candidates, factor, search, lens)
     if not chosen:
-        return _result(grid, pairs, _links(pairs, {}), rough, search)
+        return _result(grid, pairs, LinkedPoints.of(pairs, {}), rough, search)
     matches: dict[int, BlockMatches] = {}
     camera = Camera(grid.size, lens)
     numbers = sorted(chosen)
@@ -134,7 +135,7 @@ def register_tiles(
                 matches[number] = refined
                 break
         progress("refining", count + 1, len(chosen))
-    links = _links(pairs, matches)
+    links = LinkedPoints.of(pairs, matches)
     return _result(grid, pairs, links, _with_lens(grid, links, search / 3.0, lens, distortion), search)
 
 
@@ -273,7 +274,7 @@ def _chosen(
     """
     chosen: dict[int, FloatArray] = {}
     std = search / 3.0
-    fitted = adjust(grid, _links(pairs, {}), std, lens)
+    fitted = adjust(grid, LinkedPoints.of(pairs, {}), std, lens)
     outside = math.log(float(np.prod(grid.size)))
     for count in range(_ROUNDS):
         before = dict(chosen)
@@ -391,19 +392,7 @@ def _coarse_links(grid: TileGrid, pairs: IntArray, chosen: dict[int, FloatArray]
         middle = (np.array(grid.size) - 1.0 + offset) / 2.0
         information = np.eye(2)[None] / (factor / 2.0) ** 2
         matches[number] = BlockMatches(middle[None], (middle - offset)[None], information)
-    return _links(pairs, matches)
-
-
-def _links(pairs: IntArray, matches: dict[int, BlockMatches]) -> LinkedPoints:
-    """Concatenate the matches of all pairs."""
-    blocks = [BlockMatches.none(), *matches.values()]
-    return LinkedPoints(
-        np.repeat(np.arange(-1, len(matches)), [len(match) for match in blocks]),
-        pairs[list(matches)],
-        np.concatenate([match.points1 for match in blocks]),
-        np.concatenate([match.points2 for match in blocks]),
-        np.concatenate([match.information for match in blocks]),
-    )
+    return LinkedPoints.of(pairs, matches)
 
 
 def _result(
