@@ -331,7 +331,7 @@ class _Move(NamedTuple):
     """A candidate of a pair, as a move of one of its tiles away from where the stage was sent."""
 
     pair: int
-    index: int  # among the candidates of the pair
+    candidate: int  # its number among those of the pair
     nats: float
 
 
@@ -356,10 +356,10 @@ def _moved_tiles(
         place, agreeing = _largest_group(np.concatenate(moved), moves, search)
         if np.abs(place).max() <= search:
             continue
-        margins = {move: move.nats - candidates[move.pair].best_besides(move.index) for move in agreeing}
+        margins = {move: move.nats - candidates[move.pair].best_besides(move.candidate) for move in agreeing}
         shown = {move: margin for move, margin in margins.items() if margin > 0.0}
         if len(shown) > 1 and sum(shown.values()) > _SURE - _MOVED:
-            found |= {move.pair: candidates[move.pair].offsets[move.index] for move in shown}
+            found |= {move.pair: candidates[move.pair].offsets[move.candidate] for move in shown}
     return found
 
 
