@@ -83,7 +83,7 @@ def write_layers(
     OutputError
         When a file exists or cannot be written.
     """
-    placed, options = placed_by(result)
+    placed, options = placed_by(result), result.options.composite
     files = layer_files([source.name for source in placed.sources], folder)
     if outputs is None:
         with Outputs(overwrite) as staging:
