@@ -16,8 +16,8 @@ from rdstitch.export.trajectory_files import WRITERS, frame_of, has_times, path_
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.selection import selected
-from rdstitch.inputs.sensor_streams import timestamps_of, with_times
 from rdstitch.inputs.source import Source
+from rdstitch.inputs.times import timestamps_of, with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty
