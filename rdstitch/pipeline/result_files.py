@@ -17,7 +17,7 @@ from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.poses_files import geo_of_opendronemap, images_of_colmap
 from rdstitch.export.trajectory_files import as_csv
-from rdstitch.inputs.sensor_streams import timestamps_of
+from rdstitch.inputs.times import timestamps_of
 from rdstitch.io.tiff import write_cropped_tiff
 from rdstitch.pipeline.composer import placed_by
 from rdstitch.results.stitch_result import StitchResult

@@ -216,8 +216,9 @@ def _registered(
     while True:
         if len(sources) < 2:
             raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
+        nominal = _grid(sources, stored, options)
         try:
-            sources, tiled, said = _placed(sources, stored, options, run.progress)
+            sources, tiled, said = _placed(sources, nominal, options, run.progress)
             break
         except InputError:
             sources, damaged = _readable(sources)
@@ -260,7 +261,7 @@ def _readable(sources: Sequence[Source]) -> tuple[list[Source], list[Message]]:
 
 
 def _placed(
-    sources: list[Source], stored: Mapping[Path, StoredTile], options: TileOptions, progress: Progress
+    sources: list[Source], nominal: TileGrid, options: TileOptions, progress: Progress
 ) -> tuple[list[Source], TileRegistration, list[Message]]:
     """The tiles with their illumination taken out, where they are, and what there is to say of that."""
     if len({source.camera.image_size for source in sources}) > 1:
@@ -270,11 +271,11 @@ def _placed(
     else:
         sources, said = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
-    told = _grid(sources, stored, options)
-    plan = SearchPlan.of(told, options.search)
-    grid, shown = with_axes_shown(told, lambda index: coarse_tile(read(index), plan.factor), plan.factor, plan.search)
+    plan = SearchPlan.of(nominal, options.search)
+    factor = plan.factor
+    grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
     if shown:
-        said.append(Message(f"{told.source} contradicted: {shown}", code="grid-as-shown"))
+        said.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
     tiled = register_tiles(replace(plan, grid=grid), read, distortion=options.distortion, progress=progress)
