@@ -159,7 +159,7 @@ class Camera:
             if self.image_circle is not None and not self.image_circle > 0.0:
                 raise ImpossibleCameraError(f"an image circle has a radius above 0 pixels, not {self.image_circle:g}")
             corner = self._corner_radius
-            if not (math.isfinite(corner * corner) and not folds(corner, self.coefficients)):
+            if not (math.isfinite(corner * corner) and not folds(corner, self.distortion, self.higher)):
                 raise ImpossibleCameraError(f"distortion {named} folds the image")
             if horizon_radius(self.distortion, self.higher) < _NEAREST_HORIZON:
                 raise ImpossibleCameraError(f"distortion {named} leaves next to nothing of the image before the camera")
@@ -213,7 +213,7 @@ class Camera:
     @property
     def sees_beyond_horizon(self) -> bool:
         """Whether a part of the image shows what is at 90 degrees to the axis and more."""
-        return not is_one_to_one(self._corner_radius, self.coefficients)
+        return not is_one_to_one(self._corner_radius, self.distortion, self.higher)
 
     @property
     def _corner_radius(self) -> float:
