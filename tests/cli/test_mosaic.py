@@ -49,14 +49,6 @@ def test_every_way_to_name_images(frames: list[Path], tmp_path: Path, how: str) 
     assert [image["name"] for image in record["images"]] == [path.name for path in frames]
 
 
-def test_its_own_output_is_no_input(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    folder = tmp_path / "folder"
-    shutil.copytree(frames[0].parent, folder)
-    arguments = ("mosaic", folder, "-o", folder / "mosaic.png", "--overwrite", *CACHED)
-    first, second = rdstitch(*arguments), rdstitch(*arguments)
-    assert (first.status, first.err, first.out) == (second.status, second.err, second.out) == (0, "", first.out)
-
-
 def test_a_camera_that_stands_still_for_a_while(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     paused = [shutil.copy(frames[0], tmp_path / f"frame_0000_{again}.png") for again in range(2)]
     done = rdstitch("mosaic", *paused, *frames, "-o", tmp_path / "out.png", "--strict", *CACHED, err="")

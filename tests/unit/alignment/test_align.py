@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from examples.judging.trajectories import compare_trajectories
+from examples.worlds.alignment_scenes import Scene, aligned, grid, jittered, robot_path, scene
 from rdstitch.alignment import AlignmentOptions, align, most_matches_read
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
@@ -21,7 +22,6 @@ from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import RadialHomography, transfer
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import SpanningTree, spanning_tree
-from tests.alignment_scenes import Scene, aligned, grid, jittered, robot_path, scene
 from tests.sampled import sampled
 
 

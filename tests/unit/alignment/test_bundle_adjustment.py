@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import Scene, grid, jittered, scene
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, sigma_of
 from rdstitch.alignment.link_equations import link_equations, squared_lengths, trial_errors
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, MotionModel
@@ -11,7 +12,6 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors
 from rdstitch.geometry.radial_homography import transfer_jacobian
 from rdstitch.robust.loss import robust_cost, robust_weight
-from tests.alignment_scenes import Scene, grid, jittered, scene
 
 FREE_LENS = np.array([True, True, True, True, True])
 ONE_LENS = np.array([True, False, False, False, False])

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import aligned
+from examples.worlds.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
 from rdstitch.alignment import lens_selection
 from rdstitch.alignment.lens_selection import LensChoice
 from rdstitch.alignment.observations import Observations
 from rdstitch.geometry.camera import Camera
-from tests.alignment_scenes import aligned
-from tests.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
 
 align_module = importlib.import_module("rdstitch.alignment.align")
 

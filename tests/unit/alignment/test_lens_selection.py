@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import Scene, aligned, grid, scene
+from examples.worlds.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
 from rdstitch.alignment import LENSES, Alignment, AlignmentOptions, lens_selection
 from rdstitch.alignment.adjustment_problem import homography_apart
 from rdstitch.alignment.lens_description import describe_lens, radius_std
@@ -16,9 +18,7 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
-from tests.alignment_scenes import Scene, aligned, grid, scene
 from tests.alignment_stubs import adjusted, independent_errors, observations
-from tests.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
 from tests.sampled import sampled
 
 OFF_CENTRE = Camera(SIZE, -0.25, 0.0, (339.0, 229.0))

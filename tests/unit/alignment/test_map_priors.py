@@ -4,13 +4,13 @@ from functools import cache
 
 import numpy as np
 
+from examples.worlds.alignment_scenes import Scene, grid, jittered, scene
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.motion_models import TILTING, X, Y
 from rdstitch.alignment.plane_marks import PlaneMarks, Sighting
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
-from tests.alignment_scenes import Scene, grid, jittered, scene
 
 _HEIGHT = 300.0
 """Metres above the ground."""

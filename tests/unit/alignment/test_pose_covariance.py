@@ -8,6 +8,7 @@ import pytest
 
 import rdstitch
 from examples.benchmarks.consistency import OPTIONS, errors, rendered
+from examples.worlds.alignment_scenes import aligned, grid, scene
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import PlanarPoses
@@ -15,7 +16,6 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import TrajectoryFrame
 from rdstitch.export.trajectory_files import as_csv
-from tests.alignment_scenes import aligned, grid, scene
 
 FOCAL = 520.0
 

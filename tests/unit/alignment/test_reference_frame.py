@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import aligned, scene
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames import frontal_reference, in_frame_of
 from rdstitch.alignment.motion_models import POSE, PSI, X
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
-from tests.alignment_scenes import aligned, scene
 
 
 def _tilted() -> Alignment:

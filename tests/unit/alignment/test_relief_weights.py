@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import Scene, aligned, grid, scene
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.align import from_another_start
@@ -14,7 +15,6 @@ from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_re
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.choices import Purpose
 from rdstitch.geometry.radial_homography import measurement_whitening
-from tests.alignment_scenes import Scene, aligned, grid, scene
 
 
 def _scene(relief: float, seed: int = 0) -> Scene:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import aligned, grid, scene
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, RIGID, ROTATION, MotionModel
@@ -19,7 +20,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
 from rdstitch.synthetic.panorama import camera_rotations
-from tests.alignment_scenes import aligned, grid, scene
 
 SIZE, FOCAL = (640, 480), 520.0
 

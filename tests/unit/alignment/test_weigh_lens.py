@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import Scene, aligned, grid, scene
+from examples.worlds.lens_scenes import SIZE
 from rdstitch.alignment import Alignment
 from rdstitch.geometry.camera import Camera
-from tests.alignment_scenes import Scene, aligned, grid, scene
-from tests.lens_scenes import SIZE
 
 
 def pair(seed: int, *, distortion: float = 0.0, noise: float = 0.5, count: int = 80, depth: float = 0.0) -> Scene:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.worlds.compositing_scenes import Scene, grey, render
 from rdstitch import Composer
 from rdstitch.compositing import PlacedImage
 from rdstitch.compositing import plan as planning
@@ -26,7 +27,6 @@ from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import pano
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.system.cache import Cache, Stored
-from tests.compositing_scenes import Scene, grey, render
 
 
 def _planned(max_memory: int | None = None, *, masked: bool = False) -> CompositePlan:

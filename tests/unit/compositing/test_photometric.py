@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from examples.worlds.compositing_scenes import as_image, place_images, render, side_by_side
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import gain_compensation, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
@@ -22,7 +23,6 @@ from rdstitch.compositing.warp import locate, plan_warp
 from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import ground
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import as_image, place_images, render, side_by_side
 from tests.sampled import sampled
 
 

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from examples.worlds.compositing_scenes import as_image, gradient, grey, place_images
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
 from rdstitch.compositing.canvas import NearPart, near_parts, plan_canvas
@@ -27,7 +28,6 @@ from rdstitch.io.read import DecodedImage
 from rdstitch.pipeline.straighten import view_rotation
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import as_image, gradient, grey, place_images
 
 LENS = Camera((160, 120), -0.2, focal=110.0, focal_source="option")
 

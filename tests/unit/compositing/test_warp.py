@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from examples.worlds.compositing_scenes import as_image, grey, inner, place_images, render
 from rdstitch.compositing import CompositeOptions, compose, plan_canvas
 from rdstitch.compositing.warp import locate, plan_warp
 from rdstitch.geometry.camera import Camera
-from tests.compositing_scenes import as_image, grey, inner, place_images, render
 
 PLAIN = CompositeOptions(exposure="none", seam="none", blend="none")
 

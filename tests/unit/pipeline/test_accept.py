@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
@@ -25,7 +26,6 @@ from rdstitch.pipeline.register import register
 from rdstitch.results.messages import Message, left_out
 from rdstitch.system.cache import NO_CACHE
 from rdstitch.verification.verdict import RefusedError
-from tests.alignment_scenes import grid, scene
 from tests.cli.running import flight
 from tests.registrations import registration
 from tests.sampled import sampled

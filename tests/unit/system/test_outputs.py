@@ -158,6 +158,8 @@ def test_a_folder_of_the_user_is_no_folder_of_tiles(tmp_path: Path) -> None:
 def test_whatever_is_no_tile_keeps_a_folder(tmp_path: Path, name: str) -> None:
     (tmp_path / "a_files" / "0").mkdir(parents=True)
     (tmp_path / "a_files" / "0" / "0_0.jpg").write_bytes(b"tile")
+    with pytest.raises(OutputError, match="a_files: exists already"):
+        check_output(tmp_path / "a.dzi")
     check_output(tmp_path / "a.dzi", overwrite=True)
     (tmp_path / "a_files" / name).parent.mkdir(exist_ok=True)
     (tmp_path / "a_files" / name).write_bytes(b"dear")
