@@ -272,9 +272,9 @@ def test_keypoints_of_tiles_are_those_of_the_whole(grey: NDArray[np.uint8]) -> N
     assert (np.abs(one.descriptors[same] - two.descriptors[partner[same]]).max(axis=1) <= 3).mean() > 0.99
 
     for low, high in ((8.0, 16.0), (16.0, 64.0)):
-        one, two = (found.response[(found.scale >= low) & (found.scale < high)] for found in (whole, tiles))
-        assert len(two) == pytest.approx(len(one), rel=0.15)
-        assert np.median(two) == pytest.approx(np.median(one), rel=0.1)
+        wanted, given = (found.response[(found.scale >= low) & (found.scale < high)] for found in (whole, tiles))
+        assert len(given) == pytest.approx(len(wanted), rel=0.15)
+        assert np.median(given) == pytest.approx(np.median(wanted), rel=0.1)
 
 
 _SQUARES, _SUBPIXELS = 8, 6
