@@ -15,7 +15,6 @@ from rdstitch.alignment.adjustment_problem import homography_apart
 from rdstitch.alignment.lens_description import describe_lens, radius_std
 from rdstitch.alignment.lens_selection import LensChoice, free_parameters
 from rdstitch.alignment.observations import Observations
-from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from tests.alignment_stubs import adjusted, independent_errors, observations
@@ -208,48 +207,3 @@ def test_a_lens_with_more_freed_is_the_next_that_has_it_all(freed: list[int], na
     assert (found.free == np.array(freed, dtype=np.bool_)).all()
     assert (found is plain) is (name == "division")
     assert ("series" in found.reason) is (name == "division3")
-
-
-@pytest.mark.parametrize(
-    ("images", "names", "fitted", "chosen"),
-    [
-        (6, ["division", "division-center"], [[3, 4]], "division-center"),
-        (6, ["division2"], [[1, 3, 4]], "division2"),
-        (3, ["division", "division-center", "division2"], [[1]], "division2"),
-        (3, ["division-center"], [[3, 4]], "division-center"),
-    ],
-)
-def test_each_lens_is_tried_from_the_simpler_one(
-    monkeypatch: pytest.MonkeyPatch, images: int, names: list[str], fitted: list[list[int]], chosen: str
-) -> None:
-    """The first is at hand where it is λ alone; of less than four images the centre stays in the middle."""
-    seen = observations(independent_errors(links=9 if images == 6 else 3), images)
-    good, bad = (adjusted(seen, np.full(len(seen.points1), value)) for value in (0.2, 9.0))
-    starts: list[object] = []
-    frees: list[list[int]] = []
-
-    def apart(
-        observations: Observations, homographies: FloatArray, lens: FloatArray, free: BoolArray, known: object
-    ) -> object:
-        starts.append(homographies)
-        frees.append([k for k in range(1, 5) if free[k]])
-        assert free[0]
-        return good
-
-    monkeypatch.setattr(lens_selection, "homography_apart", apart)
-    monkeypatch.setattr(lens_selection, "_score", lambda *given: 0.0 if given[-1] is good else 100.0)
-    known: Any = None
-    found = lens_selection.choose_lens(seen, bad, names, known)
-    assert frees == fitted
-    assert starts[0] is bad.homographies
-    assert all(start is good.homographies for start in starts[1:])
-    assert found.name == chosen
-    assert (found.apart is bad) is (chosen == "division")
-    assert ("too few images" in found.reason) is (images == 3 and len(names) > 1)
-
-
-def test_a_lens_that_is_given_is_not_chosen() -> None:
-    known: Any = None
-    found = lens_selection.choose_lens(SEEN, adjusted(SEEN, BASE), [], known)
-    assert (found.name, found.reason) == ("division", "given")
-    assert not found.free.any()

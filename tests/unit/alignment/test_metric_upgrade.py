@@ -21,7 +21,6 @@ def _homographies(count: int) -> np.ndarray:
 
 
 def test_memory_does_not_grow_with_images_times_tilts() -> None:
-    """All tilts at once took 0.25 MB an image."""
     homographies = _homographies(800)
     tracemalloc.start()
     try:

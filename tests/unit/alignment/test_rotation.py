@@ -67,22 +67,17 @@ def test_the_horizon_is_level_whatever_the_frame(pitch: float) -> None:
     assert middle.max() == pytest.approx(65.0, abs=1e-6)
 
 
-def test_two_images_one_above_the_other_are_shown_as_they_were_taken() -> None:
-    """They hardly turn about the vertical: what hands roll says nothing of the horizon."""
+def test_neither_a_roll_of_hands_nor_a_camera_on_its_side_tips_the_horizon() -> None:
+    """Two images one above the other hardly turn about the vertical; their x axes alone say 45 degrees."""
     rotations = camera_rotations(np.radians([0.0, 3.0]), np.radians([-5.0, 5.0]), np.radians([1.5, -1.5]))
     ahead = (rotations @ level_frame(rotations, 0).T)[:, 2]
-    assert np.abs(np.degrees(np.arcsin(ahead[:, 1].mean()))) < 15.0  # their x axes alone say 45
-
-
-def test_images_taken_with_the_camera_on_its_side_do_not_tip_the_horizon() -> None:
+    assert np.abs(np.degrees(np.arcsin(ahead[:, 1].mean()))) < 15.0
     heading, roll = np.radians(np.arange(6) * 25.0), np.radians([2.0, -1.0, 91.0, -2.0, -89.0, 1.0])
     rotations = camera_rotations(heading, 0.1, roll)
     down = (rotations @ level_frame(rotations, 0).T)[:, :, 1]
     np.testing.assert_allclose(down[:, 2], -np.sin(0.1), atol=0.03)
     np.testing.assert_allclose(np.degrees(np.arctan2(down[:, 0], down[:, 1])), np.degrees(roll), atol=2.0)
-
-
-def test_a_full_turn_has_the_reference_image_ahead() -> None:
+    # A full turn has the reference image ahead.
     rotations = camera_rotations(np.arange(12) * np.pi / 6)
     ahead = (rotations @ level_frame(rotations, 5).T)[5, 2]
     np.testing.assert_allclose(ahead, (0.0, 0.0, 1.0), atol=1e-9)
