@@ -260,12 +260,9 @@ def _near(tilt: float, max_stretch: float = 3.0) -> NearPart | None:
     return near_parts([NEAR], [_image_to_plane(tilt)], resolution, max_stretch)[0]
 
 
-def test_an_image_from_above_is_drawn_whole() -> None:
-    assert _near(0.0) is None
-
-
 @pytest.mark.parametrize("tilt", [0.9, 1.2])
 def test_nothing_is_drawn_beyond_the_stretch(tilt: float) -> None:
+    assert _near(0.0) is None
     near = _near(tilt)
     outline = near.outline()
     plane = to_plane(NEAR, _image_to_plane(tilt), outline)
