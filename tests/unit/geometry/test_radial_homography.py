@@ -85,11 +85,8 @@ def test_pixels_and_normalized_coordinates_agree() -> None:
 def test_a_failed_fit_is_falsy_and_says_why() -> None:
     camera = Camera((640, 480))
     failed = RadialHomography.failed("only 2 matches", camera, camera, 7)
-    assert not failed
-    assert failed.reason == "only 2 matches"
+    assert (bool(failed), failed.reason, failed.inliers.tolist()) == (False, "only 2 matches", [False] * 7)
     assert np.isnan(failed.distortion)
-    assert failed.inliers.shape == (7,)
-    assert not failed.inliers.any()
 
 
 def test_to_the_plane_and_back() -> None:
@@ -102,12 +99,9 @@ def test_to_the_plane_and_back() -> None:
     assert np.isfinite(to_plane(camera, beyond, [[320.0, 479.0]])).all()
 
 
-def test_one_coefficient_is_the_closed_form() -> None:
+def test_one_coefficient_is_the_closed_form_which_reaches_as_far_as_it_is_used() -> None:
     points = np.random.default_rng(0).uniform(-2.0, 2.0, (500, 2))
     np.testing.assert_allclose(distort(points, -0.4, (0.0, 1e-300)), distort(points, -0.4), rtol=1e-12)
-
-
-def test_no_distortion_reaches_as_far_as_the_model_is_used() -> None:
     assert valid_radius(0.0) == np.inf
     assert valid_radius(-0.25) == pytest.approx(2.0)
     assert valid_radius(0.25) == pytest.approx(2.0)
@@ -141,9 +135,19 @@ def test_what_lies_beyond_the_domain_is_masked_and_never_folded(coefficients: tu
     assert not (distort([[x, 0.0] for x in np.geomspace(1e-3, 1e6, 300)], distortion, higher) > limit).any()
 
 
-@pytest.mark.parametrize("coefficients", [(1.2, 0.0, 0.0), (-0.4, 0.9, 0.0), (0.1, 0.1, 0.9)])
-def test_a_camera_that_folds_anywhere_in_the_image_is_refused(coefficients: tuple[float, float, float]) -> None:
-    with pytest.raises(ArgumentError, match="folds"):
+@pytest.mark.parametrize(
+    ("coefficients", "told"),
+    [
+        *((folding, "folds") for folding in ((1.2, 0.0, 0.0), (-0.4, 0.9, 0.0), (0.1, 0.1, 0.9))),
+        ((-30.0, 0.0, 0.0), "next to nothing"),
+        # A damaged camera file holds them; what they are multiplied by would be infinite.
+        *((endless, "") for endless in ((0.0, 1e308, 1e308), (0.0, 0.0, 1e308), (-1e308, 1e308, 1e308))),
+    ],
+)
+def test_a_camera_that_folds_anywhere_in_the_image_is_refused(
+    coefficients: tuple[float, float, float], told: str
+) -> None:
+    with pytest.raises(ArgumentError, match=told):
         Camera((640, 480), coefficients[0], coefficients[1], distortion3=coefficients[2])
 
 
@@ -167,11 +171,6 @@ def test_what_a_fisheye_sees_beyond_the_horizon_is_masked(coefficients: tuple[fl
                     (border.max() - 1e-3, border.max()))  # fmt: skip
     assert 15.0 < (outer - inner) / (1e-3 * camera.scale) < 21.0
     assert not Camera((640, 480), -0.9).sees_beyond_horizon
-
-
-def test_too_small_a_circle_is_no_camera() -> None:
-    with pytest.raises(ArgumentError, match="next to nothing"):
-        Camera((640, 480), -30.0)
 
 
 def test_nearest_lambda_is_what_a_fit_of_measured_points_gives() -> None:
@@ -199,10 +198,3 @@ def test_three_coefficients_describe_an_equidistant_fisheye() -> None:
     lens = Camera((640, 480), -(half**2) / 3, -(half**4) / 45, distortion3=-2.0 * half**6 / 945)
     points = np.random.default_rng(0).uniform((0, 0), (639, 479), (300, 2))
     assert np.linalg.norm(lens.distort(fisheye.undistort(points)) - points, axis=1).max() < 0.1
-
-
-def test_coefficients_beyond_what_can_be_computed_with_fold() -> None:
-    """A damaged camera file holds them; what they are multiplied by would be infinite."""
-    for coefficients in ((0.0, 1e308), (0.0, 0.0, 1e308), (-1e308, 1e308)):
-        with pytest.raises(ArgumentError):
-            Camera((640, 480), distortion=coefficients[0], distortion2=coefficients[1], distortion3=coefficients[-1])
