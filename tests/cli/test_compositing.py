@@ -41,9 +41,7 @@ WAYS: list[tuple[str, ...]] = [
 ]
 
 
-def test_every_way_makes_another_image_of_the_same_place(
-    rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path
-) -> None:
+def test_every_way_shows_the_same_place(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
     images = []
     for number, way in enumerate(WAYS):
         output = tmp_path / f"{number}.png"
@@ -100,7 +98,7 @@ def test_deep_zoom_is_the_same_image(rdstitch: Run, frames: list[Path], tmp_path
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
-def test_profile_and_exif_are_kept_and_the_image_is_upright(
+def test_tags_are_kept_and_upright(
     rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path, suffix: str
 ) -> None:
     profile, folder = bytes(range(256)) * 2, tmp_path / "turned"
@@ -123,9 +121,7 @@ def test_profile_and_exif_are_kept_and_the_image_is_upright(
 
 
 @pytest.mark.parametrize("whole", [False, True])
-def test_layers_by_their_masks_are_the_composite(
-    rdstitch: Run, frames: list[Path], tmp_path: Path, whole: bool
-) -> None:
+def test_layers_by_masks_are_the_composite(rdstitch: Run, frames: list[Path], tmp_path: Path, whole: bool) -> None:
     output, folder = tmp_path / "all.png", tmp_path / "layers"
     more = ["--whole-layers"] if whole else []
     rdstitch("mosaic", frames[0].parent, "-o", output, "--blend", "none", "--layers", folder, *more, *CACHED, err="")

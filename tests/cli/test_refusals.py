@@ -295,17 +295,13 @@ def _spoils(change: str) -> Callable[..., Any]:
 
 
 @pytest.mark.parametrize("change", ["vanishes", "shrinks"])
-def test_an_image_changes_after_its_registration(
-    rdstitch: Run, here: Path, monkeypatch: pytest.MonkeyPatch, change: str
-) -> None:
+def test_an_image_changes_afterwards(rdstitch: Run, here: Path, monkeypatch: pytest.MonkeyPatch, change: str) -> None:
     monkeypatch.setattr(accept, "judge", _spoils(change))
     rdstitch(*PANO.split(), *CACHED, status=3, told="b.png")
     assert not Path("out.png").exists()
 
 
-def test_an_image_vanishes_after_its_header_was_read(
-    rdstitch: Run, here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_image_vanishes_after_its_header_is_read(rdstitch: Run, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def vanish(path: Path) -> Metadata:
         metadata = read_metadata(path)
         if path.name == "b.png":

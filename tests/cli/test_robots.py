@@ -59,9 +59,7 @@ def test_exif_tells_the_time(rdstitch: Run, frames: list[Path], tmp_path: Path) 
     np.testing.assert_allclose(np.loadtxt(output)[:, 0], 1714557600.25 + np.arange(3), atol=1e-5)
 
 
-def test_without_times_numbers_stand_for_them_and_that_is_said(
-    rdstitch: Run, frames: list[Path], tmp_path: Path
-) -> None:
+def test_without_times_numbers_stand_for_them_as_is_told(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "path.tum"
     done = rdstitch("trajectory", *frames, "-o", output, "--format", "tum", "--focal", "380", *CACHED)
     assert "give --timestamps" in done.line
@@ -150,9 +148,7 @@ def _message(message: Any, header: Any, frame: Path, kind: str) -> Any:
 
 
 @pytest.mark.parametrize(("version", "kind"), [(1, "bgr8"), (1, "compressed"), (2, "rgb8"), (2, "compressed")])
-def test_a_bag_is_as_good_as_its_frames(
-    rdstitch: Run, frames: list[Path], tmp_path: Path, version: int, kind: str
-) -> None:
+def test_a_bag_is_like_its_frames(rdstitch: Run, frames: list[Path], tmp_path: Path, version: int, kind: str) -> None:
     bag = _write_bag(tmp_path, frames, version, kind)
     output = tmp_path / "path.csv"
     done = rdstitch("trajectory", bag, "-o", output, "--focal", "380", *CACHED, err="")
@@ -299,9 +295,7 @@ def test_a_video_is_never_written_over(rdstitch: Run, clip: Path, tmp_path: Path
 
 @pytest.mark.parametrize("follow", [(), ("--follow", "--idle", "0.1")])
 @pytest.mark.parametrize("damage", ["text", "cut"])
-def test_nobody_but_rdstitch_writes_on_standard_error(
-    frames: list[Path], tmp_path: Path, damage: str, follow: tuple[str, ...]
-) -> None:
+def test_nobody_else_writes_to_stderr(frames: list[Path], tmp_path: Path, damage: str, follow: tuple[str, ...]) -> None:
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(b"no video\n" * 20 if damage == "text" else b"\0\0\0\x18ftypmp42" + bytes(400))
     done = finished(start("trajectory", *follow, str(broken), "-o", str(tmp_path / "path.csv")))

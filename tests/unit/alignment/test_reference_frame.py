@@ -35,9 +35,7 @@ def test_an_oblique_reference_gives_way_to_one_whose_horizon_no_image_crosses() 
         assert np.allclose(a / a[2, 2], b / b[2, 2], atol=1e-6)
 
 
-def test_each_border_is_undistorted_once_whatever_the_number_of_possible_references(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_each_border_is_undistorted_once_of_any_number_of_references(monkeypatch: pytest.MonkeyPatch) -> None:
     calls, found = list[int](), _tilted()
     many = replace(
         found,

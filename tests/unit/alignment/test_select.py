@@ -134,9 +134,7 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
         (7.0, 1.1, "homography"),
     ],
 )
-def test_instead_of_an_implausible_plane_a_turn_may_leave_what_seams_hide_and_the_noise(
-    stretch: float, turn: float, chosen: str
-) -> None:
+def test_a_turn_may_leave_what_seams_hide(stretch: float, turn: float, chosen: str) -> None:
     problem: Any = SimpleNamespace(count=3)
     posterior = Posterior(problem)
     # A quarter of 4 px, and the noise: 1.17 px.

@@ -107,9 +107,7 @@ def test_a_camera_whose_lens_was_not_observable_is_written(tmp_path: Path, name:
 
 @pytest.mark.parametrize("camera", CAMERAS[:3])
 @pytest.mark.parametrize("name", FOREIGN)
-def test_of_a_foreign_file_the_lens_is_fitted_and_the_residual_reported(
-    tmp_path: Path, name: str, camera: Camera
-) -> None:
+def test_the_lens_of_a_foreign_file_is_fitted_with_a_residual(tmp_path: Path, name: str, camera: Camera) -> None:
     assert "lambda" not in _saved_by_others(camera, tmp_path / name)
     found = read_camera_file(tmp_path / name)
     assert found.camera.image_size == camera.image_size
@@ -186,9 +184,7 @@ def _opendronemap(text: str) -> Parsed:
         ("fisheye.yml", _opencv),
     ],
 )
-def test_what_is_exported_is_off_by_what_it_states(
-    tmp_path: Path, name: str, camera: Camera, parse: Callable[[str], Parsed]
-) -> None:
+def test_exports_are_off_as_stated(tmp_path: Path, name: str, camera: Camera, parse: Callable[[str], Parsed]) -> None:
     save_camera(camera, tmp_path / name)
     text = (tmp_path / name).read_text(encoding="utf-8")
     (fx, fy, cx, cy), values, model = parse(text)

@@ -295,9 +295,7 @@ CORNERS = [(0, 20), (60, 0), (200, 90)]
 
 
 @pytest.mark.parametrize(("corner", "block", "paper"), sampled(list(product(CORNERS, BLOCKS, [255, 240])), 5))
-def test_a_coloured_block_in_one_of_two_images_tints_no_paper(
-    corner: tuple[int, int], block: tuple[int, int, int], paper: int
-) -> None:
+def test_a_block_in_one_image_tints_no_paper(corner: tuple[int, int], block: tuple[int, int, int], paper: int) -> None:
     """A block over up to half of what two equally bright images share, in either."""
     sheet, places = _poster(paper, 3), ((0, 0), (150, 0))
     frames, (x, y) = _crops(sheet, places, (1.0, 1.0)), corner

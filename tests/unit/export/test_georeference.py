@@ -98,9 +98,7 @@ def test_a_tiff_lies_in_the_right_place_and_north_is_up(
     assert result.georeference.summary in [message.text for message in result.messages]
 
 
-def test_the_frame_of_the_reference_is_kept_on_request(
-    located: tuple[list[Path], FloatArray], cached: StitchOptions
-) -> None:
+def test_the_references_frame_on_request(located: tuple[list[Path], FloatArray], cached: StitchOptions) -> None:
     paths = located[0]
     turned = [
         mosaic(paths, options=replace(cached, composite=CompositeOptions(scale=0.3, **given)))
@@ -110,7 +108,7 @@ def test_the_frame_of_the_reference_is_kept_on_request(
     assert places[1].clockwise_deg == pytest.approx(places[0].clockwise_deg - 30.0, abs=1e-6)
 
 
-def test_ground_sample_distance_and_coordinate_system_as_requested(
+def test_gsd_and_crs_as_requested(
     located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
 ) -> None:
     paths, truth = located
@@ -125,9 +123,7 @@ def test_ground_sample_distance_and_coordinate_system_as_requested(
     assert np.hypot(*(np.stack(back, axis=1) - truth).T).max() < 4 * METRES_PER_TEXEL + 0.05
 
 
-def test_what_is_requested_of_the_map_is_checked_before_the_work(
-    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
-) -> None:
+def test_maps_are_checked_first(located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path) -> None:
     plain = flight(4, 2).write(tmp_path)
     for paths, options, message in (
         (plain, CompositeOptions(gsd=0.1), "gsd needs GPS positions of 3 images"),
@@ -138,7 +134,7 @@ def test_what_is_requested_of_the_map_is_checked_before_the_work(
             mosaic(paths, options=replace(cached, composite=options))
 
 
-def test_bands_that_are_applied_lie_where_the_first_one_does(
+def test_bands_lie_like_the_first(
     located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
 ) -> None:
     paths = located[0]
@@ -158,9 +154,7 @@ def test_bands_that_are_applied_lie_where_the_first_one_does(
         np.testing.assert_allclose(one.transform, two.transform, atol=1e-6)
 
 
-def test_other_formats_get_a_world_file(
-    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
-) -> None:
+def test_others_get_a_world_file(located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path) -> None:
     paths, truth = located
     mosaic(paths, tmp_path / "a.jpg", cached)
     a, d, b, e, c, f = map(float, (tmp_path / "a.jgw").read_text(encoding="ascii").split())
@@ -170,9 +164,7 @@ def test_other_formats_get_a_world_file(
     assert "UTM_Zone_34S" in (tmp_path / "a.prj").read_text(encoding="ascii")
 
 
-def test_files_beside_are_not_replaced_unasked(
-    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
-) -> None:
+def test_files_beside_are_kept(located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path) -> None:
     (tmp_path / "a.prj").write_text("mine", encoding="ascii")
     with pytest.raises(OutputError, match=r"a\.prj: exists already"):
         mosaic(located[0], tmp_path / "a.jpg", cached)
@@ -360,7 +352,7 @@ def test_the_error_of_the_map_is_as_large_as_told(std: float) -> None:
     assert np.abs(errors).max() < 5.0
 
 
-def test_positions_and_control_points_from_files(
+def test_positions_and_gcp_of_files(
     located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
 ) -> None:
     """Also where EXIF has none; the residuals are in the sidecar, the report, and the sidecar of what is applied."""

@@ -180,9 +180,7 @@ def raising(*_arguments: object, **_options: object) -> None:
 
 
 @pytest.mark.parametrize("remove", [lambda m: m.delattr(cv2, "ORB"), lambda m: m.setattr(cv2.ORB, "create", raising)])
-def test_a_detector_that_opencv_lacks_is_named(
-    monkeypatch: pytest.MonkeyPatch, remove: Callable[[pytest.MonkeyPatch], None]
-) -> None:
+def test_what_opencv_lacks(monkeypatch: pytest.MonkeyPatch, remove: Callable[[pytest.MonkeyPatch], None]) -> None:
     remove(monkeypatch)
     with pytest.raises(ArgumentError, match="'orb' are not in this OpenCV"):
         detect(np.zeros((50, 50), np.uint8), FeatureOptions(kind="orb"))

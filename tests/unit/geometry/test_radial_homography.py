@@ -108,7 +108,7 @@ def test_one_coefficient_is_the_closed_form_which_reaches_as_far_as_it_is_used()
 
 
 @pytest.mark.parametrize("higher", [(0.02, 0.01), (0.3, 0.2), (-0.9, 0.3), (-0.2,)])
-def test_the_root_is_the_same_where_newtons_method_has_to_be_guarded(
+def test_the_root_is_the_same_where_newton_is_guarded(
     higher: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     straight = np.random.default_rng(0).uniform(-3.0, 3.0, size=(500, 2))
@@ -144,9 +144,7 @@ def test_what_lies_beyond_the_domain_is_masked_and_never_folded(coefficients: tu
         *((endless, "") for endless in ((0.0, 1e308, 1e308), (0.0, 0.0, 1e308), (-1e308, 1e308, 1e308))),
     ],
 )
-def test_a_camera_that_folds_anywhere_in_the_image_is_refused(
-    coefficients: tuple[float, float, float], told: str
-) -> None:
+def test_a_camera_that_folds_in_its_image_is_refused(coefficients: tuple[float, float, float], told: str) -> None:
     with pytest.raises(ArgumentError, match=told):
         Camera((640, 480), coefficients[0], coefficients[1], distortion3=coefficients[2])
 

@@ -39,9 +39,7 @@ _RGB = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
         b"RIFF\x24\0\0\0WAVEfmt ",
     ],
 )
-def test_only_the_documented_formats_are_opened(
-    tmp_path: Path, content: bytes, function: object, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_formats(tmp_path: Path, content: bytes, function: object, monkeypatch: pytest.MonkeyPatch) -> None:
     def started(*arguments: object, **options: object) -> None:
         raise AssertionError("a program was started")
 
@@ -263,9 +261,7 @@ def test_what_a_decoder_warns_of_reaches_the_host(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize(("name", "bits"), [("a.jpg", 8), ("a.png", 16)])
-def test_what_follows_an_image_is_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, bits: int
-) -> None:
+def test_the_rest_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, bits: int) -> None:
     """A hole of 2 GB, which takes no room on the disk, or a phone's video."""
     file, samples = tmp_path / name, np.full((40, 60, 3), 2**bits - 1, np.uint16 if bits == 16 else np.uint8)
     file.write_bytes(cv2.imencode(file.suffix, samples)[1].tobytes())

@@ -78,9 +78,7 @@ def _failed(image1: int, image2: int) -> PairRegistration:
 
 
 @pytest.mark.parametrize(("moved", "static"), [(0.0, True), (0.9, True), (1.1, False), (2.0, False), (40.0, False)])
-def test_a_pair_is_static_where_most_inliers_move_by_less_than_a_third_of_the_threshold(
-    moved: float, static: bool
-) -> None:
+def test_a_pair_is_static_where_most_inliers_move_less_than_a_third_of_it(moved: float, static: bool) -> None:
     assert is_static_pair(_still(np.full(40, moved)), THRESHOLD) is static
     # Most decide, not the mean and not all.
     assert is_static_pair(_still(np.append(np.full(31, moved), np.full(9, 90.0))), THRESHOLD) is static

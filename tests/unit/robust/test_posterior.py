@@ -106,7 +106,5 @@ def test_fisheyes_are_possible_and_strong_pincushion_is_not() -> None:
 
 
 @pytest.mark.parametrize(("value", "std", "found"), [(-0.3, 0.001, -0.3), (0.08, 0.04, 0.04), (-0.3, 0.12, -0.325)])
-def test_a_measurement_and_the_likeliest_part_of_a_prior_meet_by_their_variances(
-    value: float, std: float, found: float
-) -> None:
+def test_a_measurement_and_the_likeliest_part_of_a_prior_meet(value: float, std: float, found: float) -> None:
     assert LENS[0].combined(value, std) == pytest.approx(found, abs=1e-4)

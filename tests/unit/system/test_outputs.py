@@ -184,9 +184,7 @@ def _leftovers(*folders: Path) -> list[Path]:
     return [path for folder in folders for path in folder.iterdir() if "rdstitch-" in path.name]
 
 
-def test_leftovers_of_dead_processes_go_and_those_of_living_ones_stay(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_leftovers_of_the_dead_go_those_of_the_living_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, temporary = tmp_path / "out", tmp_path / "tmp"
     out.mkdir()
     temporary.mkdir()

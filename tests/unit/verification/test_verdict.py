@@ -136,8 +136,7 @@ def _checked_by(monkeypatch: pytest.MonkeyPatch, good: Registration, *checked: C
 
 
 @pytest.mark.parametrize(
-    ("cells", "confirming", "severity"),
-    [(100, 9, "failure"), (100, 10, None), (7, 0, None), (8, 0, "failure")],
+    ("cells", "confirming", "severity"), [(100, 9, "failure"), (100, 10, None), (7, 0, None), (8, 0, "failure")]
 )
 def test_a_tenth_of_an_overlap_must_look_alike(
     good: Registration, monkeypatch: pytest.MonkeyPatch, cells: int, confirming: int, severity: str | None
@@ -161,9 +160,7 @@ def test_depth_shifts_what_a_picture_shows_by_a_little(
 
 
 @pytest.mark.parametrize(("clear", "severity"), [(True, "warning"), (False, "failure")])
-def test_poses_need_to_know_which_of_two_motions_is_the_plane(
-    good: Registration, monkeypatch: pytest.MonkeyPatch, clear: bool, severity: str
-) -> None:
+def test_poses_need_the_plane(good: Registration, monkeypatch: pytest.MonkeyPatch, clear: bool, severity: str) -> None:
     second = SecondMotion((0, 1), 20, 80, (30.0, 40.0), 120.0)
     monkeypatch.setattr(evidence, "find_second_motions", lambda *_: [second])
     monkeypatch.setattr(evidence, "is_clear", lambda *_: clear)
@@ -173,9 +170,7 @@ def test_poses_need_to_know_which_of_two_motions_is_the_plane(
 
 
 @pytest.mark.parametrize(("ambiguous", "of_all"), [(1, False), (2, True)])
-def test_a_pattern_all_over_is_one_failure(
-    good: Registration, monkeypatch: pytest.MonkeyPatch, ambiguous: int, of_all: bool
-) -> None:
+def test_a_pattern_all_over(good: Registration, monkeypatch: pytest.MonkeyPatch, ambiguous: int, of_all: bool) -> None:
     """Of more than two fifths of the pairs."""
     pairs = [(0, 1), (1, 2), (0, 2)]
     checked = [_checked(100, 90, pair=pair, elsewhere=0.9 * (k < ambiguous)) for k, pair in enumerate(pairs)]
