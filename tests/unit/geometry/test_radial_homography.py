@@ -145,7 +145,7 @@ def test_what_lies_beyond_the_domain_is_masked_and_never_folded(coefficients: tu
     ],
 )
 def test_a_camera_that_folds_in_its_image_is_refused(coefficients: tuple[float, float, float], told: str) -> None:
-    with pytest.raises(ArgumentError, match=told):
+    with pytest.raises(ArgumentError, match=told or None):
         Camera((640, 480), coefficients[0], coefficients[1], distortion3=coefficients[2])
 
 
