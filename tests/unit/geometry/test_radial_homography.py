@@ -10,6 +10,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry import division_model
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.division_model import distort, horizon_radius, nearest_one_parameter, undistort, valid_radius
+from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import (
     RadialHomography,
@@ -196,3 +197,14 @@ def test_three_coefficients_describe_an_equidistant_fisheye() -> None:
     lens = Camera((640, 480), -(half**2) / 3, -(half**4) / 45, distortion3=-2.0 * half**6 / 945)
     points = np.random.default_rng(0).uniform((0, 0), (639, 479), (300, 2))
     assert np.linalg.norm(lens.distort(fisheye.undistort(points)) - points, axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize(("points", "queries", "dimensions"), [(1, 3, 2), (40, 7, 2), (900, 50, 3)])
+def test_the_nearest_points_are_those_of_all_distances(points: int, queries: int, dimensions: int) -> None:
+    rng = np.random.default_rng(points)
+    # Metres of a map projection: far from 0.
+    places, asked = (5e6 + 100.0 * rng.random((count, dimensions)) for count in (points, queries))
+    distances, indices = nearest_points(places, asked, 4)
+    expected = np.sort(np.linalg.norm(asked[:, None] - places, axis=2), axis=1)[:, :4]
+    np.testing.assert_allclose(distances, expected, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(asked[:, None] - places[indices], axis=2), expected, atol=1e-4)

@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
+from io import BytesIO, StringIO, TextIOWrapper
 from pathlib import Path
 
 import cv2
@@ -268,3 +269,10 @@ def test_what_cannot_be_followed_is_refused(tmp_path: Path) -> None:
         next(iter(Arrivals("tcp://127.0.0.1:9", frames_folder=_nowhere)))
     empty = io.StringIO("")
     assert list(Arrivals("-", frames_folder=_nowhere, names=empty)) == []
+
+
+@pytest.mark.parametrize("names", [b"a.jpg\nb\xff.jpg\r\n\nc.jpg", "a.jpg\nb\udcff.jpg\nc.jpg\n"])
+def test_names_need_not_be_utf8(names: bytes | str) -> None:
+    stream = StringIO(names) if isinstance(names, str) else TextIOWrapper(BytesIO(names), encoding="utf-8")
+    arrivals = Arrivals("-", frames_folder=Path, names=stream)
+    assert [os.fsencode(frame.path) for frame in arrivals] == [b"a.jpg", b"b\xff.jpg", b"c.jpg"]
