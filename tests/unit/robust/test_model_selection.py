@@ -207,7 +207,7 @@ def test_what_cannot_be_transferred_counts_as_a_large_error() -> None:
     errors = independent_errors().reshape(-1, 2)
     evidence = evidence_of(observations(errors.reshape(9, 60, 2)), errors)
     lost, far = errors.copy(), errors.copy()
-    lost[::7], far[::7] = np.nan, 30.0 * FACTOR
+    lost[::7], far[::7] = np.nan, 30.0 * SCALE
     assert evidence.cost(errors).cost < evidence.cost(lost).cost < np.inf
     assert evidence.cost(far).cost < np.inf
 
