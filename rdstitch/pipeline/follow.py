@@ -21,19 +21,13 @@ from rdstitch.executors import ProcessExecutor
 from rdstitch.export.trajectory_files import covariance_in_frame, in_frame, ros_covariance
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
+from rdstitch.inputs.attitudes import XMP, with_attitudes
+from rdstitch.inputs.delays import DELAYS
 from rdstitch.inputs.frame import Frame, Image, as_inputs
+from rdstitch.inputs.odometry import BodyPose, Odometry, read_odometry
 from rdstitch.inputs.selection import is_selected, mask_of, with_masks
-from rdstitch.inputs.sensor_streams import (
-    DELAYS,
-    XMP,
-    BodyPose,
-    Odometry,
-    read_odometry,
-    time_of,
-    timestamps_of,
-    with_attitudes,
-)
 from rdstitch.inputs.source import Source
+from rdstitch.inputs.times import time_of, timestamps_of
 from rdstitch.io.opening import check_readable
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions

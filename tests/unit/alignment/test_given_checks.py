@@ -10,7 +10,7 @@ from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.motion_models import PSI, THETA
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
-from rdstitch.inputs.sensor_streams import DELAYS
+from rdstitch.inputs.delays import DELAYS
 
 _ONE = math.radians(1.0)
 

@@ -15,7 +15,7 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.sensor_streams import BodyPose, read_odometry
+from rdstitch.inputs.odometry import BodyPose, read_odometry
 from rdstitch.synthetic import Sequence
 
 HEIGHT, LEVER, MOUNT = 0.42, 0.15 - 0.06j, np.exp(0.5j * np.pi)  # metres; the top of the image is ahead

@@ -6,7 +6,7 @@ import pytest
 
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame
-from rdstitch.inputs.sensor_streams import with_times
+from rdstitch.inputs.times import with_times
 
 
 def times(folder: Path, count: int) -> Path:

@@ -21,7 +21,7 @@ from rdstitch.robust.loss import (
 from rdstitch.robust.model_selection import rms_of
 from rdstitch.robust.posterior import LENS, TILT, Evidence, Prior, exact, focal_prior
 from rdstitch.robust.similarity_fit import fit_similarity
-from tests.alignment_stubs import independent_errors, observations
+from tests.alignment_stubs import SCALE, independent_errors, observations
 
 SQUARED = np.array([0.0, 1.0, 4.0, 36.0, np.inf])
 
