@@ -39,6 +39,7 @@ from rdstitch.sidecar.write import (
     lens_fields,
     output_geometry,
     plain,
+    seams_fields,
     to_output,
     versions,
 )
@@ -114,6 +115,7 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
             **output_geometry(result.canvas, turned=result.saved.turned),
             "georeference": georeference_fields(result.georeference, result.not_georeferenced),
         },
+        "seams": seams_fields(result.seams, [source.name for source in result.placed.sources]),
         "images": entries,
         "pairs": [],
         "options": {**then["options"], "composite": result.options.composite},
@@ -234,7 +236,7 @@ def apply(
             check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
         given_frames: Sequence[Frame] = listed.frames
         if (stage := saved.content.get("stage")) is not None:
-            given_frames, _, said = tile_frames(given_frames, stage["z"], stage["time"])
+            given_frames, _, said = tile_frames(given_frames, stage.get("z"), stage.get("time"))
             doubts += said
         chosen, matched, said = counterparts(saved, given_frames, match)
         doubts += said
@@ -268,7 +270,7 @@ def apply(
         composed, said = compose_images(Layout.of(placed, options), run, outputs)
         result = Recomposition(
             saved=saved,
-            sources=tuple(sources),
+            sources=tuple(map(used.get, range(len(sources)))),
             matched=matched,
             left_out=left_out,
             placed=placed,

@@ -218,8 +218,9 @@ def _registered(
     while True:
         if len(sources) < 2:
             raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
+        nominal = _grid(sources, stored, options)
         try:
-            sources, tiled, said = _placed(sources, stored, options, run.progress)
+            sources, tiled, said = _placed(sources, nominal, options, run.progress)
             break
         except InputError:
             sources, damaged = _readable(sources)
@@ -262,7 +263,7 @@ def _readable(sources: Sequence[Source]) -> tuple[list[Source], list[Message]]:
 
 
 def _placed(
-    sources: list[Source], stored: Mapping[Path, StoredTile], options: TileOptions, progress: Progress
+    sources: list[Source], nominal: TileGrid, options: TileOptions, progress: Progress
 ) -> tuple[list[Source], TileRegistration, list[Message]]:
     """The tiles with their illumination taken out, where they are, and what there is to say of that."""
     if len({source.camera.image_size for source in sources}) > 1:
@@ -272,11 +273,10 @@ def _placed(
     else:
         sources, said = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
-    told = _grid(sources, stored, options)
-    search, factor = search_radius(told, options.search), coarse_factor(told)
-    grid, shown = with_axes_shown(told, lambda index: coarse_tile(read(index), factor), factor, search)
+    search, factor = search_radius(nominal, options.search), coarse_factor(nominal)
+    grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, search)
     if shown:
-        said.append(Message(f"{told.source} contradicted: {shown}", code="grid-as-shown"))
+        said.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
     tiled = register_tiles(grid, read, search=search, distortion=options.distortion, progress=progress)

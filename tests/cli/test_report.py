@@ -4,9 +4,11 @@ import base64
 import io
 import re
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -213,6 +215,26 @@ def test_of_too_large_an_image_it_is_said(pair: StitchResult, tmp_path: Path, mo
         page = report_page(replace(pair, composite=None, output=file))
         assert ("too large to be shown here" in page) is not shown
         assert "Match graph" in page
+
+
+def test_tiles_in_a_folder_are_not_called_too_large_and_pairs_are_looked_through_once(
+    pair: StitchResult, tmp_path: Path
+) -> None:
+    looked_through = []
+
+    class Pairs(tuple[Any, ...]):
+        __slots__ = ()
+
+        def __iter__(self) -> Iterator[Any]:
+            looked_through.append(self)
+            return super().__iter__()
+
+    registration = pair.registration
+    alignment = replace(registration.alignment, links=registration.alignment.links * 40)
+    registration = replace(registration, alignment=alignment, pairs=Pairs(registration.pairs))
+    page = report_page(replace(pair, composite=None, output=tmp_path / "a.zarr", registration=registration))
+    assert "a folder of tiles, which is not shown here" in page
+    assert len(looked_through) < 20
 
 
 def test_the_dots_of_a_thousand_seams_are_as_many_as_can_be_told_apart_and_hide_no_break() -> None:

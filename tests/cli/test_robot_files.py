@@ -69,12 +69,15 @@ def test_the_first_image_is_the_frame_of_all_that_is_written(rdstitch: Run, fram
 
 def test_of_several_bands_the_first_one_is_the_map(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     wanted = ("mosaic", *frames, "-o", tmp_path / "f.png", "--map-server", tmp_path / "maps", "--focal", "380", *CACHED)
+    rdstitch(*wanted, status=2, told="--map-server is in metres")
+    wanted = (*wanted, "--height", "1")
     rdstitch(*wanted, "--bands", "A=*.png,B=*.png")
     assert {file.name for file in (tmp_path / "maps").iterdir()} == {"map.yaml", "map.png"}
     rdstitch(*wanted, status=None, told="map.yaml: exists already")
     assert not (tmp_path / "f.png").exists()
-    tiled = ("mosaic", *frames, "-o", tmp_path / "f.dzi", "--map-server", tmp_path / "maps")
-    rdstitch(*tiled, status=2, told="instead of .dzi")
+    for suffix in (".dzi", ".zarr"):
+        tiled = ("mosaic", *frames, "-o", tmp_path / f"f{suffix}", "--map-server", tmp_path / "maps")
+        rdstitch(*tiled, status=2, told=f"instead of {suffix}")
 
 
 def test_a_folder_that_is_no_bag_is_not_replaced(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import camera_file_text
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, OutputError
-from rdstitch.export.georeference import Georeference, Located, georeference
+from rdstitch.export.georeference import Georeference, Located, georeference, world_file_paths
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs, NamedSystem
 from rdstitch.geometry.radial_homography import from_plane, to_plane
@@ -162,6 +162,11 @@ def test_others_get_a_world_file(located: tuple[list[Path], FloatArray], cached:
     place = np.column_stack([a * px[:, 0] + b * px[:, 1] + c, d * px[:, 0] + e * px[:, 1] + f])
     assert np.hypot(*(place - truth).T).max() < 4 * METRES_PER_TEXEL
     assert "UTM_Zone_34S" in (tmp_path / "a.prj").read_text(encoding="ascii")
+    assert world_file_paths("field.ome.zarr") == ()
+    mosaic(paths, tmp_path / "a.ome.tif", cached)
+    with rasterio.open(tmp_path / "a.ome.tif") as ome:
+        np.testing.assert_allclose(ome.transform[:6], (a, b, c, d, e, f), atol=0.6 * abs(a))
+        assert ome.crs.to_epsg() == 32734
 
 
 def test_files_beside_are_kept(located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path) -> None:

@@ -188,6 +188,9 @@ def test_images_for_which_there_is_no_room_are_not_kept() -> None:
     decoded_images.put("large", large)
     decoded_images.put("other", large)
     decoded_images.put("small", small)
+    copy = pickle.loads(pickle.dumps(decoded_images))
+    copy.put("large", large)
+    assert copy.take("large") is large
     assert decoded_images.take("other") is None
     assert decoded_images.take("large") is large
     assert decoded_images.take("large") is None

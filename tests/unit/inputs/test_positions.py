@@ -157,6 +157,9 @@ def test_control_points(tmp_path: Path) -> None:
     ]
     np.testing.assert_allclose((one[0].place.latitude, one[0].place.longitude), (-33.9, 18.5), atol=1e-7)
     assert three[0].name == "268900 6246200"
+    (tmp_path / "bare.txt").write_text(file.read_text().partition("\n")[2], encoding="utf-8")
+    bare = with_ground_control(_sources(), tmp_path / "bare.txt", 32734)
+    assert [source.control for source in bare] == [one, two, three]
     sources = [replace(source, path=Path(f"DJI {source.name}")) for source in _sources()]
     file.write_text("WGS84 UTM 34S\n268832 6246117 12 1 2 DJI a.jpg the post\n268832 6246117 12\t3\t4\tDJI b.jpg\n")
     one, two, _ = (source.control for source in with_ground_control(sources, file))

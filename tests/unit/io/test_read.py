@@ -1,6 +1,7 @@
 """Reading images and their metadata."""
 
 import struct
+import tracemalloc
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,11 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
-from rdstitch.io import read_image, read_metadata
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.lens_model import LensModel
+from rdstitch.io import Metadata, read_image, read_metadata
+from rdstitch.io.lens_correction import corrected
+from rdstitch.io.read import DecodedImage
 
 Samples = NDArray[Any]
 
@@ -226,3 +231,15 @@ def test_a_png_that_ends_early_is_no_image_without_metadata(tmp_path: Path) -> N
     file.write_bytes(file.read_bytes()[:-40])
     with pytest.raises(Exception, match="cut"):
         read_metadata(file)
+
+
+def test_correction_of_a_lens_keeps_nothing_of_the_size_of_images() -> None:
+    model = LensModel((1500.0, 1500.0), (1000.0, 600.0), (-0.1, 0.01, 0.0, 0.0, 0.0))
+    camera = Camera((2000, 1200), -0.1, lens_model=model)
+    image = DecodedImage(np.zeros((1200, 2000), np.uint8), None, Metadata((2000, 1200)))
+    tracemalloc.start()
+    try:
+        corrected(image, camera, 1)
+        assert tracemalloc.get_traced_memory()[0] < image.pixels.nbytes
+    finally:
+        tracemalloc.stop()
