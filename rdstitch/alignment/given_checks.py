@@ -19,7 +19,7 @@ from rdstitch.alignment.priors import CameraPriors
 from rdstitch.alignment.select import select_model
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.sensor_streams import DELAY_STD, DELAYS, at_delay, smooth
+from rdstitch.inputs.delays import DELAY_STD, DELAYS, at_delay, smooth
 from rdstitch.results.messages import Message
 
 _MAX_IMAGES = 60
