@@ -17,8 +17,8 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.export.map_fit import MapFit, Views, fit_map, views_of
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import WGS84, Crs, middle
+from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.io.tiff import ExtraTag
 
 MIN_POSITIONS = 3

@@ -31,7 +31,7 @@ from rdstitch.system.file_access import (
 from rdstitch.system.outputs import TemporaryFolder
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
-IMAGE_SUFFIXES = frozenset(
+READABLE_SUFFIXES = frozenset(
     [".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".tga", ".jp2", ".ppm", ".pgm", ".pnm", ".gif"]
 )
 """What counts as an image in a folder; a file that is named is tried whatever it is called."""
@@ -237,7 +237,7 @@ def _at_url(url: str) -> Iterator[tuple[Frame, bool]]:
     """The image, or the images of the folder or pattern, that a URL names."""
     path = Path(url)
     pattern = glob.has_magic(path.name)
-    if not pattern and path.suffix.lower() in IMAGE_SUFFIXES:
+    if not pattern and path.suffix.lower() in READABLE_SUFFIXES:
         yield Frame(path), True
         return
     if path.suffix.lower() in VIDEO_SUFFIXES:
@@ -246,7 +246,7 @@ def _at_url(url: str) -> Iterator[tuple[Frame, bool]]:
         found = sorted(map(Path, remote_names(url)), key=natural_key)
     except OSError as error:
         raise InputError(f"{path}: {error}") from error
-    found = [name for name in found if name.suffix.lower() in IMAGE_SUFFIXES | HEIF_SUFFIXES]
+    found = [name for name in found if name.suffix.lower() in READABLE_SUFFIXES | HEIF_SUFFIXES]
     if not found:
         raise InputError(f"{path}: there are no images at this address")
     yield from ((Frame(name), False) for name in found)
@@ -272,7 +272,7 @@ def images_in(folder: Path) -> list[Path]:
         entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
-    images = [path for path in entries if path.suffix.lower() in IMAGE_SUFFIXES]
+    images = [path for path in entries if path.suffix.lower() in READABLE_SUFFIXES]
     # Many cameras write a raw file beside each image, and phones that export JPEG leave the HEIC there.
     stems = {path.stem for path in images}
     images += [
