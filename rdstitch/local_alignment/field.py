@@ -55,7 +55,8 @@ class DisplacementField:
         # What matters in each cell, side by side: many times faster to gather.
         patches = np.lib.stride_tricks.sliding_window_view(self._coefficients, (4, 4), axis=(0, 1))
         patches = patches.reshape(*patches.shape[:3], 16)
-        return np.einsum("...ck,...k->...c", patches[cell[..., 1] - 1, cell[..., 0] - 1], weights)
+        moved = np.einsum("...ck,...k->...c", patches[cell[..., 1] - 1, cell[..., 0] - 1], weights)
+        return np.asarray(moved, dtype=np.float64)
 
     def resized(self, image_size: tuple[int, int]) -> "DisplacementField":
         """The same for an image of another size that shows the same."""
@@ -113,9 +114,10 @@ def _prefilter(count: int) -> FloatArray:
     """From values at nodes in a row to the coefficients of their cubic B-spline (count + 2 aprons, count)."""
     around = ((_APRON, _APRON), (0, 0))
     padded = np.pad(np.eye(count), around, mode="reflect", reflect_type="odd")
-    values = sum(weight * np.eye(len(padded), k=k) for k, weight in ((-1, 1.0), (0, 4.0), (1, 1.0))) / 6.0
+    one, beside = np.eye(len(padded)), np.eye(len(padded), k=1)
+    values = (4.0 * one + beside + beside.T) / 6.0
     values[0, 1] = values[-1, -2] = 2.0 / 6.0
-    return np.linalg.solve(values, padded)
+    return np.asarray(np.linalg.solve(values, padded), dtype=np.float64)
 
 
 @lru_cache(maxsize=64)
