@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from examples.worlds.adverse_sets import adverse_set
 from rdstitch.io import read_image
-from tests.adverse_sets import adverse_set
 from tests.cli.running import CACHED, DISTORTION, Run
 
 LEG = (255, 0, 255)
@@ -42,9 +42,7 @@ def leg_pixels(output: Path) -> int:
 
 @pytest.mark.parametrize("command", ["mosaic", "pano"])
 @pytest.mark.parametrize("one", [True, False])
-def test_a_leg_is_neither_matched_nor_shown(
-    rdstitch: Run, legs: Path, tmp_path: Path, command: str, *, one: bool
-) -> None:
+def test_a_leg_is_not_matched_nor_shown(rdstitch: Run, legs: Path, tmp_path: Path, command: str, *, one: bool) -> None:
     mask = tmp_path / "mask.png"
     if not one:
         (tmp_path / "masks").mkdir()

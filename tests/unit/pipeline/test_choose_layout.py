@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from examples.worlds.trust_sets import judge_set, trust_set
 from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.io import write_image
 from rdstitch.options.stitch_options import StitchOptions
@@ -15,7 +16,6 @@ from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recipes import mosaic, pano
 from rdstitch.synthetic.textures import ground
 from tests.registrations import CAMERA, source
-from tests.trust_sets import judge_set, trust_set
 
 
 def test_where_a_part_of_the_scene_is_nearer_one_line_says_where_its_lines_break(tmp_path: Path) -> None:

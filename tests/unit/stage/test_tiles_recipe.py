@@ -8,8 +8,8 @@ import tifffile
 from numpy.typing import NDArray
 
 import rdstitch
+from examples.worlds.stage_grid import StageGrid
 from rdstitch.errors import ArgumentError, InputError
-from tests.stage_grid import StageGrid
 
 STAGE = StageGrid(rows=2, columns=3, tile=256, overlap=0.2, content=0.9, backlash=2.0, seed=5)
 TILES = np.stack([STAGE.render(index) for index in range(6)])
@@ -48,6 +48,13 @@ def test_arrays_of_any_library_with_positions() -> None:
 def test_positions_that_are_no_numbers_of_each_tile_are_refused(places: object) -> None:
     with pytest.raises(ArgumentError, match="numbers, x and y of each of 6 tiles"):
         rdstitch.tiles(TILES, positions=places)
+
+
+def test_a_list_of_positions_that_is_not_there_is_told_before_a_tile_is_read(tmp_path: Path) -> None:
+    lazy = [_Lazy(tile) for tile in TILES]
+    with pytest.raises(InputError, match="missing"):
+        rdstitch.tiles(lazy, positions=tmp_path / "missing.csv", flat_field="auto")
+    assert not any(item.reads for item in lazy)
 
 
 def test_one_array_of_all_tiles_is_read_tile_by_tile() -> None:
