@@ -131,7 +131,7 @@ def _named(change: FloatArray) -> str:
     return " and ".join(changes)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _ShownTilts:
     """What the images show of their tilts."""
 

@@ -93,7 +93,7 @@ _LEAST_DAMPING = 1e-12
 """Relative to the diagonal: what makes poses solvable that nothing holds."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SparseNormalEquations:
     """``[A B; B' C] step = -gradient`` for poses and shared parameters, in that order."""
 

@@ -64,7 +64,7 @@ def align_registration_locally(registration: Registration, choice: LocalAlignmen
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlacedImages:
     """The images that are used, and where they belong."""
 

@@ -29,7 +29,7 @@ _SCALE_STD = 0.02
 _LENS_STD = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinkedPoints:
     """Matches of all pairs, block by block."""
 
@@ -47,7 +47,7 @@ class LinkedPoints:
         return LinkedPoints(number[self.pair[kept]], self.tiles[wanted], *parts)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StageModel:
     """Errors of the stage."""
 
@@ -61,7 +61,7 @@ class StageModel:
     std: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Adjustment:
     """All places."""
 

@@ -38,7 +38,7 @@ def _count(length: int, side: int) -> int:
     return max(1, min(round(length / side * _BLOCKS), length // _LEAST_SIDE))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Overlap:
     """Two tiles and what they should have in common."""
 
@@ -88,7 +88,7 @@ class Overlap:
         return np.array(parts, dtype=np.intp)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surfaces:
     """Correlation of each block over all displacements within a radius."""
 
@@ -143,7 +143,7 @@ def correlate(first: Image, second: Image, overlap: Overlap, reach: int) -> Surf
     return Surfaces(surface[:, rows[:, None], columns].astype(np.float16), plain)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CoarseTile:
     """A tile as overlaps are looked for."""
 

@@ -56,7 +56,7 @@ _LENS_AGREES = 0.25  # and where the two differ by no more than so much of it, b
 _WHOLE_PIXEL = 0.5  # and where corners move farther than by leaving whole pixels
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TileRegistration:
     """The places of all tiles, and the matches that show them."""
 
@@ -170,7 +170,7 @@ def _lens_is_there(grid: TileGrid, links: LinkedPoints, std: float, lens: float)
     return apart and a * b > 0.0 and all(abs(value) > _LENS_SHOWN * deviation for value, deviation in shown)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Candidates:
     """Where the second tile of a pair may be in the first."""
 

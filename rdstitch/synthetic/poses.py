@@ -25,7 +25,7 @@ Tilt = tuple[float, float]
 _PARKING_ANGLE = 0.7  # radians: how far a robot is turned in the middle of the S
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Poses:
     """Poses of N images."""
 
