@@ -49,22 +49,22 @@ class FollowedPoses:
 
     Attributes
     ----------
-    height : float
-        Of the first keyframe above the plane, in the unit that positions shall have.
+    height : float, optional
+        Of the first keyframe above the plane, in the unit that positions shall have; else as odometry says, or 1.
     frame : str
         "enu", "ros" or "camera", see :mod:`rdstitch.export.trajectory_files`.
     """
 
-    height: float = 1.0
+    height: float | None = None
     frame: TrajectoryFrame = "enu"
 
     def unit(self, tracked: Tracked) -> float:
-        """How long the height of the first keyframe is: as given, or, where that is one, as odometry says."""
-        return tracked.unit if self.height == 1.0 and math.isfinite(tracked.unit) else self.height
+        """How long the height of the first keyframe is: as given, else as odometry says, else one."""
+        return self.height or (tracked.unit if math.isfinite(tracked.unit) else 1.0)
 
     def length_std(self, tracked: Tracked) -> float:
         """Relative standard deviation that all lengths share."""
-        return tracked.length_std if self.unit(tracked) == self.height else tracked.unit_std
+        return tracked.length_std if self.height or not math.isfinite(tracked.unit) else tracked.unit_std
 
     def fields(self, tracked: Tracked | None) -> dict[str, float | None]:
         """x, y, yaw and height."""

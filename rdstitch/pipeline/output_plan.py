@@ -35,7 +35,7 @@ def stage_beside(beside: FilesBeside, outputs: Outputs, result: StitchResult | R
     if isinstance(result, StitchResult) and result.plan is None:
         how = {"whole": beside.whole_layers, "overwrite": result.options.overwrite}
         attempt(beside.hugin_project, lambda file: _hugin_project(file, outputs, result))
-        table = partial(poses_file, result, frame=beside.frame, height=beside.height)
+        table = partial(poses_file, result, frame=beside.frame, height=beside.height or 1.0)
         attempt(beside.poses, lambda file: outputs.write(file, text_bytes(table(file))))
         attempt(beside.layers, lambda folder: write_layers(result, folder, **how, outputs=outputs))
     return failed

@@ -321,7 +321,7 @@ def trajectory(
     layout: TrajectoryFormat = "csv",
     timestamps: str | Path | None = None,
     plot: str | Path | None = None,
-    height: float = 1.0,
+    height: float | None = None,
     frame: TrajectoryFrame | None = None,
     every: int | None = 1,
     progress: Progress = silent,
@@ -341,8 +341,8 @@ def trajectory(
         As in ``options``.
     plot : path, optional
         SVG file to draw the path to.
-    height : float
-        Height of the first frame above the plane, metres; positions are in metres then, and in heights with 1.
+    height : float, optional
+        Height of the first frame above the plane, metres; positions are in metres then, and in heights without it.
     frame : str, optional
         "enu", "ros" or "camera": the axes of the file, see :mod:`rdstitch.export.trajectory_files`. "enu" if not given,
         but for "kitti", whose axes are the camera's, and for "bag", whose axes are those of ROS.
@@ -374,9 +374,9 @@ def trajectory(
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     stored = QuarterTurns.of(registration.sources).stored_alignment(registration.alignment)
-    path = Trajectory.from_alignment(stored, height)
+    path = Trajectory.from_alignment(stored, height or 1.0)
     if options.odometry is not None:
-        path, notes = along_odometry(path, sources, options.odometry, keep_unit=height != 1.0)
+        path, notes = along_odometry(path, sources, options.odometry, keep_unit=height is not None)
         registration = registration.with_messages(notes)
     path = path.labelled(
         [s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], timestamps_of(sources)
@@ -393,7 +393,7 @@ def trajectory(
             else:
                 outputs.write(output, text_bytes(WRITERS[layout](path, frame or frame_of(layout))))
         if plot is not None:
-            file, drawn = plot, path_as_svg(path, "heights" if height == 1.0 else "m")
+            file, drawn = plot, path_as_svg(path, "heights" if height is None else "m")
             failed = outputs.attempt(file, lambda: outputs.write(file, text_bytes(drawn)))
             registration = registration.with_messages(failed)
     return path, registration
