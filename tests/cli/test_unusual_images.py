@@ -1,6 +1,5 @@
 """Images out of the ordinary, and those that see beyond the horizon."""
 
-import json
 import os
 import sys
 from collections.abc import Callable
@@ -19,7 +18,7 @@ from rdstitch.camera_files.lens_models import nearest_model
 from rdstitch.io import read_image
 from rdstitch.synthetic import FisheyeLens, ground
 from tests.cli.faulty import Make
-from tests.cli.running import CACHED, DISTORTION, Run, finished, start
+from tests.cli.running import CACHED, DISTORTION, Run, finished, sidecar_of, start
 
 
 def _saved(good: Path, file: Path, change: Callable[[Image.Image], Image.Image], **options: Any) -> Path:
@@ -85,7 +84,7 @@ def test_unusual_images_are_stitched(rdstitch: Run, place: Path, make: Make) -> 
     odd = make(place / "b.png", place)
     done = rdstitch("pano", place / "a.png", odd, "-o", place / "out.tif", *CACHED, err="")
     assert abs(float(done.out) - DISTORTION) < 0.02
-    record = json.loads((place / "out.tif.json").read_text(encoding="utf-8"))
+    record = sidecar_of(place / "out.tif")
     assert all(image["used"] for image in record["images"])
     assert [image["size"] for image in record["images"]] == [[400, 300]] * 2
 
@@ -106,8 +105,7 @@ def test_odd_names_work(place: Path, name: str) -> None:
     done = finished(start("pano", place / "a.png", image, "-o", output, *CACHED))
     assert (done.status, done.err) == (0, "")
     assert output.exists()
-    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
-    assert len(record["images"]) == 2
+    assert len(sidecar_of(output)["images"]) == 2
 
 
 def test_what_nobody_here_can_read_is_named(rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
