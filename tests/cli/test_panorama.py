@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from examples.worlds.drone_xmp import euler_angles, xmp_of
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
@@ -20,7 +21,6 @@ from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panor
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.viewer import viewer_page
 from tests.cli.running import CACHE, Run, sidecar_of
-from tests.drone_xmp import euler_angles, xmp_of
 
 LENS = Camera((320, 240), -0.2, focal=260.0, focal_source="option")
 

@@ -14,7 +14,6 @@ from PIL import Image
 
 import rdstitch as library
 from rdstitch.camera_files import load_camera
-from rdstitch.camera_files.lens_models import nearest_model
 from rdstitch.io import read_image
 from rdstitch.synthetic import FisheyeLens, ground
 from tests.cli.faulty import Make
@@ -166,19 +165,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cv2.imwrite(str(made / f"{number}.png"), image.astype(np.uint8))
     (made / "fisheye.yml").write_text(FILE, encoding="utf-8")
     return made
-
-
-def test_the_camera_file_is_read_to_the_horizon(folder: Path) -> None:
-    camera = load_camera(folder / "fisheye.yml")
-    assert camera.sees_beyond_horizon
-    points = np.random.default_rng(0).uniform((0, 0), (399, 299), (500, 2))
-    angle = np.degrees(np.linalg.norm(points - LENS.center, axis=1) / LENS.focal)
-    straight = camera.undistort(points)
-    near = angle < 80.0
-    assert np.linalg.norm(LENS.distort(straight[near]) - points[near], axis=1).max() < 0.1
-    assert np.isnan(straight[angle > 91.0]).all()
-    _, fit = nearest_model(camera, "fisheye")
-    assert fit.largest < 0.1
 
 
 @pytest.mark.parametrize("view", ["same", "all", "valid"])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from examples.worlds.drone_xmp import euler_angles, xmp_of
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
@@ -19,7 +20,6 @@ from rdstitch.synthetic import ImageTexture, Photometry, Sequence, ground, seque
 from rdstitch.synthetic.poses import Poses
 from rdstitch.synthetic.textures import Texture
 from tests.cli.running import CACHED, Run, sidecar_of
-from tests.drone_xmp import euler_angles, xmp_of
 
 LENS = Camera((400, 300), -0.1, focal=420.0, focal_source="option")
 TILT, ROLL = (0.4, 0.25), 0.08
