@@ -11,13 +11,13 @@ import pytest
 from PIL import Image
 
 from examples.worlds.drone_xmp import euler_angles, xmp_of
+from examples.worlds.turns import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import viewed_images
 from rdstitch.pipeline.recipes import pano
 from rdstitch.report.pairs import match_graph
-from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.viewer import viewer_page
 from tests.cli.running import CACHE, Run, sidecar_of

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from examples.worlds.alignment_scenes import aligned, fitted, grid, scene
+from examples.worlds.turns import camera_rotations
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, RIGID, ROTATION, MotionModel
@@ -17,7 +18,6 @@ from rdstitch.choices import Purpose
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
-from rdstitch.synthetic.panorama import camera_rotations
 
 SIZE, FOCAL = (640, 480), 520.0
 

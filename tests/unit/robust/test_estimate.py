@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from examples.worlds.correspondences import correspondences
+from examples.worlds.turns import panorama_rotations
 from rdstitch.choices import SOLVERS, SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
-from rdstitch.synthetic import panorama_rotations
 
 MATCHES = correspondences(150, seed=4, outliers=0.3)
 LENS = MATCHES.truth.camera
