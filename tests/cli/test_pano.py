@@ -41,19 +41,6 @@ def test_writes_image_sidecar_and_camera(rdstitch: Run, frames: list[Path], sequ
     assert seen.median < 1.0
 
 
-def test_order_does_not_matter_and_reference_keeps_its_frame(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    output = tmp_path / "pano.tif"
-    rdstitch("pano", frames[2], frames[0], frames[1], "-o", output, "--reference", frames[0].name, *CACHED)
-    record = sidecar_of(output)
-    assert record["reference"] == frames[0].name
-    matrix = np.array(next(i for i in record["images"] if i["name"] == frames[0].name)["to_output"])
-    matrix /= matrix[2, 2]
-    # An undistorted image is only scaled and shifted into its own frame.
-    np.testing.assert_allclose(
-        matrix, [[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[0, 0], matrix[1, 2]], [0, 0, 1]], atol=1e-9
-    )
-
-
 @pytest.mark.parametrize("how", ["lambda", "camera"])
 def test_known_lens_is_kept(rdstitch: Run, frames: list[Path], tmp_path: Path, how: str) -> None:
     Camera((400, 300), distortion=-0.21).save(tmp_path / "camera.json")
