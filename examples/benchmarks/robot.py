@@ -29,9 +29,10 @@ from numpy.typing import NDArray
 
 import rdstitch
 from examples.benchmarks.driver import run
+from examples.worlds.paths import drive_poses
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.synthetic import BrownLens, FisheyeLens, Photometry, drive_poses, ground, sequence_over
+from rdstitch.synthetic import BrownLens, FisheyeLens, Photometry, ground, sequence_over
 from rdstitch.synthetic.lenses import Lens
 
 SIZE, FOCAL, DISTORTION, HEIGHT = (320, 240), 190.0, -0.2, 0.4

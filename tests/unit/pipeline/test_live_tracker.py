@@ -15,6 +15,7 @@ import rdstitch
 from examples.benchmarks.robot import HEIGHT as DRIVE_HEIGHT
 from examples.benchmarks.robot import swaying
 from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
+from examples.worlds.paths import drive_poses
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ImpossibleCameraError, InputError
@@ -22,7 +23,7 @@ from rdstitch.features import detect, match
 from rdstitch.features.prepared_image import View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.robust import EstimationOptions
-from rdstitch.synthetic import Sequence, drive_poses, ground, sequence_over
+from rdstitch.synthetic import Sequence, ground, sequence_over
 from rdstitch.tracking import Tracker as FrameTracker
 from rdstitch.tracking import TrackingOptions
 from rdstitch.tracking import tracker as tracker_module
