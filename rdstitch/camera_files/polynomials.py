@@ -128,7 +128,7 @@ class Polynomial:
     fit: LensFit
 
     def moved(self) -> tuple[float, tuple[float, ...]]:
-        """Give how much larger the undistorted image is with the scale kept at r = 1, ``1 - Σ k`` at the centre; and k.
+        """How much larger the undistorted image is with the scale kept at r = 1, ``1 - Σ k`` at the centre; and k.
 
         r = s u, where s (1 - Σ k) = 1, and k are those found over s^p.
         """

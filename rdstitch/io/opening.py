@@ -184,7 +184,7 @@ def check_decoded_size(file: Path, size: tuple[int, int], channels: int = 3, bit
 
 
 def _factory(file: Path, stream: BinaryIO) -> Factory:
-    """Give what opens the format of a file, by its first bytes."""
+    """What opens the format of a file, by its first bytes."""
     beginning = stream.read(_MAX_MAGIC)
     stream.seek(0)
     for magic, reader in _FORMATS.items():
@@ -215,7 +215,7 @@ def _imported(name: str) -> Factory:
 
 
 def _avif_factory(path: Path) -> Factory:
-    """Give what opens AVIF: Pillow, since version 11.3."""
+    """What opens AVIF: Pillow, since version 11.3."""
     try:
         return _imported("PIL.AvifImagePlugin.AvifImageFile")
     except ImportError:

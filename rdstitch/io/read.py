@@ -133,7 +133,7 @@ def reduced(image: DecodedImage, factor: int) -> DecodedImage:
 
 
 def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> int:
-    """Give by how much of a reduction the decoder can make the image smaller; 1 for nothing."""
+    """By how much of a reduction the decoder can make the image smaller; 1 for nothing."""
     factor = math.gcd(reduction, _MAX_DECODED_REDUCTION)
     # Blocks begin at the stored image's first pixel; in one that is to be mirrored they must end at its last.
     crosswise = metadata.orientation != 1 and any(n % factor for n in image.size)
