@@ -26,11 +26,9 @@ from rdstitch.io.opening import (
     has_late_metadata,
     is_raw,
     opened_image,
-    own_exif,
-    raw_exif,
-    raw_size,
 )
 from rdstitch.io.radiometric_tags import Radiometry, read_radiometry
+from rdstitch.io.raw import own_exif, raw_exif, raw_size
 from rdstitch.io.read_tiff import channel_count
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
