@@ -91,7 +91,7 @@ def survey_images(
     factor = survey_factor(canvas)
     small = canvas.reduced(factor)
     warps = tuple(plan_warps(images, small))
-    enlarged = factor / seen_reduction(canvas)
+    enlarged = factor / seen_reduction(canvas, [warp.shrink / factor for warp in warps])
     tiles = []
     with ThreadPoolExecutor(workers) as pool:
         for tile in pool.map(partial(_survey_tile, reader, enlarged), range(len(warps)), warps):
@@ -100,11 +100,14 @@ def survey_images(
     return Survey(factor, small, warps, tuple(tiles), enlarged)
 
 
-def seen_reduction(canvas: Canvas) -> float:
-    """Canvas pixels, along a side, for one of what seams are looked at on."""
+def seen_reduction(canvas: Canvas, shrinks: Sequence[float]) -> float:
+    """Canvas pixels, along a side, for one of what seams are looked at on, by image pixels for one of the canvas.
+
+    What is seen is the same for an output of any size: it decides what is shown.
+    """
     areas = np.array(canvas.areas(), dtype=np.float64)
     usual = 1.44 * math.sqrt(float(np.median(areas)))  # the diagonal of an image of 4 to 3
-    return max(1.0, usual / DIAGONAL, math.sqrt(areas.sum() / _MAX_SEEN))
+    return max(1.0 / float(np.median(shrinks)), usual / DIAGONAL, math.sqrt(areas.sum() / _MAX_SEEN))
 
 
 def _survey_tile(reader: ImageReader, enlarged: float, index: int, warp: Warp) -> SurveyTile | None:
