@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
-from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
-from rdstitch.features import Correspondences
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import Metadata
-from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.verification.evidence import Evidence
@@ -27,12 +24,6 @@ CAMERA = Camera((400, 300))
 def source(name: str = "a.jpg", *, mask: Path | None = None, **metadata: Any) -> Source:
     """An image in ``folder``, of which there is nothing but its name and what is said of it."""
     return Source(Path("folder") / name, Metadata(CAMERA.image_size, **metadata), CAMERA, mask)
-
-
-def stored(points1: FloatArray, points2: FloatArray) -> StoredMatches:
-    """Matches of two images, the i-th features of each, as good as any other."""
-    indices = np.repeat(np.arange(len(points1))[:, None], 2, axis=1)
-    return StoredMatches.of(Correspondences(indices, points1, points2, np.full(len(points1), 0.5)))
 
 
 @cache

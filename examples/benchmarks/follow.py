@@ -18,13 +18,13 @@ import numpy as np
 import rdstitch
 from examples.benchmarks.driver import run
 from examples.judging.trajectories import compare_trajectories
+from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.inputs.arrivals import Arrivals
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.follow import Pose, follow
 from rdstitch.system.process_memory import peak_memory
-from tests.floor_drives import DISTORTION, floor_drive, true_path
 
 
 def path_of(frames: list[Pose]) -> Trajectory:

@@ -18,14 +18,14 @@ from examples.judging import registration_error
 from examples.paper.common.estimators import lomsac_estimators
 from examples.paper.common.stitchers import installed_stitchers, run_all
 from examples.paper.end_to_end import SETS
+from examples.worlds.correspondences import correspondences
+from examples.worlds.floor_drives import floor_drive
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import read_image
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.synthetic import Sequence
 from rdstitch.system.process_memory import peak_memory
-from tests.correspondences import correspondences
-from tests.floor_drives import floor_drive
 
 MATCHES = 300
 _ROUNDS = 3

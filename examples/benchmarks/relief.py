@@ -21,11 +21,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from examples.benchmarks.driver import run
+from examples.worlds.relief_strips import Strip, displacement, strip
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.result import Alignment
 from rdstitch.errors import RdstitchError
 from rdstitch.synthetic import RELIEFS
-from tests.relief_strips import Strip, displacement, strip
 
 HEIGHTS = (0.02, 0.05, 0.1)
 

@@ -26,13 +26,13 @@ import tifffile
 from numpy.typing import NDArray
 
 from examples.benchmarks.driver import run
+from examples.worlds.stage_grid import Specimen, StageGrid
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import RegistrationError
 from rdstitch.inputs.source import read_sources
 from rdstitch.pipeline.read_inputs import with_flat_field
 from rdstitch.pipeline.stage_tiles import place_tiles
 from rdstitch.stage import TileGrid, TileOptions, register_tiles
-from tests.stage_grid import Specimen, StageGrid
 
 _PEERS = r"""
 import json, sys, time, warnings

@@ -13,8 +13,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from examples.benchmarks.driver import run
-from tests.adverse_sets import ADVERSE, SOLVABLE_ADVERSE
-from tests.trust_sets import HOPELESS, ODD, SOLVABLE, SPOILED, Judged, judge_set, trust_set
+from examples.worlds.adverse_sets import ADVERSE, SOLVABLE_ADVERSE
+from examples.worlds.trust_sets import HOPELESS, ODD, SOLVABLE, SPOILED, Judged, judge_set, trust_set
 
 _SOLVABLE = (*SOLVABLE, *ODD, *SPOILED, *SOLVABLE_ADVERSE)
 _TRUE_OF = {

@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from examples.benchmarks.driver import run
+from examples.worlds.trust_sets import SOLVABLE, trust_set
 from rdstitch.errors import RdstitchError
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
@@ -24,7 +25,6 @@ from rdstitch.synthetic import (
     sequence_over,
     turning_sequence,
 )
-from tests.trust_sets import SOLVABLE, trust_set
 
 BOTH = "a plane seen from one place would look the same"
 
@@ -48,7 +48,7 @@ def turn(seed: int) -> Sequence:
 
 
 def plane(seed: int) -> Sequence:
-    """A set of :mod:`tests.trust_sets`, or images with tilts and heights of their own."""
+    """A set of :mod:`examples.worlds.trust_sets`, or images with tilts and heights of their own."""
     rng = np.random.default_rng((seed, 6))
     kind = str(rng.choice([*SOLVABLE, "free"]))
     if kind != "free":

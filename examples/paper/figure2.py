@@ -6,8 +6,8 @@ import numpy as np
 
 from examples.paper.common.contenders import absent, known_tilt, unknown_tilt
 from examples.paper.common.report import Report, Settings, Table, histograms
+from examples.worlds.instances import planar_instances
 from rdstitch.arrays import FloatArray
-from tests.instances import planar_instances
 
 _MISSED = 1e-2
 

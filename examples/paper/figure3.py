@@ -2,6 +2,7 @@
 
 from examples.paper.common.contenders import WITNESSES, Contender, absent, sweep, unknown_tilt
 from examples.paper.common.report import Report, Settings
+from examples.worlds.instances import PlanarInstances, planar_instances
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions, four_point
 from rdstitch.solvers.batch import IndexArray, solve_in_blocks
@@ -9,7 +10,6 @@ from rdstitch.solvers.four_point import QuarticEquation, SexticEquation
 from rdstitch.solvers.homography import Quadrangles
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.roots import real_roots
-from tests.instances import PlanarInstances, planar_instances
 
 _RANGE = (-1.5, 0.5)
 _EQUATIONS = {QuarticEquation: 18, SexticEquation: 16}  # with their degrees in λ

@@ -4,10 +4,10 @@ import numpy as np
 
 from examples.paper.common.contenders import WITNESSES, Contender, absent, known_tilt, sweep, unknown_tilt
 from examples.paper.common.report import Report, Settings
+from examples.worlds.instances import PlanarInstances, planar_instances
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
-from tests.instances import PlanarInstances, planar_instances
 
 _WRONG_BY = 1.0  # degrees
 

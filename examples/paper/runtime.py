@@ -7,7 +7,7 @@ import numpy as np
 
 from examples.paper.common.contenders import HOMLIB, Contender, absent, known_tilt, optional_module, own_unknown_tilt
 from examples.paper.common.report import Report, Settings, Table
-from tests.instances import PlanarInstances, planar_instances
+from examples.worlds.instances import PlanarInstances, planar_instances
 
 _SINGLES = 40
 _REPETITIONS = 5

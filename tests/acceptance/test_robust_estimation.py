@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import rdstitch
+from examples.worlds.correspondences import SyntheticMatches, correspondences
+from examples.worlds.relief_strips import displacement, strip
 from rdstitch.alignment import AlignmentOptions, align
-from tests.correspondences import SyntheticMatches, correspondences
-from tests.relief_strips import displacement, strip
 from tests.sampled import sampled
 
 PAIRS = 20

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from examples.worlds.adverse_sets import adverse_set
 from rdstitch.io import read_image
-from tests.adverse_sets import adverse_set
 from tests.cli.running import CACHED, DISTORTION, Run
 
 LEG = (255, 0, 255)

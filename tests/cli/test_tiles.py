@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import tifffile
 
+from examples.worlds.stage_grid import StageGrid
 from rdstitch.io.flat_field import FlatField
 from rdstitch.report.page import backlash
 from tests.cli.running import SIDECAR_SCHEMA, Run, rows_of
-from tests.stage_grid import StageGrid
 
 STAGE = StageGrid(rows=3, columns=3, tile=256, overlap=0.15, content=0.8, backlash=4.0, seed=5)
 NAMED = ("--grid", "r{row}c{col}", "--overlap", "15")

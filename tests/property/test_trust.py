@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from examples.worlds.trust_sets import HOPELESS, ODD, SOLVABLE, judge_set, trust_set
 from tests.sampled import sampled
-from tests.trust_sets import HOPELESS, ODD, SOLVABLE, judge_set, trust_set
 
 
 @pytest.mark.parametrize("kind", [*SOLVABLE, *ODD, *HOPELESS])

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from examples.paper.common.report import Table, curves
+from examples.worlds.instances import PlanarInstances
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.radial_homography import lift
 from rdstitch.solvers import Solutions
-from tests.instances import PlanarInstances
 
 
 def optional_module(name: str) -> Any | None:

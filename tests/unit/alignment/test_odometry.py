@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import rdstitch
+from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
 from rdstitch.alignment.odometry import OdometryFit, bridged, scaled_by_odometry
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
@@ -16,7 +17,6 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.sensor_streams import BodyPose, read_odometry
 from rdstitch.synthetic import Sequence
-from tests.floor_drives import DISTORTION, floor_drive, true_path
 
 HEIGHT, LEVER, MOUNT = 0.42, 0.15 - 0.06j, np.exp(0.5j * np.pi)  # metres; the top of the image is ahead
 

@@ -9,7 +9,7 @@ import pytest
 
 import rdstitch
 from examples.ros2_node import camera_of, odometry, pixels
-from tests.floor_drives import DISTORTION, floor_drive, true_path
+from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
 
 
 def test_images_of_messages_become_odometry_in_the_axes_of_ros() -> None:

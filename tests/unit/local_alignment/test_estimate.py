@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from examples.worlds.correspondences import stored
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
@@ -24,7 +25,7 @@ from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches, pla
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.pipeline.placed_images import align_registration_locally
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
-from tests.registrations import registration, stored
+from tests.registrations import registration
 
 SIZE = (640, 480)
 SHAPE = grid_shape(SIZE, 12)

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from examples.worlds.correspondences import stored
 from rdstitch.arrays import FloatArray
 from rdstitch.features import Features
 from rdstitch.features.keypoints import Descriptors
@@ -15,7 +16,6 @@ from rdstitch.matching.candidate_pairs import CANDIDATES, EXHAUSTIVE_UP_TO, neig
 from rdstitch.matching.candidate_pairs import first_pairs as _first_pairs
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.system.cache import Cache
-from tests.registrations import stored
 
 
 def first_pairs(features: list[Features], seed: int, positions: FloatArray | None = None) -> list[tuple[int, int]]:

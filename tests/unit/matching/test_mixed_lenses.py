@@ -6,13 +6,13 @@ import math
 import numpy as np
 import pytest
 
+from examples.worlds.correspondences import stored
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.mixed_lenses import TwoLenses, Votes, two_lenses
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust import estimate_radial_homography
-from tests.registrations import stored
 
 LENS = Camera((640, 480), -0.2, focal=520.0)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import rdstitch
+from examples.worlds.correspondences import stored
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Correspondences, FeatureOptions, Features, detect
 from rdstitch.geometry.camera import Camera
@@ -18,7 +19,6 @@ from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features, show_motion
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.synthetic import ImageTexture, Sequence, grid_poses, ground, sequence_over
-from tests.registrations import stored
 
 CAMERA = Camera((640, 480), -0.2)
 POINTS = np.random.default_rng(0).uniform((5.0, 5.0), (634.0, 474.0), (300, 2))

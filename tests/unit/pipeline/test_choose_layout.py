@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from examples.worlds.trust_sets import judge_set, trust_set
 from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.io import write_image
 from rdstitch.options.stitch_options import StitchOptions
@@ -15,7 +16,6 @@ from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recipes import mosaic, pano
 from rdstitch.synthetic.textures import ground
 from tests.registrations import CAMERA, source
-from tests.trust_sets import judge_set, trust_set
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.2])  # seams are judged by the images, whatever the size of the output

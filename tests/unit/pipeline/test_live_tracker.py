@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import rdstitch
+from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ImpossibleCameraError, InputError
@@ -23,7 +24,6 @@ from rdstitch.synthetic import Sequence, drive_poses, ground, sequence_over
 from rdstitch.tracking import Tracker as FrameTracker
 from rdstitch.tracking import TrackingOptions
 from rdstitch.tracking import tracker as tracker_module
-from tests.floor_drives import DISTORTION, floor_drive, true_path
 
 HEIGHT = 0.8
 

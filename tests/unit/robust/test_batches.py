@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from examples.worlds.correspondences import correspondences
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.division_model import distorted_ratio
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
 from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
 from rdstitch.robust.measurements import Measurements
-from tests.correspondences import correspondences
 
 
 def _pairs(count: int) -> list[PairMatches]:

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from examples.worlds.correspondences import correspondences
 from rdstitch.choices import SOLVERS, SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
 from rdstitch.synthetic import panorama_rotations
-from tests.correspondences import correspondences
 
 MATCHES = correspondences(150, seed=4, outliers=0.3)
 LENS = MATCHES.truth.camera

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import rdstitch
+from examples.worlds.correspondences import correspondences
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane, rotation_from_tilt
@@ -15,7 +16,6 @@ from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import minimal_solvers
 from rdstitch.robust.own_lenses import OwnLenses, own_lenses
 from rdstitch.robust.sampling import Sampler
-from tests.correspondences import correspondences
 
 FOCAL = 1.4
 K = np.diag([FOCAL, FOCAL, 1.0])

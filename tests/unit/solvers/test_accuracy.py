@@ -6,10 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.worlds.instances import (
+    Instances,
+    PlanarInstances,
+    general_instances,
+    planar_instances,
+    rotation_instances,
+)
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
-from tests.instances import Instances, PlanarInstances, general_instances, planar_instances, rotation_instances
 
 COUNT = 4000
 SEED = 424_242

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from examples.worlds.instances import planar_instances, rotation_instances
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.planar_motion import PlanarMotion, rotation_from_tilt
 from rdstitch.geometry.radial_homography import lift, transfer
 from rdstitch.solvers import Solutions
-from tests.instances import planar_instances, rotation_instances
 
 TILT = (0.12, -0.2)
 

@@ -9,6 +9,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
+from examples.worlds.stage_grid import Specimen, StageGrid
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.source import read_sources
@@ -21,7 +22,6 @@ from rdstitch.stage.correlation import Overlap, coarse_tile, correlate
 from rdstitch.stage.estimate_flat_field import estimate_illumination
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.positions import Scan, grid_from_names, grid_from_table, grid_from_tiles
-from tests.stage_grid import Specimen, StageGrid
 
 
 @pytest.mark.parametrize(

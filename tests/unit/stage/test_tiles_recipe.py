@@ -8,8 +8,8 @@ import tifffile
 from numpy.typing import NDArray
 
 import rdstitch
+from examples.worlds.stage_grid import StageGrid
 from rdstitch.errors import ArgumentError, InputError
-from tests.stage_grid import StageGrid
 
 STAGE = StageGrid(rows=2, columns=3, tile=256, overlap=0.2, content=0.9, backlash=2.0, seed=5)
 TILES = np.stack([STAGE.render(index) for index in range(6)])

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from examples.judging.trajectories import compare_trajectories
+from examples.worlds.floor_drives import floor_drive, true_path
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.features import FeatureOptions, Features, detect, match
 from rdstitch.features.corner_flow import CornerFlow, corners_of, fitted_affine, matched_corners
@@ -20,7 +21,6 @@ from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, drive_poses, sequence_over
 from rdstitch.tracking import CameraPose, Placement, PlaneSimilarity, Preview, Tracked, Tracker, TrackingOptions
 from rdstitch.tracking import tracker as module
-from tests.floor_drives import floor_drive, true_path
 
 SIZE = (320, 240)
 DISTORTION = -0.25

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.worlds.correspondences import stored
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
@@ -15,7 +16,7 @@ from rdstitch.synthetic.textures import ground
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey
 from rdstitch.verification.rival_planes import fills_at_most, planes_of_pairs
-from tests.registrations import registration, stored
+from tests.registrations import registration
 
 SIZE = (400, 300)
 LENS = Camera(SIZE)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from examples import judging
+from examples.worlds.adverse_sets import ADVERSE, AlteredSequence, adverse_set
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import RdstitchError
 from rdstitch.features import FeatureOptions
@@ -31,7 +32,6 @@ from rdstitch.synthetic import (
     repeated,
     sequence_over,
 )
-from tests.adverse_sets import ADVERSE, AlteredSequence, adverse_set
 
 SOLVABLE = ("pair", "chain", "grid")
 ODD = ("odd lens",)
@@ -91,7 +91,7 @@ class MixedSequence(Sequence):
 
 @dataclass(frozen=True)
 class TrustSet:
-    kind: str  # one of :data:`SOLVABLE`, :data:`ODD`, :data:`HOPELESS` or :data:`tests.adverse_sets.ADVERSE`
+    kind: str  # one of :data:`SOLVABLE`, :data:`ODD`, :data:`HOPELESS` or :data:`examples.worlds.adverse_sets.ADVERSE`
     sequence: Sequence
 
 

@@ -1,7 +1,7 @@
 """Rendered sets with what real images suffer from: bodies, vehicles, borders, blur, odd lenses and shutters, dirt.
 
 Each is a :class:`rdstitch.synthetic.Sequence`, so that the truth is known, and is judged as the other sets are; see
-:mod:`tests.trust_sets`.
+:mod:`examples.worlds.trust_sets`.
 """
 
 from collections.abc import Callable

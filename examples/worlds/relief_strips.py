@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from examples.worlds.correspondences import stored
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
@@ -13,7 +14,6 @@ from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
-from tests.registrations import stored
 
 LENS = Camera((640, 480), -0.2, focal=520.0)
 _MATCHES = 300

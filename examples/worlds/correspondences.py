@@ -1,4 +1,4 @@
-"""Matches of one pair of images, with noise and outliers and their truth: for tests of robust estimation."""
+"""Matches of one pair of images, with noise and outliers and their truth."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,10 +6,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from examples.worlds.instances import Instances, PlanarInstances, general_instances, planar_instances
 from rdstitch.arrays import FloatArray
+from rdstitch.features import Correspondences
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
-from tests.instances import Instances, PlanarInstances, general_instances, planar_instances
+from rdstitch.matching.feature_store import StoredMatches
+
+
+def stored(points1: FloatArray, points2: FloatArray) -> StoredMatches:
+    """Matches of two images, the i-th features of each, as good as any other."""
+    indices = np.repeat(np.arange(len(points1))[:, None], 2, axis=1)
+    return StoredMatches.of(Correspondences(indices, points1, points2, np.full(len(points1), 0.5)))
 
 
 @dataclass(frozen=True)

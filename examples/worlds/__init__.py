@@ -1,0 +1,1 @@
+"""Worlds with known truth that tests and benchmarks share: matches, rendered drives, odd and hopeless image sets."""
