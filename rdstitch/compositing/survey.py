@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection, overlapping_pairs
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, measure_seams, share_alike
+from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, likeness, measure_seams
 from rdstitch.compositing.source_images import ImageReader, LoadedImage, PlacedImage
 from rdstitch.compositing.warp import Warp, locate, plan_warps, sample, sample_opacity
 from rdstitch.io.reduction import mean_of_channels
@@ -67,8 +67,7 @@ class Survey:
             full = max(float(high - low), 1e-12)
         seen = [None if tile is None else tile.seen for tile in self.tiles]
         quality = measure_seams(seen, labels, self.enlarged, self.factor / self.enlarged, full)
-        alike, worst = share_alike(seen, self.pairs(), full)
-        return replace(quality, alike=alike, least_alike=worst)
+        return replace(quality, **likeness(seen, self.pairs(), full)._asdict())
 
 
 def survey_factor(canvas: Canvas) -> int:

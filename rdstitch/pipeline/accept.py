@@ -48,8 +48,7 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
     if _fails(findings) and undamaged is not None and not _fails(judged := checked(undamaged)):
         current, findings = undamaged, judged
     if _fails(findings) and not options.force:
-        another = not purpose.lens_only and any(map(_is_of_the_whole, findings))
-        plane = plane_of_most(registration, options, aligner) if another else None
+        plane = None if purpose.lens_only else plane_of_most(registration, options, aligner)
         judged = () if plane is None else checked(plane)
         if plane is not None and not any(map(_is_of_the_whole, judged)):
             current, findings = plane, judged

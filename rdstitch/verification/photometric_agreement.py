@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.seam_quality import SeamTile, share_alike
+from rdstitch.compositing.seam_quality import SeamTile, likeness
 from rdstitch.compositing.warp import Lattice
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
@@ -130,7 +130,7 @@ def overlap_agreement(first: ComparedImage, second: ComparedImage) -> Agreement:
     known = textured & _have_texture(cells) & np.isfinite(windows).all(axis=(1, 2))
     confirming = sum(_confirms(*both) for both in zip(cells[known], windows[known], strict=True))
     tiles = [SeamTile((0, 0, width, height), np.nan_to_num(grey), np.isfinite(grey)) for grey in (seen, second.grey)]
-    return Agreement(int(known.sum()), confirming, int(textured.sum()), share_alike(tiles, np.array([[0, 1]]), 1.0)[0])
+    return Agreement(int(known.sum()), confirming, int(textured.sum()), likeness(tiles, np.array([[0, 1]]), 1.0).alike)
 
 
 def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:

@@ -6,6 +6,8 @@ image, and most of that looks different: it fills less than half of the images, 
 part only, and may fill all that is not seen there.
 """
 
+import math
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -14,6 +16,7 @@ import numpy as np
 from rdstitch.executors import batches
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import PAIRS_ESTIMATED_AT_ONCE, Pair, PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
@@ -41,12 +44,27 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
         return None
     for pair, motion in _second_motions(registration.alignment.cameras, pairs, threshold).items():
         found[pair] = max(found[pair], (fills(pair, motion), motion), key=lambda each: each[0])
+    needed = _least_needed({pair: share for pair, (share, _) in found.items() if share >= half})
     return [
-        replace(pair, relation=found[pair.images][1] if found[pair.images][0] >= half else _no_plane(pair))
+        replace(pair, relation=found[pair.images][1] if found[pair.images][0] >= needed else _no_plane(pair))
         if pair.images in found
         else pair
         for pair in registration.pairs
     ]
+
+
+def _least_needed(fills: Mapping[Pair, float]) -> float:
+    """The share from which on pairs join all images that all of them join: those of less may show anything."""
+    surest = sorted(fills, key=lambda pair: -fills[pair])
+    images = sorted({k for pair in surest for k in pair})
+    if not images:
+        return math.inf
+
+    def parts(count: int) -> int:
+        firsts, seconds = zip(*surest[:count], strict=True)
+        return len([part for part in connected_components(images[-1] + 1, firsts, seconds) if part[0] in images])
+
+    return fills[surest[bisect_left(range(1, len(surest)), -parts(len(surest)), key=lambda count: -parts(count))]]
 
 
 def _second_motions(

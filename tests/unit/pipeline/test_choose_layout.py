@@ -71,7 +71,7 @@ def test_a_plane_seen_from_the_side_is_stretched(tilt: float, stretched: bool) -
 
 
 def _quality(*breaks: SeamBreak, alike: float = 0.9) -> SeamQuality:
-    return SeamQuality(np.zeros((100, 2)), np.arange(100) < len(breaks), breaks, 8.0, alike, (0, 2))
+    return SeamQuality(np.zeros((100, 2)), np.arange(100) < len(breaks), breaks, 8.0, alike, least_alike=(0, 2))
 
 
 def _break(pair: tuple[int, int], length: float) -> SeamBreak:

@@ -15,7 +15,7 @@ from rdstitch.results.registration import Registration
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey
-from rdstitch.verification.rival_planes import fills_at_most, planes_of_pairs
+from rdstitch.verification.rival_planes import _least_needed, fills_at_most, planes_of_pairs
 from tests.registrations import registration
 
 SIZE = (400, 300)
@@ -115,3 +115,10 @@ def test_what_is_not_seen_speaks_against_nothing() -> None:
     assert fills_at_most([cells]) == pytest.approx(1.0 - 6 / 40)
     assert fills_at_most([cells, cells]) == fills_at_most([cells])
     assert fills_at_most([Agreement(10, 0, 40)]) == fills_at_most([]) == 1.0
+
+
+def test_pairs_that_are_less_sure_than_those_that_hold_the_images_together_are_not_needed() -> None:
+    fills = {(0, 1): 0.9, (1, 2): 0.8, (0, 2): 0.51, (2, 3): 0.7, (0, 3): 0.6, (7, 8): 0.75}
+    assert _least_needed(fills) == 0.7
+    assert _least_needed({(0, 1): 0.6}) == 0.6
+    assert _least_needed({}) == np.inf
