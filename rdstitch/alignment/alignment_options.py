@@ -27,7 +27,7 @@ class AlignmentOptions:
     tilt: tuple[float, float] | None = None  # (ψ, θ), radians
     # (ψ, θ) of each image (N, 2), radians, by an IMU or a gimbal; ``tilt`` is then how the camera is mounted on that
     attitudes: ArrayLike | None = None
-    delayed_attitudes: FloatArray | None = None  # (N, S, 2): the same if their times are late by sensor_streams.DELAYS
+    delayed_attitudes: FloatArray | None = None  # (N, S, 2): the same if late by rdstitch.inputs.delays.DELAYS
     attitudes_std: float = 0.0  # radians; 0: exact
     # direction down (N, 3) in the axes of each camera (right, down, ahead); NaN where unknown; it levels panoramas
     gravity: ArrayLike | None = None

@@ -16,7 +16,7 @@ import numpy as np
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
-from rdstitch.inputs.sensor_streams import BodyPose, motion_between
+from rdstitch.inputs.odometry import BodyPose, motion_between
 
 _WHEELS = 0.01  # relative standard deviation of what all distances share: the size of the wheels
 _LEVER = 0.5  # units of the odometry: how far from the body's origin cameras are
@@ -51,7 +51,8 @@ class OdometryFit:
         if not np.abs(camera).sum() * np.abs(body).sum() > 0.0:
             return None
         design = np.stack([camera, 1.0 - np.exp(1j * turn)], axis=1).astype(np.complex128)
-        weight, prior = 1.0 / variance, np.diag([0.0, 1.0 / _LEVER**2])
+        # What images are off by does not become less where a body hardly moves.
+        weight, prior = 1.0 / np.maximum(variance, variance.mean()), np.diag([0.0, 1.0 / _LEVER**2])
         rest = np.ones(len(body))
         for _ in range(_ROUNDS):
             by = design.conj().T * (weight * rest)

@@ -65,7 +65,7 @@ def compose(
     The canvas is planned, and the ``decisions`` are made, with the same images. ``elsewhere`` computes the pixels in
     blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
     """
-    with prepare_composite(images, canvas, options, progress, elsewhere, decisions) as prepared:
+    with prepare_composite(images, canvas, options, elsewhere, decisions) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
@@ -96,7 +96,7 @@ def compose_to_file(
     As :func:`compose`. ``extra_tags`` gives further tags of a TIFF file for the canvas after cropping; without
     ``outputs`` the file replaces what is there.
     """
-    with prepare_composite(images, canvas, options, progress, elsewhere, decisions) as prepared:
+    with prepare_composite(images, canvas, options, elsewhere, decisions) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
         layout = Layout(
             size,

@@ -27,7 +27,6 @@ from rdstitch.results.messages import Message
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.system.progress import ShareProgress, unheard
 
-_PREPARATION = 0.25
 # Images that the survey reads at one time: what the tiles need is not there yet.
 _READERS = 2
 
@@ -44,7 +43,6 @@ class Prepared:
 
     def strips(self, progress: ShareProgress = unheard) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
-        progress = _part_of(progress, _PREPARATION, 1.0)
         if self.elsewhere is None:
             return self.tiles.strips(progress)
         return strips_of_blocks(self.tiles, self.elsewhere, progress)
@@ -90,14 +88,9 @@ class _Task:
         return self.canvas if box == (0, 0, *self.canvas.size) else self.canvas.cropped(box)
 
 
-def decide(
-    images: Sequence[PlacedImage],
-    canvas: Canvas,
-    options: CompositeOptions | None = None,
-    progress: ShareProgress = unheard,
-) -> Decisions:
+def decide(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions) -> Decisions:
     """Decide on exposure, seams and cropping, from a small version of each image; see :func:`compose`."""
-    return _decided(_Task.of(images, canvas, options), progress)
+    return _decided(_Task.of(images, canvas, options))
 
 
 @contextmanager
@@ -105,7 +98,6 @@ def prepare_composite(
     images: Sequence[PlacedImage],
     canvas: Canvas,
     options: CompositeOptions | None = None,
-    progress: ShareProgress = unheard,
     elsewhere: BlockRunner | None = None,
     decisions: Decisions | None = None,
 ) -> Iterator[Prepared]:
@@ -114,7 +106,7 @@ def prepare_composite(
     Images are read ahead as long as it lasts, if they are needed here.
     """
     task = _Task.of(images, canvas, options)
-    decided = decisions or _decided(task, _part_of(progress, 0.0, _PREPARATION))
+    decided = decisions or _decided(task)
     plan, warps, (channels, dtype) = task.plan, plan_warps(images, task.canvas), task.reader.samples
     cache = ImageCache(
         task.reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1 and elsewhere is None
@@ -129,7 +121,7 @@ def prepare_composite(
         yield Prepared(renderer, task.cropped(decided.box), tiles, decided.messages, elsewhere)
 
 
-def _decided(task: _Task, progress: ShareProgress) -> Decisions:
+def _decided(task: _Task) -> Decisions:
     """Everything that small images say."""
     images, canvas, options, plan = task.images, task.canvas, task.options, task.plan
     exposure, seams, quality = no_exposure(len(images), task.reader.samples[0]), None, SeamQuality()
@@ -141,14 +133,14 @@ def _decided(task: _Task, progress: ShareProgress) -> Decisions:
     whole = task.turn or (0, 0, *canvas.size)
     if not joined and options.crop != "auto":
         return Decisions(exposure, None, whole)
-    survey = survey_images(task.reader, images, canvas, min(plan.workers, _READERS), _part_of(progress, 0.0, 0.7))
+    survey = survey_images(task.reader, images, canvas, min(plan.workers, _READERS))
     if joined and method == "exif":
         exposure, said = exposure_by_metadata(images, task.reader.samples[0])
         messages.append(said)
     elif joined and method != "none":
         exposure = estimate_exposure(survey, images, method)
     if joined and options.seam != "none":
-        seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
+        seams = find_seams(survey, exposure, options.seam == "graphcut")
         quality = survey.seam_quality(seams.labels)
         if canvas.period is not None:
             seams = seams.repeated(round(canvas.period))
@@ -180,8 +172,3 @@ def _unwidened(canvas: Canvas) -> Box | None:
     (width, height), turn = canvas.size, round(canvas.period)
     left = (width - turn) // 2
     return left, 0, left + turn, height
-
-
-def _part_of(progress: ShareProgress, start: float, stop: float) -> ShareProgress:
-    """A progress that fills a part of another."""
-    return lambda share: progress(start + (stop - start) * share)

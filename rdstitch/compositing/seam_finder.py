@@ -19,7 +19,6 @@ from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import border_weight, locate
 from rdstitch.io.reduction import block_mean
-from rdstitch.system.progress import ShareProgress, unheard
 
 NO_OWNER = -1
 
@@ -98,7 +97,7 @@ class SeamMap:
         return self.labels[np.ix_(rows, columns)]
 
 
-def find_seams(survey: Survey, exposure: Exposure, graphcut: bool, progress: ShareProgress = unheard) -> SeamMap:
+def find_seams(survey: Survey, exposure: Exposure, graphcut: bool) -> SeamMap:
     """Owner of every pixel.
 
     Seams avoid what differs but for exposure, or, without ``graphcut``, run where borders are equally far.
@@ -126,7 +125,6 @@ def find_seams(survey: Survey, exposure: Exposure, graphcut: bool, progress: Sha
                 cv2.copyTo(pixels, won.view(np.uint8), composite[cut])
             labels[cut][won] = index
             weights[cut][won] = weight[won]
-        progress((index + 1) / len(survey.tiles))
     return SeamMap(labels, survey.factor)
 
 

@@ -17,7 +17,6 @@ from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, l
 from rdstitch.compositing.source_images import ImageReader, LoadedImage, PlacedImage
 from rdstitch.compositing.warp import Warp, locate, plan_warps, sample, sample_opacity
 from rdstitch.io.reduction import mean_of_channels
-from rdstitch.system.progress import ShareProgress, unheard
 
 _MAX_IMAGE = 200_000
 _MAX_TOTAL = 16_000_000  # pixels of one image and of all on the reduced canvas; OpenCV finds seams at 100,000
@@ -79,24 +78,15 @@ def survey_factor(canvas: Canvas) -> int:
     return factor
 
 
-def survey_images(
-    reader: ImageReader,
-    images: Sequence[PlacedImage],
-    canvas: Canvas,
-    workers: int = 1,
-    progress: ShareProgress = unheard,
-) -> Survey:
+def survey_images(reader: ImageReader, images: Sequence[PlacedImage], canvas: Canvas, workers: int = 1) -> Survey:
     """Read every image once, ``workers`` at a time, and lay it, small, on the reduced canvas."""
     factor = survey_factor(canvas)
     small = canvas.reduced(factor)
     warps = tuple(plan_warps(images, small))
     enlarged = factor / seen_reduction(canvas, [warp.shrink / factor for warp in warps])
-    tiles = []
     with ThreadPoolExecutor(workers) as pool:
-        for tile in pool.map(partial(_survey_tile, reader, enlarged), range(len(warps)), warps):
-            tiles.append(tile)
-            progress(len(tiles) / len(warps))
-    return Survey(factor, small, warps, tuple(tiles), enlarged)
+        tiles = tuple(pool.map(partial(_survey_tile, reader, enlarged), range(len(warps)), warps))
+    return Survey(factor, small, warps, tiles, enlarged)
 
 
 def seen_reduction(canvas: Canvas, shrinks: Sequence[float]) -> float:

@@ -186,11 +186,11 @@ def _metres(value: float) -> str:
 def world_file_paths(image: str | Path) -> tuple[Path, ...]:
     """The world file, and the coordinate system as .prj, of an image; none where its own format has a place for both.
 
-    A Deep Zoom image has none either: nothing that shows it would read them.
+    Deep Zoom images and OME-Zarr have none either: nothing that shows them would read it.
     """
     file = Path(image)
     kind = file.suffix.lower()
-    if kind in (".tif", ".tiff", ".dzi"):
+    if kind in (".tif", ".tiff", ".dzi", ".zarr"):
         return ()
     return file.with_suffix(f"{kind[:2]}{kind[-1]}w"), file.with_suffix(".prj")
 

@@ -15,7 +15,7 @@ class DecodedImageCache:
     """
 
     def __init__(self, room: int = _CAPACITY) -> None:
-        self._room = room
+        self._capacity = self._room = room
         self._held: dict[Hashable, DecodedImage] = {}
         self._lock = Lock()
 
@@ -37,9 +37,9 @@ class DecodedImageCache:
     def clear(self) -> None:
         """Let go of all that is left."""
         with self._lock:
-            self._room += sum(image.nbytes for image in self._held.values())
             self._held.clear()
+            self._room = self._capacity
 
     def __reduce__(self) -> tuple[type["DecodedImageCache"], tuple[int]]:
         """Copies and other processes get an empty one."""
-        return DecodedImageCache, (self._room,)
+        return DecodedImageCache, (self._capacity,)

@@ -24,7 +24,7 @@ class InputGuard:
     def __init__(self, strict: bool = False) -> None:
         self._strict = strict
         self._stamps: dict[Path, _Stamp | None] = {}
-        self._damaged: dict[Path, str] = {}
+        self.damaged: dict[Path, str] = {}  # files of which parts may be wrong, and why
         self.unreadable: dict[Path, str] = {}  # files that were left out, and why
 
     @contextmanager
@@ -47,12 +47,12 @@ class InputGuard:
         reason = f"is damaged, and parts of it may be wrong ({image.damage}); copy it again from its source"
         if self._strict:
             raise InputError(f"{path}: {reason}")
-        self._damaged[path] = reason
+        self.damaged[path] = reason
 
     @property
     def messages(self) -> list[Message]:
         """What the user should know of the files."""
-        return [Message(self._damaged[path], (str(path),), code="damaged") for path in sorted(self._damaged)]
+        return [Message(self.damaged[path], (str(path),), code="damaged") for path in sorted(self.damaged)]
 
     @property
     def complaints(self) -> list[Message]:
@@ -66,7 +66,7 @@ class InputGuard:
         known = [path for path in paths if path in self._stamps]
         return (
             {path: self._stamps[path] for path in known},
-            {path: self._damaged[path] for path in known if path in self._damaged},
+            {path: self.damaged[path] for path in known if path in self.damaged},
         )
 
     def learn(self, notes: GuardNotes) -> None:
@@ -74,7 +74,7 @@ class InputGuard:
         stamps, damaged = notes
         for path, stamp in stamps.items():
             self._note(path, stamp)
-        self._damaged |= damaged
+        self.damaged |= damaged
 
     def __reduce__(self) -> tuple[type["InputGuard"], tuple[bool]]:
         """Copies and other processes begin anew."""

@@ -201,15 +201,16 @@ def with_ground_control(
     text = read_text(file)
     first, _, rest = text.partition("\n")
     system = NamedSystem.named_by(first)
-    header = next((line for line in (rest if system else text).splitlines() if line.strip()), "")
+    body = f"\n{rest}" if system else text  # lines keep their numbers
+    rows: Iterable[Row]
+    header = next((line for line in body.splitlines() if line.strip()), "")
     if re.match(r"\W*[A-Za-z_ ./()]+[,;\t]", header):
-        rows = csv_rows(f"\n{rest}" if system else text, str(file), _CONTROL, _CONTROL_WANTED, _UNITS)
-        rows = [replace(row, values={**row.values, "name": row.image}) for row in rows]
-        geographic = any("latitude" in row.values for row in rows)
-        code = WGS84 if geographic else epsg
-        system = system or (None if code is None else NamedSystem(f"EPSG:{code}", code))
+        listed = csv_rows(body, str(file), _CONTROL, _CONTROL_WANTED, _UNITS)
+        rows = [replace(row, values={**row.values, "name": row.image}) for row in listed]
+        epsg = WGS84 if any("latitude" in row.values for row in listed) else epsg
     else:
-        rows = list(_opendronemap(text, str(file)))
+        rows = _opendronemap(body, str(file))
+    system = system or (None if epsg is None else NamedSystem(f"EPSG:{epsg}", epsg))
     if system is None:
         raise InputError(
             f"{file}: line 1: expected a coordinate system like EPSG:32632 or WGS84 UTM 32N; or give --crs"
@@ -239,8 +240,8 @@ def with_ground_control(
 
 
 def _opendronemap(text: str, file: str) -> Iterator[Row]:
-    """The lines of a ``gcp_list.txt`` after its first; what follows the numbers is an image and a point."""
-    for number, line in enumerate(text.splitlines()[1:], start=2):
+    """The lines of a ``gcp_list.txt`` below its coordinate system; what follows the numbers is an image and a point."""
+    for number, line in enumerate(text.splitlines(), start=1):
         fields = line.split(maxsplit=5)
         if not fields or fields[0].startswith("#"):
             continue

@@ -16,7 +16,7 @@ from rdstitch.errors import InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.keyframes import Wanted, wanted_frames
-from rdstitch.inputs.sensor_streams import Odometry, odometry_of, yaw_of
+from rdstitch.inputs.odometry import Odometry, odometry_of, yaw_of
 from rdstitch.io.video import write_frame
 from rdstitch.system.file_access import read_beginning
 

@@ -43,7 +43,7 @@ class Source:
     mask: Path | None = None  # image that is dark where this one does not count
     mask_frame: int | None = None  # how it is turned, see :func:`rdstitch.io.mask.mask_frame`
     attitude: tuple[float, float] | None = None  # (ψ, θ), radians, as a gimbal or an IMU has measured it
-    # (S, 2): the same at :data:`rdstitch.inputs.sensor_streams.DELAYS`; None where it has no times
+    # (S, 2): the same at :data:`rdstitch.inputs.delays.DELAYS`; None where it has no times
     attitude_by_delay: FloatArray | None = field(default=None, compare=False, repr=False)
     # its number and time in the sequence; the pixels, where they are no file
     frame: Frame | None = field(default=None, compare=False, repr=False)

@@ -21,11 +21,14 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
+from math import isfinite
 from typing import Any
 
 from rdstitch.errors import InputError
 from rdstitch.system.file_access import canonical_text
 from rdstitch.system.records import parse_json
+
+IMAGE_NAMES, TIME_NAMES = "name filename file image imagename", "timestamp time stamp"  # of columns
 
 _DELIMITERS = ",;\t"
 _HEADING = re.compile(r"(?:.*:)?([^\[(]*)(?:[\[(]([^\])]*)[\])]?.*)?", re.DOTALL)
@@ -80,6 +83,14 @@ class Row:
             raise InputError(f"{self.where}: '{text}' could be two numbers; write it without a comma")
         value = readings.get(self.decimal or ".", next(iter(readings.values()), None))
         return value if value is not None and abs(value) < float("inf") else None
+
+
+def is_number(text: str) -> bool:
+    """Whether it is a number in the notation of programs."""
+    try:
+        return isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def image_name(text: str) -> str:

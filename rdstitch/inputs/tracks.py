@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.errors import InputError
-from rdstitch.inputs.sensor_streams import timestamps_of
 from rdstitch.inputs.source import Source
+from rdstitch.inputs.times import timestamps_of
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.system.records import parse_xml
 

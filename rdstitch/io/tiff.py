@@ -297,7 +297,7 @@ def _even(length: int) -> int:
     return length + length % 2
 
 
-def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip]) -> None:
+def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
     """Write an OME-TIFF file with a pyramid; what no image covers is 0.
 
     Channels become pages; those of a colour image stay together.
@@ -342,6 +342,8 @@ def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip]) -> None:
                     if number
                     else {"axes": "CYX" if apart else "YXS", "UUID": f"urn:uuid:{identity}", **units, **names},
                     software="rdstitch",
+                    iccprofile=None if number else layout.metadata.icc_profile or None,
+                    extratags=[] if number else [*_copied_tags(layout.metadata), *extra_tags],
                 )
 
 

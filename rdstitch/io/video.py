@@ -65,7 +65,8 @@ def opened_capture(source: str | int) -> Iterator[cv2.VideoCapture]:
     """A video, stream or camera, whether it can be opened or not, while neither OpenCV nor FFmpeg logs anything."""
     with silent_opencv():
         # What OpenCV gives to FFmpeg as its level when it loads it, once.
-        unset = os.environ.setdefault(_FFMPEG_LEVEL, _FFMPEG_QUIET) is _FFMPEG_QUIET
+        unset = _FFMPEG_LEVEL not in os.environ
+        os.environ.setdefault(_FFMPEG_LEVEL, _FFMPEG_QUIET)
         try:
             capture = cv2.VideoCapture(source)
         finally:

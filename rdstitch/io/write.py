@@ -100,7 +100,7 @@ def write_strips(
     else:
         with outputs.writing(file) as staged:
             if file.name.lower().endswith(OME_SUFFIXES):
-                write_ome_tiff(staged, layout, checked)
+                write_ome_tiff(staged, layout, checked, extra_tags)
             else:
                 _write_file(staged, suffix, layout, checked, extra_tags)
     with naming(file):

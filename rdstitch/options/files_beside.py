@@ -40,7 +40,7 @@ class FilesBeside:
         "and the sidecar has them too: the first image is the reference. map: easting, northing and height in metres, "
         "where the output is georeferenced.",
     )
-    height: Height = 1.0
+    height: Height = None
     command: str = ""  # the command line, for the report
     timer: StageTimer = field(default_factory=StageTimer)  # the ``progress`` of the recipe, for the report
 

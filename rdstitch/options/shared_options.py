@@ -37,7 +37,14 @@ Workers = Annotated[
 Overwrite = Annotated[bool, Option("Replace existing output files.")]
 Strict = Annotated[bool, Option("Fail with status 5 when an image is left out.")]
 DryRun = Annotated[bool, Option("Print size, memory and time of compositing; write nothing.")]
-Height = Annotated[float, Option("Height of the first frame above the plane; positions have its unit.", "H", above=0.0)]
+Height = Annotated[
+    float | None,
+    Option(
+        "Height of the first frame above the plane, whose unit positions have; else they are in heights.",
+        "H",
+        above=0.0,
+    ),
+]
 Distortion = Annotated[
     float | None, Option("Known λ (half-diagonal frame); it is not estimated.", "L", "--lambda", above=-1.0, below=1.0)
 ]

@@ -17,7 +17,7 @@ from rdstitch.system.machine import processor_count
 
 if TYPE_CHECKING:
     from rdstitch.geometry.camera import Camera
-    from rdstitch.inputs.sensor_streams import Odometry
+    from rdstitch.inputs.odometry import Odometry
 
 _SELECT_MODEL_BELOW = 50
 """Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""

@@ -99,9 +99,8 @@ def _without_damage(registration: Registration, aligner: Aligner) -> Registratio
     by more, as if something moved.
     """
     used = registration.alignment.used
-    index = {str(source.path): k for k, source in enumerate(registration.sources)}
-    reported = (message.images[0] for message in registration.sources[0].guard.messages)
-    damaged = [index[path] for path in reported if path in index and used[index[path]]]
+    known = registration.sources[0].guard.damaged  # all have one guard
+    damaged = [k for k, source in enumerate(registration.sources) if source.path in known and used[k]]
     if not damaged:
         return None
     reason = Message("is damaged, and all others fit better without it; copy it again from its source")

@@ -10,9 +10,10 @@ from rdstitch.alignment.odometry import bridged, scaled_by_odometry
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, Named
+from rdstitch.inputs.odometry import Odometry, read_odometry
 from rdstitch.inputs.rosbag import is_bag, odometry_in_bag
-from rdstitch.inputs.sensor_streams import Odometry, read_odometry, timestamps_of
 from rdstitch.inputs.source import Source
+from rdstitch.inputs.times import timestamps_of
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message, shortened
 

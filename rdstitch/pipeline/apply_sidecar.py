@@ -22,10 +22,11 @@ from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.band_lens import BandLens, band_lens
-from rdstitch.pipeline.compose import check_world_files, compose_images, image_files, plainly_viewed, write_page
+from rdstitch.pipeline.compose import Layout, check_world_files, compose_images, image_files, plainly_viewed, write_page
 from rdstitch.pipeline.counterparts import MatchedBy, counterparts, registered_files
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
+from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.straighten import turned_anew
 from rdstitch.results.messages import Message, told_once
 from rdstitch.results.messages import left_out as left_out_message
@@ -38,6 +39,7 @@ from rdstitch.sidecar.write import (
     lens_fields,
     output_geometry,
     plain,
+    seams_fields,
     to_output,
     versions,
 )
@@ -62,11 +64,8 @@ class Recomposition(OutputImage):
         Images that the registration used and that are not in the output, by their number, with the reason.
     placed : PlacedImages
         Those that are in the output.
-    composite_options : CompositeOptions
     messages : tuple of Message
         What the user should know of the compositing, and of the sidecar.
-    channel_order : str
-        Of :attr:`image`: "bgr" or "rgb".
     """
 
     saved: SavedRegistration
@@ -74,21 +73,13 @@ class Recomposition(OutputImage):
     matched: MatchedBy
     left_out: Mapping[int, Message]
     placed: PlacedImages
-    composite_options: CompositeOptions
     messages: tuple[Message, ...] = ()
-    channel_order: ChannelOrder = "bgr"
-
-    @property
-    def image_order(self) -> ChannelOrder:
-        """Order of the channels of :attr:`image`."""
-        return self.channel_order
 
     @property
     def summary(self) -> str:
         """What was made, and of how many images, in one line."""
-        name, (width, height) = "" if self.output is None else f"{self.output}: ", self.canvas.size
         used = sum(source is not None for source in self.sources)
-        return f"{name}{width} x {height} pixels, {used} of {used + len(self.left_out)} images"
+        return f"{super().summary}, {used} of {used + len(self.left_out)} images"
 
 
 def applied_sidecar(result: Recomposition) -> dict[str, Any]:
@@ -124,9 +115,10 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
             **output_geometry(result.canvas, turned=result.saved.turned),
             "georeference": georeference_fields(result.georeference, result.not_georeferenced),
         },
+        "seams": seams_fields(result.seams, [source.name for source in result.placed.sources]),
         "images": entries,
         "pairs": [],
-        "options": {**then["options"], "composite": result.composite_options},
+        "options": {**then["options"], "composite": result.options.composite},
         "versions": versions(),
         "applied": {"sidecar": str(result.saved.path), "matched": result.matched},
     }
@@ -244,7 +236,7 @@ def apply(
             check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
         given_frames: Sequence[Frame] = listed.frames
         if (stage := saved.content.get("stage")) is not None:
-            given_frames, _, said = tile_frames(given_frames, stage["z"], stage["time"])
+            given_frames, _, said = tile_frames(given_frames, stage.get("z"), stage.get("time"))
             doubts += said
         chosen, matched, said = counterparts(saved, given_frames, match)
         doubts += said
@@ -270,30 +262,25 @@ def apply(
         doubts += said
         if (grid := _same_grid(saved, used, options)) is not None:
             placed, options = replace(placed, grid=grid), replace(options, crop="none")
-        composed = compose_images(
-            placed,
-            output,
-            options,
-            StitchOptions(workers=workers).threads,
-            progress,
-            outputs=outputs,
-            dry_run=dry_run,
+        reference = saved.images[saved.reference].name
+        settings = StitchOptions(
+            composite=options, reference=reference, channel_order=channel_order, workers=workers, dry_run=dry_run
         )
+        run = Run(settings, output, progress=progress)
+        composed, said = compose_images(Layout.of(placed, options), run, outputs)
         result = Recomposition(
             saved=saved,
-            sources=tuple(sources),
+            sources=tuple(map(used.get, range(len(sources)))),
             matched=matched,
             left_out=left_out,
             placed=placed,
-            composite_options=options,
-            messages=(*doubts, *listed.messages, *guard.messages, *composed.messages),
-            channel_order=channel_order,
-            **composed.output_fields,
+            messages=(*doubts, *listed.messages, *guard.messages, *said),
+            **composed.fields,
         )
         if dry_run or output is None:
             return result
-        page = partial(plainly_viewed, composed.canvas, [source.name for source in used.values()])
-        result = replace(result, messages=(*result.messages, *write_page(outputs, output, composed, page)))
+        page = partial(plainly_viewed, result.canvas, [source.name for source in used.values()])
+        result = replace(result, messages=(*result.messages, *write_page(result, outputs, page)))
         outputs.write(f"{output}.json", json_bytes(applied_sidecar(result)))
         return result
 

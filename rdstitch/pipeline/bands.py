@@ -13,6 +13,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.selection import selected
+from rdstitch.inputs.source import read_sources
 from rdstitch.io import Layout, write_strips
 from rdstitch.io.encoding import Strip
 from rdstitch.io.metadata import Metadata
@@ -44,6 +45,8 @@ def mosaic_bands(
     no number of bands have only the latter. Given are the first band, and the others, each by its own lens.
     """
     options, file = options or StitchOptions(), Path(output)
+    if options.dry_run:
+        raise ArgumentError("bands have no plan before the first of them is registered: leave out dry_run")
     files = [file.with_name(f"{file.stem}-{name}{file.suffix}") for name in bands]
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
         stack = [file] if file.suffix.lower() in (".tif", ".tiff") else []
@@ -51,6 +54,7 @@ def mosaic_bands(
         frames = selected(listed.frames, options.exclude, options.include_only)
         chosen = [_of_band(frames, pattern) for pattern in bands.values()]
         options = replace(options, exclude=(), include_only=())
+        _check_alike(dict(zip(bands, chosen, strict=True)), in_one_file=bool(stack))
         first = mosaic(chosen[0], files[0], options, progress=progress, beside=beside)
         others = tuple(
             apply(
@@ -71,6 +75,26 @@ def mosaic_bands(
     return first, others
 
 
+def _check_alike(bands: Mapping[str, list[Frame]], *, in_one_file: bool) -> None:
+    """Refuse before long work bands whose images have other sizes than the first's, or which one file cannot hold."""
+    kinds = {}
+    for name, frames in bands.items():
+        read = [source.metadata for source in read_sources(frames, skip_bad=True)[0]]
+        bits = {next(depth for depth in (8, 16, 64) if one.bit_depth <= depth) for one in read}
+        kinds[name] = {"{} x {} pixels".format(*one.size) for one in read}, {f"{depth} bits" for depth in bits}
+    first = next(iter(bands))
+    for name, (sizes, depths) in kinds.items():
+        if sizes != kinds[first][0]:
+            reason, differing = "their lenses are compared at one size", (kinds[first][0], sizes)
+        elif in_one_file and depths != kinds[first][1]:
+            reason, differing = "one TIFF cannot hold both", (kinds[first][1], depths)
+        else:
+            continue
+        one, other = (", ".join(sorted(values)) for values in differing)
+        text = f"bands: images of {first} have {one}, those of {name} {other}, but {reason}"
+        raise ArgumentError(f"{text}; convert the images of one of them, or stitch them separately")
+
+
 def _write_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, *, overwrite: bool) -> None:
     """One file of all bands; what one of them does not show is transparent."""
 
@@ -80,14 +104,12 @@ def _write_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, *, 
 
     streams = [written_strips(path) for path in bands.values()]
     heads = [next(stream) for stream in streams]
-    if len(kinds := {samples.dtype for samples, _ in heads}) > 1:
-        raise ArgumentError(f"bands: some have {' and others '.join(sorted(map(str, kinds)))} samples; give each alone")
     names: list[str] = []
     for name, (samples, _) in zip(bands, heads, strict=True):
         count = samples.shape[2]
         names += [name] if count == 1 else [f"{name} {k}" for k in range(1, count + 1)]
     metadata = Metadata(first.canvas.size, channels=len(names), planes=True, channel_names=tuple(names))
-    layout = Layout(first.canvas.size, len(names), kinds.pop(), transparent=True, metadata=metadata)
+    layout = Layout(first.canvas.size, len(names), heads[0][0].dtype, transparent=True, metadata=metadata)
     tags = [] if first.georeference is None else first.georeference.tiff_tags()
     strips = map(joined, chain([heads], zip(*streams, strict=True)))
     with Outputs(overwrite) as outputs:

@@ -13,6 +13,7 @@ import numpy as np
 from rdstitch.alignment.result import links_by_image
 from rdstitch.compositing import (
     Canvas,
+    Composite,
     CompositeOptions,
     CompositePlan,
     Decisions,
@@ -33,30 +34,23 @@ from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
+from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.options.upright_options import Corners
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages
+from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened
 from rdstitch.results.stitch_result import OutputImage, StitchResult
 from rdstitch.system.cache import Cache, Stored
 from rdstitch.system.outputs import Outputs, check_outputs, text_bytes
 from rdstitch.system.process_memory import return_freed_memory
-from rdstitch.system.progress import Progress
 from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
 
 # Reduction of an image of which only the kind of its samples is wanted.
 _PROBE_REDUCTION = 8
 _VISIBLE_CUT = 0.02  # share of the images that is cut away, from which on it is said
-
-
-@dataclass(frozen=True, repr=False, kw_only=True)
-class Composed(OutputImage):
-    """Images put together, or the plan of doing so."""
-
-    messages: tuple[Message, ...]  # what the user should know, such as why nothing was cropped
-    written: FileComposite | None = None  # the image in its file
 
 
 @dataclass(frozen=True)
@@ -90,26 +84,19 @@ class Layout:
 
 
 def compose_images(
-    placed: PlacedImages | Layout,
-    output: str | Path | None,
-    options: CompositeOptions,
-    threads: int,
-    progress: Progress,
-    *,
-    outputs: Outputs,
-    elsewhere: BlockRunner | None = None,
-    dry_run: bool = False,
-) -> Composed:
-    """Plan the canvas, see whether a file can hold it, and put the images on it; of a dry run the plan alone.
+    layout: Layout, run: Run, outputs: Outputs, elsewhere: BlockRunner | None = None
+) -> tuple[OutputImage, list[Message]]:
+    """See whether a file can hold the canvas, and put the images on it; of a dry run the plan alone.
 
-    Without ``output`` the image is made in memory; a file has colour profile and EXIF of the first image, and its place
-    on the Earth. ``elsewhere``: see :func:`rdstitch.compositing.compose`.
+    Without an output the image is made in memory; a file has colour profile and EXIF of the first image, and its place
+    on the Earth. ``elsewhere``: see :func:`rdstitch.compositing.compose`. With it comes what the user should know, such
+    as why nothing was cropped.
     """
     return_freed_memory()
-    layout = placed if isinstance(placed, Layout) else Layout.of(placed, options)
-    placed, canvas, images, place = layout.placed, layout.canvas, layout.images, layout.georeference
-    world_files = world_file_paths(output) if output is not None and placed.has_place else ()
-    notes = [
+    threads = run.options.threads
+    options = replace(run.options.composite, workers=threads)
+    placed, canvas, place, output = layout.placed, layout.canvas, layout.georeference, run.output
+    messages = [
         *_masked(placed),
         *place_messages(place, layout.not_georeferenced, placed),
         *_cut_away(placed, canvas, options),
@@ -118,69 +105,50 @@ def compose_images(
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)
         check_memory(output, canvas.size, options.max_memory)
-    composed = Composed(
+    composed = OutputImage(
         canvas=canvas,
+        options=run.options,
         output=None if output is None else Path(output),
         georeference=place,
         not_georeferenced=layout.not_georeferenced,
-        messages=tuple(notes),
     )
-    if dry_run:
-        return replace(composed, plan=_planned(placed, canvas, replace(options, workers=threads)))
+    if run.options.dry_run:
+        return replace(composed, plan=_planned(placed, canvas, options)), messages
     layout = layout if layout.decisions is not None else layout.decided(options, threads)
-    options = replace(options, workers=threads)
     if layout.photographs:
-        notes += seam_messages(layout.seams, [str(source.path) for source in placed.sources])
+        messages += seam_messages(layout.seams, [str(source.path) for source in placed.sources])
 
     def report(share: float) -> None:
-        progress("compositing", round(100 * share), 100)
-
-    if output is None:
-        composite = compose(images, canvas, options, report, elsewhere, layout.decisions)
-        place, messages = moved(place, canvas, composite.canvas), (*notes, *composite.messages)
-        composed = replace(composed, canvas=composite.canvas, composite=composite, seams=layout.seams)
-        return replace(composed, georeference=place, messages=messages)
+        run.progress("compositing", round(100 * share), 100)
 
     def tags(final: Canvas) -> list[ExtraTag]:
         on_final = moved(place, canvas, final)
         return [] if on_final is None else on_final.tiff_tags()
 
-    metadata = placed.sources[0].metadata.of_composite()
-    if metadata.pixel_size is not None:
-        scaled = None if options.max_size is not None else metadata.pixel_size / options.scale
-        metadata = replace(metadata, pixel_size=scaled)
-    written = compose_to_file(
-        output,
-        images,
-        canvas,
-        options,
-        report,
-        elsewhere,
-        layout.decisions,
-        metadata=metadata,
-        extra_tags=tags,
-        outputs=outputs,
-    )
-    place = moved(place, canvas, written.canvas)
-    beside = []
-    if place is not None and world_files:
-        beside = outputs.attempt(world_files[0], partial(_write_world_files, outputs, world_files, place))
-    messages = (
-        *notes,
-        *written.messages,
-        *_profile_lost(placed.sources[0], Path(output)),
-        *_profiles_differ(placed.sources),
-        *beside,
-    )
-    return replace(
-        composed,
-        canvas=written.canvas,
-        messages=messages,
-        fingerprint=written.fingerprint,
-        written=written,
-        georeference=place,
-        seams=layout.seams,
-    )
+    how = (layout.images, canvas, options, report, elsewhere, layout.decisions)
+    made: Composite | FileComposite
+    if output is None:
+        made = composite = compose(*how)
+        composed = replace(composed, composite=composite)
+    else:
+        metadata = _metadata(placed.sources[0], options)
+        made = written = compose_to_file(output, *how, metadata=metadata, extra_tags=tags, outputs=outputs)
+        composed = replace(composed, written=written)
+    place = moved(place, canvas, made.canvas)
+    messages += made.messages
+    if output is not None:
+        messages += [*_profile_lost(placed.sources[0], Path(output)), *_profiles_differ(placed.sources)]
+        if place is not None and (files := world_file_paths(output) if placed.has_place else ()):
+            messages += outputs.attempt(files[0], partial(_write_world_files, outputs, files, place))
+    return replace(composed, canvas=made.canvas, georeference=place, seams=layout.seams), messages
+
+
+def _metadata(source: Source, options: CompositeOptions) -> Metadata:
+    """That of the output, as of its first image; its pixels have another size where they were scaled."""
+    metadata = source.metadata.of_composite()
+    if metadata.pixel_size is None:
+        return metadata
+    return replace(metadata, pixel_size=None if options.max_size is not None else metadata.pixel_size / options.scale)
 
 
 def _cut_away(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> list[Message]:
@@ -315,18 +283,15 @@ def compose_block(
     return strips, sources[0].guard.notes_on([source.path for source in sources]) if sources else ({}, {})
 
 
-def write_page(
-    outputs: Outputs, output: str | Path, composed: Composed, images: Callable[[], Sequence[ViewedImage]]
-) -> list[Message]:
+def write_page(result: OutputImage, outputs: Outputs, images: Callable[[], Sequence[ViewedImage]]) -> list[Message]:
     """Write the page of a ``.dzi`` output; others have none. A warning, where it cannot be written."""
-    page, written = viewer_path(output), composed.written
-    if page is None or written is None:
+    output, written = result.output, result.written
+    if output is None or written is None or (page := viewer_path(output)) is None:
         return []
-
-    gsd = None if composed.georeference is None else composed.georeference.gsd
+    gsd = None if result.georeference is None else result.georeference.gsd
 
     def stage() -> None:
-        text = viewer_page(output, composed.canvas.size, images(), written.seams, written.origin, gsd)
+        text = viewer_page(output, result.canvas.size, images(), written.seams, written.origin, gsd)
         # Names of files need not be UTF-8.
         outputs.write(page, text.encode("utf-8", "backslashreplace"))
 

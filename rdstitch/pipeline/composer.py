@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.tables import CompositeTables
 from rdstitch.inputs.frame import in_order
-from rdstitch.options.composite_options import CompositeOptions, Interpolation
+from rdstitch.options.composite_options import Interpolation
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.opencv_state import one_opencv_thread
@@ -55,10 +55,10 @@ class Composer:
 
     @one_opencv_thread()
     def __init__(self, result: "StitchResult | Recomposition", interpolation: Interpolation = "linear") -> None:
-        placed, options = placed_by(result)
-        images, options = placed.images(result.canvas.near), replace(options, interpolation=interpolation)
+        placed, options = placed_by(result), replace(result.options.composite, interpolation=interpolation)
+        images = placed.images(result.canvas.near)
         self.names = tuple(source.name for source in placed.sources)
-        self._tables, self._order = CompositeTables.of(images, result.canvas, options), result.image_order
+        self._tables, self._order = CompositeTables.of(images, result.canvas, options), result.options.channel_order
         self.alpha = self._tables.alpha
 
     @one_opencv_thread()
@@ -81,9 +81,8 @@ class Composer:
         )
 
 
-def placed_by(result: "StitchResult | Recomposition") -> tuple[PlacedImages, CompositeOptions]:
-    """The images of a result in their places, and how they are put together."""
+def placed_by(result: "StitchResult | Recomposition") -> PlacedImages:
+    """The images of a result in their places."""
     if isinstance(result, StitchResult):
-        placed = PlacedImages.of(result.registration, result.local_alignment.fields or None)
-        return placed, result.options.composite
-    return result.placed, result.composite_options
+        return PlacedImages.of(result.registration, result.local_alignment.fields or None)
+    return result.placed

@@ -21,19 +21,13 @@ from rdstitch.executors import ProcessExecutor
 from rdstitch.export.trajectory_files import covariance_in_frame, in_frame, ros_covariance
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
+from rdstitch.inputs.attitudes import XMP, with_attitudes
+from rdstitch.inputs.delays import DELAYS
 from rdstitch.inputs.frame import Frame, Image, as_inputs
+from rdstitch.inputs.odometry import BodyPose, Odometry, read_odometry
 from rdstitch.inputs.selection import is_selected, mask_of, with_masks
-from rdstitch.inputs.sensor_streams import (
-    DELAYS,
-    XMP,
-    BodyPose,
-    Odometry,
-    read_odometry,
-    time_of,
-    timestamps_of,
-    with_attitudes,
-)
 from rdstitch.inputs.source import Source
+from rdstitch.inputs.times import time_of, timestamps_of
 from rdstitch.io.opening import check_readable
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
@@ -55,22 +49,22 @@ class FollowedPoses:
 
     Attributes
     ----------
-    height : float
-        Of the first keyframe above the plane, in the unit that positions shall have.
+    height : float, optional
+        Of the first keyframe above the plane, in the unit that positions shall have; else as odometry says, or 1.
     frame : str
         "enu", "ros" or "camera", see :mod:`rdstitch.export.trajectory_files`.
     """
 
-    height: float = 1.0
+    height: float | None = None
     frame: TrajectoryFrame = "enu"
 
     def unit(self, tracked: Tracked) -> float:
-        """How long the height of the first keyframe is: as given, or, where that is one, as odometry says."""
-        return tracked.unit if self.height == 1.0 and math.isfinite(tracked.unit) else self.height
+        """How long the height of the first keyframe is: as given, else as odometry says, else one."""
+        return self.height or (tracked.unit if math.isfinite(tracked.unit) else 1.0)
 
     def length_std(self, tracked: Tracked) -> float:
         """Relative standard deviation that all lengths share."""
-        return tracked.length_std if self.unit(tracked) == self.height else tracked.unit_std
+        return tracked.length_std if self.height or not math.isfinite(tracked.unit) else tracked.unit_std
 
     def fields(self, tracked: Tracked | None) -> dict[str, float | None]:
         """x, y, yaw and height."""

@@ -1,13 +1,13 @@
 """All files of a run: named and checked before its work, written with its result."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
 from rdstitch.options.files_beside import FilesBeside
-from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import image_files
 from rdstitch.pipeline.result_files import layer_files, make_folder, poses_file, write_layers
+from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
@@ -35,7 +35,7 @@ def stage_beside(beside: FilesBeside, outputs: Outputs, result: StitchResult | R
     if isinstance(result, StitchResult) and result.plan is None:
         how = {"whole": beside.whole_layers, "overwrite": result.options.overwrite}
         attempt(beside.hugin_project, lambda file: _hugin_project(file, outputs, result))
-        table = partial(poses_file, result, frame=beside.frame, height=beside.height)
+        table = partial(poses_file, result, frame=beside.frame, height=beside.height or 1.0)
         attempt(beside.poses, lambda file: outputs.write(file, text_bytes(table(file))))
         attempt(beside.layers, lambda folder: write_layers(result, folder, **how, outputs=outputs))
     return failed
@@ -63,18 +63,23 @@ def _hugin_project(file: Path, outputs: Outputs, result: StitchResult) -> None:
 
 
 def check_run(
-    images: Sequence[str | Path],
-    options: StitchOptions,
-    beside: FilesBeside,
+    run: Run,
     inputs: Iterable[str | Path],
     names: Iterable[str],
+    further: Iterable[Path] = (),
+    others: Iterable[Path] = (),
 ) -> None:
-    """Find out before long work whether all that images of these names become can be written, over nothing read."""
+    """Find out before long work whether all that images of these names become can be written, over nothing read.
+
+    ``further`` are images that may follow, ``others`` what else is written.
+    """
+    options = run.options
+    images = [*([] if run.output is None else [run.output]), *further]
     files = [file for image in images for file in image_files(check_suffix(image))]
     if options.save_camera is not None:
         from rdstitch.camera_files import format_of
 
         format_of(options.save_camera, options.camera_format)
         files.append(options.save_camera)
-    files += files_beside(beside, names)
+    files += [*others, *files_beside(run.beside, names)]
     check_outputs(files, options.overwrite, [*inputs, *options.files])

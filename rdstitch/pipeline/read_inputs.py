@@ -5,13 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import natural_key
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.positions import with_ground_control, with_positions
 from rdstitch.inputs.rosbag import camera_in_bag, is_bag
 from rdstitch.inputs.selection import selected, with_masks
-from rdstitch.inputs.sensor_streams import with_attitudes
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.flat_field import read_flat_field
 from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO

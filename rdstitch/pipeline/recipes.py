@@ -16,8 +16,8 @@ from rdstitch.export.trajectory_files import WRITERS, frame_of, has_times, path_
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.selection import selected
-from rdstitch.inputs.sensor_streams import timestamps_of, with_times
 from rdstitch.inputs.source import Source
+from rdstitch.inputs.times import timestamps_of, with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty
@@ -28,6 +28,7 @@ from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.output_plan import check_run, report_refused, stage_beside
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag
 from rdstitch.pipeline.register import register
+from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, told_once
 from rdstitch.results.registration import Registration
@@ -87,7 +88,7 @@ def pano(
     >>> result.image.shape[2], result.ok
     (3, True)
     """
-    return _stitch(inputs, output, options or StitchOptions(), every, progress, beside, pano=True)
+    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, progress, Purpose.PANO))
 
 
 @one_opencv_thread()
@@ -131,7 +132,7 @@ def mosaic(
     >>> result.output.name, result.registration.alignment.used.all()
     ('small.tif', np.True_)
     """
-    return _stitch(inputs, output, options or StitchOptions(), every, progress, beside, pano=False)
+    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, progress))
 
 
 @one_opencv_thread()
@@ -181,13 +182,14 @@ def mosaic_blocks(
         options = replace(options, timestamps=None)
         frames = selected(listed.frames, options.exclude, options.include_only)
         names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
+        run = Run(options, beside=beside, progress=progress)
         further = names[1:]
         found = replace(listed, outputs=[], notes=())
         while len(frames) > 1 or not results:
-            name = names[len(results)]
+            run = replace(run, output=names[len(results)])
             try:
                 with outputs.together():
-                    result = _stitch_found(found, name, options, progress, beside, outputs, further=further)
+                    result = _stitch_found(found, run, outputs, further)
                 registration = result.registration
             except RdstitchError as error:
                 if not results or isinstance(error, OutputError):
@@ -205,7 +207,7 @@ def mosaic_blocks(
             frames = [frame for frame in frames if (frame.path, frame.number) not in done]
             found = replace(found, frames=frames)
             # These are of the first block, or of its reference image.
-            options, beside, further = _for_further_blocks(options), NOTHING_BESIDE, []
+            run, further = replace(run, options=_for_further_blocks(run.options), beside=NOTHING_BESIDE), []
     return (_without_blocks(results[0], results[1:], [*listed.messages, *refused]), *map(_without_blocks, results[1:]))
 
 
@@ -234,59 +236,40 @@ def _without_blocks(
     return replace(result, registration=replace(result.registration, messages=(*kept, *more)))
 
 
-def _stitch(
-    inputs: Images,
-    output: str | Path | None,
-    options: StitchOptions,
-    every: int | None,
-    progress: Progress,
-    beside: FilesBeside,
-    *,
-    pano: bool,
-) -> StitchResult:
+def _stitch(inputs: Images, every: int | None, run: Run) -> StitchResult:
     """The stages of :func:`mosaic`, and, where every image must be readable and one gives the plane, :func:`pano`."""
-    given = as_inputs(inputs, options.channel_order)
-    options, notes = with_camera_in_bag(given, options)
+    given = as_inputs(inputs, run.options.channel_order)
+    options, notes = with_camera_in_bag(given, run.options)
     with (
-        found_images(given, output=output, every=every, topic=options.topic) as listed,
+        found_images(given, output=run.output, every=every, topic=options.topic) as listed,
         Outputs(options.overwrite) as outputs,
     ):
         listed = replace(listed, notes=(*listed.notes, *notes))
-        return _stitch_found(listed, output, options, progress, beside, outputs, pano=pano)
+        return _stitch_found(listed, replace(run, options=options), outputs)
 
 
-def _stitch_found(
-    listed: FoundImages,
-    output: str | Path | None,
-    options: StitchOptions,
-    progress: Progress,
-    beside: FilesBeside,
-    outputs: Outputs,
-    *,
-    pano: bool = False,
-    further: Sequence[Path] = (),
-) -> StitchResult:
+def _stitch_found(listed: FoundImages, run: Run, outputs: Outputs, further: Sequence[Path] = ()) -> StitchResult:
     """The same of images that were found; ``further`` are images that may follow."""
-    images = [] if output is None else [output, *further]
+    options = run.options
     frames = in_lasting_order(with_times(listed.frames, options.timestamps))
     names = [frame.name for frame in selected(frames, options.exclude, options.include_only)]
-    check_run(images, options, beside, listed.files, names)
-    sources, unread = read_inputs(frames, options, skip_bad=not pano)
-    check_world_files(images, sources, options.overwrite)
+    check_run(run, listed.files, names, further)
+    sources, unread = read_inputs(frames, options, skip_bad=run.purpose is not Purpose.PANO)
+    check_world_files([*([] if run.output is None else [run.output]), *further], sources, options.overwrite)
     check_map(sources, options.composite)
-    if beside.frame == "first":
-        options = replace(options, reference=sources[0].name)
-    purpose = Purpose.PANO if pano else Purpose.MOSAIC
+    if run.beside.frame == "first":
+        run = replace(run, options=replace(options, reference=sources[0].name))
     with options.executor(len(sources)) as executor:
         known = [*unread, *listed.messages]
-        accepted = _accepted(sources, known, options, executor, progress, purpose, beside)
+        accepted = _accepted(sources, known, run, executor)
         first = accepted.alignment.used.tolist().index(True)
-        if beside.frame == "first" and accepted.alignment.reference != first:  # those before it were left out
-            options = replace(options, reference=accepted.sources[first].name)
-            accepted = _accepted(sources, known, options, executor, progress, purpose, beside)
-        progress("laying out", 0, 1)
-        chosen = choose_layout(accepted, options, aligner_of(accepted, options, purpose), pano=pano)
-        return compose_registration(chosen, executor, output, options, progress, beside, outputs)
+        if run.beside.frame == "first" and accepted.alignment.reference != first:  # those before it were left out
+            run = replace(run, options=replace(options, reference=accepted.sources[first].name))
+            accepted = _accepted(sources, known, run, executor)
+        run.progress("laying out", 0, 1)
+        aligner = aligner_of(accepted, run.options, run.purpose)
+        chosen = choose_layout(accepted, run.options, aligner, pano=run.purpose is Purpose.PANO)
+        return compose_registration(chosen, run, outputs, executor)
 
 
 @one_opencv_thread()
@@ -318,13 +301,12 @@ def calibrate(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = options or StitchOptions()
+    run = Run(options, None, beside, progress, Purpose.CALIBRATE)
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
-        check_run([], options, beside, listed.files, ())
+        check_run(run, listed.files, ())
         sources, unread = read_inputs(with_times(listed.frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
-            known = [*unread, *listed.messages]
-            accepted = _accepted(sources, known, options, executor, progress, Purpose.CALIBRATE, beside)
-            result = _finished(at_full_size(accepted))
+            result = _finished(at_full_size(_accepted(sources, [*unread, *listed.messages], run, executor)))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
         return result.with_messages(stage_beside(beside, outputs, result))
@@ -339,7 +321,7 @@ def trajectory(
     layout: TrajectoryFormat = "csv",
     timestamps: str | Path | None = None,
     plot: str | Path | None = None,
-    height: float = 1.0,
+    height: float | None = None,
     frame: TrajectoryFrame | None = None,
     every: int | None = 1,
     progress: Progress = silent,
@@ -359,8 +341,8 @@ def trajectory(
         As in ``options``.
     plot : path, optional
         SVG file to draw the path to.
-    height : float
-        Height of the first frame above the plane, metres; positions are in metres then, and in heights with 1.
+    height : float, optional
+        Height of the first frame above the plane, metres; positions are in metres then, and in heights without it.
     frame : str, optional
         "enu", "ros" or "camera": the axes of the file, see :mod:`rdstitch.export.trajectory_files`. "enu" if not given,
         but for "kitti", whose axes are the camera's, and for "bag", whose axes are those of ROS.
@@ -387,14 +369,14 @@ def trajectory(
         frames = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
         sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
-            known = [*unread, *listed.messages, *notes]
-            registration = at_full_size(_accepted(sources, known, options, executor, progress, Purpose.TRAJECTORY))
+            run = Run(options, progress=progress, purpose=Purpose.TRAJECTORY)
+            registration = at_full_size(_accepted(sources, [*unread, *listed.messages, *notes], run, executor))
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     stored = QuarterTurns.of(registration.sources).stored_alignment(registration.alignment)
-    path = Trajectory.from_alignment(stored, height)
+    path = Trajectory.from_alignment(stored, height or 1.0)
     if options.odometry is not None:
-        path, notes = along_odometry(path, sources, options.odometry, keep_unit=height != 1.0)
+        path, notes = along_odometry(path, sources, options.odometry, keep_unit=height is not None)
         registration = registration.with_messages(notes)
     path = path.labelled(
         [s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], timestamps_of(sources)
@@ -411,75 +393,49 @@ def trajectory(
             else:
                 outputs.write(output, text_bytes(WRITERS[layout](path, frame or frame_of(layout))))
         if plot is not None:
-            file, drawn = plot, path_as_svg(path, "heights" if height == 1.0 else "m")
+            file, drawn = plot, path_as_svg(path, "heights" if height is None else "m")
             failed = outputs.attempt(file, lambda: outputs.write(file, text_bytes(drawn)))
             registration = registration.with_messages(failed)
     return path, registration
 
 
-def _accepted(
-    sources: Sequence[Source],
-    known: Sequence[Message],
-    options: StitchOptions,
-    executor: Executor,
-    progress: Progress,
-    purpose: Purpose,
-    beside: FilesBeside = NOTHING_BESIDE,
-) -> Registration:
+def _accepted(sources: Sequence[Source], known: Sequence[Message], run: Run, executor: Executor) -> Registration:
     """Register and check, with what is known of the inputs already; a failure names what could not be read well.
 
     In pixels of the working size.
     """
     try:
-        registration = register(sources, options, executor, purpose=purpose, progress=progress)
-        progress("checking", 0, 1)
-        return accept(registration.with_messages(known), options, purpose)
+        registration = register(sources, run.options, executor, purpose=run.purpose, progress=run.progress)
+        run.progress("checking", 0, 1)
+        return accept(registration.with_messages(known), run.options, run.purpose)
     except RegistrationError as error:
         unread = [message for message in known if message.severity == "left out"]
         told = [str(replace(message, code="")) for message in told_once([*unread, *sources[0].guard.complaints])]
         error.args = ("; ".join([str(error), *told]),)
         if isinstance(error, RefusedError):
-            report_refused(beside, error.registration)
+            report_refused(run.beside, error.registration)
         raise
 
 
-def compose_registration(
-    chosen: LaidOut,
-    executor: Executor,
-    output: str | Path | None,
-    options: StitchOptions,
-    progress: Progress,
-    beside: FilesBeside,
-    outputs: Outputs,
-) -> StitchResult:
+def compose_registration(chosen: LaidOut, run: Run, outputs: Outputs, executor: Executor) -> StitchResult:
     """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
-    registration = chosen.registration
-    composed = compose_images(
-        chosen.layout,
-        output,
-        options.composite,
-        options.threads,
-        progress,
-        outputs=outputs,
-        elsewhere=blocks_on(executor, chosen.layout.placed.sources, options.cache),
-        dry_run=options.dry_run,
-    )
+    registration, options = chosen.registration, run.options
+    elsewhere = blocks_on(executor, chosen.layout.placed.sources, options.cache)
+    composed, messages = compose_images(chosen.layout, run, outputs, elsewhere)
     result = StitchResult(
-        registration=_finished(registration).with_messages((*chosen.messages, *composed.messages)),
-        options=options.for_images(len(registration.sources)),
+        registration=_finished(registration).with_messages((*chosen.messages, *messages)),
         local_alignment=chosen.local,
-        **composed.output_fields,
+        **composed.fields | {"options": options.for_images(len(registration.sources))},
     )
     if options.dry_run:
         return result
     failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, options, outputs))
-    if output is not None:
-        failed += write_page(outputs, output, composed, partial(viewed_images, result))
+    failed += write_page(result, outputs, partial(viewed_images, result))
     result = result.with_messages(failed)
-    result = result.with_messages(stage_beside(beside, outputs, result))
-    if output is not None:
+    result = result.with_messages(stage_beside(run.beside, outputs, result))
+    if run.output is not None:
         # Last: whoever finds it finds what it belongs to.
-        outputs.write(f"{output}.json", json_bytes(sidecar(result)))
+        outputs.write(f"{run.output}.json", json_bytes(sidecar(result)))
     return result
 
 

@@ -17,7 +17,7 @@ from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.poses_files import geo_of_opendronemap, images_of_colmap
 from rdstitch.export.trajectory_files import as_csv
-from rdstitch.inputs.sensor_streams import timestamps_of
+from rdstitch.inputs.times import timestamps_of
 from rdstitch.io.tiff import write_cropped_tiff
 from rdstitch.pipeline.composer import placed_by
 from rdstitch.results.stitch_result import StitchResult
@@ -83,7 +83,7 @@ def write_layers(
     OutputError
         When a file exists or cannot be written.
     """
-    placed, options = placed_by(result)
+    placed, options = placed_by(result), result.options.composite
     files = layer_files([source.name for source in placed.sources], folder)
     if outputs is None:
         with Outputs(overwrite) as staging:

@@ -35,10 +35,11 @@ from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
 from rdstitch.pipeline.choose_layout import lay_out
-from rdstitch.pipeline.compose import check_world_files, image_files
-from rdstitch.pipeline.output_plan import files_beside
+from rdstitch.pipeline.compose import check_world_files
+from rdstitch.pipeline.output_plan import check_run
 from rdstitch.pipeline.read_inputs import NO_FLAT_FIELD, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
+from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import MAX_NAMED, Message, left_out, names_of, shortened
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
@@ -63,7 +64,7 @@ from rdstitch.stage.register_tiles import (
 )
 from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, text_bytes
+from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.system.progress import Progress, silent
 
 _COMPARED = 32  # overlaps by which a flat field is judged
@@ -103,20 +104,25 @@ def tiles(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = replace(options or TileOptions(), **fields)
-    stitch = StitchOptions(
+    run = Run(_stitch_options(options), output, beside, progress)
+    with found_images(_as_tiles(inputs), output=output, topic=options.topic) as listed:
+        registration, tiled = _registered(listed, run, options, positions_file)
+        with Outputs(options.overwrite) as outputs, run.options.executor(len(registration.sources)) as executor:
+            _write_beside(outputs, positions_file, options, registration, tiled)
+            chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
+            chosen = replace(chosen, layout=replace(chosen.layout, photographs=False))
+            return compose_registration(chosen, run, outputs, executor)
+
+
+def _stitch_options(options: TileOptions) -> StitchOptions:
+    """What the stages after registration take of the options."""
+    return StitchOptions(
         distortion=None if options.distortion == "auto" else options.distortion,
         composite=options.composite,
         overwrite=options.overwrite,
         dry_run=options.dry_run,
         workers=options.workers,
     )
-    with found_images(_as_tiles(inputs), output=output, topic=options.topic) as listed:
-        registration, tiled = _registered(listed, output, positions_file, options, progress, beside)
-        with Outputs(options.overwrite) as outputs, stitch.executor(len(registration.sources)) as executor:
-            _write_beside(outputs, positions_file, options, registration, tiled)
-            chosen = lay_out(registration, no_local_alignment("tiles on a stage"), stitch.composite)
-            chosen = replace(chosen, layout=replace(chosen.layout, photographs=False))
-            return compose_registration(chosen, executor, output, stitch, progress, beside, outputs)
 
 
 @one_opencv_thread()
@@ -139,7 +145,8 @@ def place_tiles(
     """
     options = replace(options or TileOptions(), **fields)
     with found_images(_as_tiles(inputs), topic=options.topic) as listed:
-        registration, tiled = _registered(listed, None, positions_file, options, progress, NOTHING_BESIDE)
+        run = Run(_stitch_options(options), progress=progress)
+        registration, tiled = _registered(listed, run, options, positions_file)
     with Outputs(options.overwrite) as outputs:
         _write_beside(outputs, positions_file, options, registration, tiled)
     return tiled, registration
@@ -190,27 +197,30 @@ def _as_tile(item: Any, index: int) -> Any:
 
 
 def _registered(
-    listed: FoundImages,
-    output: str | Path | None,
-    positions_file: str | Path | None,
-    options: TileOptions,
-    progress: Progress,
-    beside: FilesBeside,
+    listed: FoundImages, run: Run, options: TileOptions, positions_file: str | Path | None
 ) -> tuple[Registration, TileRegistration]:
     """The places of all tiles, once it is clear that everything can be written."""
-    _check_outputs(output, positions_file, options, beside, listed)
+    positions = options.positions if isinstance(options.positions, str | os.PathLike) else None
+    read = [positions, None if options.flat_field in ("auto", "off") else options.flat_field]
+    check_run(
+        run,
+        [*listed.files, *(file for file in read if file is not None)],
+        [frame.name for frame in listed.frames],
+        others=[Path(file) for file in (positions_file, options.save_flat_field) if file is not None],
+    )
     guard = InputGuard(options.strict)
     frames, stored, notes = tile_frames(listed.frames, options.z, options.time)
     limit = options.composite.max_memory
     sources, unread = read_sources(frames, skip_bad=not options.strict, guard=guard, max_memory=limit)
-    check_world_files([] if output is None else [output], sources, options.overwrite)
+    check_world_files([] if run.output is None else [run.output], sources, options.overwrite)
     sources, odd = _of_one_kind(sources, options.strict)
     unread += odd
     while True:
         if len(sources) < 2:
             raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
+        nominal = _grid(sources, stored, options)
         try:
-            sources, tiled, said = _placed(sources, stored, options, progress)
+            sources, tiled, said = _placed(sources, nominal, options, run.progress)
             break
         except InputError:
             sources, damaged = _readable(sources)
@@ -253,7 +263,7 @@ def _readable(sources: Sequence[Source]) -> tuple[list[Source], list[Message]]:
 
 
 def _placed(
-    sources: list[Source], stored: Mapping[Path, StoredTile], options: TileOptions, progress: Progress
+    sources: list[Source], nominal: TileGrid, options: TileOptions, progress: Progress
 ) -> tuple[list[Source], TileRegistration, list[Message]]:
     """The tiles with their illumination taken out, where they are, and what there is to say of that."""
     if len({source.camera.image_size for source in sources}) > 1:
@@ -263,11 +273,10 @@ def _placed(
     else:
         sources, said = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
-    told = _grid(sources, stored, options)
-    search, factor = search_radius(told, options.search), coarse_factor(told)
-    grid, shown = with_axes_shown(told, lambda index: coarse_tile(read(index), factor), factor, search)
+    search, factor = search_radius(nominal, options.search), coarse_factor(nominal)
+    grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, search)
     if shown:
-        said.append(Message(f"{told.source} contradicted: {shown}", code="grid-as-shown"))
+        said.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
     tiled = register_tiles(grid, read, search=search, distortion=options.distortion, progress=progress)
@@ -307,22 +316,6 @@ def _write_beside(
     if options.save_flat_field is not None and field is not None:
         with outputs.writing(options.save_flat_field) as staged:
             field.write(staged)
-
-
-def _check_outputs(
-    output: str | Path | None,
-    positions_file: str | Path | None,
-    options: TileOptions,
-    beside: FilesBeside,
-    listed: FoundImages,
-) -> None:
-    """Find out before long work whether everything can be written."""
-    positions = options.positions if isinstance(options.positions, str | os.PathLike) else None
-    named = [positions, None if options.flat_field in ("auto", "off") else options.flat_field]
-    written = [] if output is None else image_files(check_suffix(output))
-    written += [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
-    written += files_beside(beside, (frame.name for frame in listed.frames))
-    check_outputs(written, options.overwrite, [*listed.files, *(file for file in named if file is not None)])
 
 
 def _plane(sources: Sequence[Source], channel: int | None, index: int) -> NDArray[Any]:

@@ -211,8 +211,11 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
     """The output, small; every outline has its image's name as title, and a few images have it written."""
     image = _thumbnail(result, staged)
     if image is None:
-        large = result.plan is None and result.output is not None
-        return section("Mosaic", "It is too large to be shown here." if large else "No image was written.")
+        if result.plan is not None or result.output is None:
+            return section("Mosaic", "No image was written.")
+        tiled = result.output.suffix.lower() in (".dzi", ".zarr")
+        reason = "a folder of tiles, which is not" if tiled else "too large to be"
+        return section("Mosaic", f"It is {reason} shown here.")
     name = "" if result.output is None else f"{result.output.name}, "
     width, height = result.canvas.size
     scale = _MOSAIC_SIDE / max(width, height)

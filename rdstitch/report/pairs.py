@@ -1,5 +1,6 @@
 """The pairs: over the outlines of the images, the best and the worst one, and what the model leaves over."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -140,7 +141,8 @@ def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: fl
 def residual_map(registration: Registration) -> str:
     """Errors of all pairs over the area of the image: rms as grey, mean as an arrow."""
     alignment = registration.alignment
-    errors = [residuals(registration, fit) for fit in alignment.links if fit.used and fit.rms > 0.0]
+    pairs = pairs_of(registration)
+    errors = [residuals(registration, pairs, fit) for fit in alignment.links if fit.used and fit.rms > 0.0]
     cameras = [alignment.cameras[fit.image2] for fit in alignment.links if fit.used and fit.rms > 0.0]
     if not errors:
         return section("Residuals", "There are none.")
@@ -203,13 +205,15 @@ def pairs_of(registration: Registration) -> dict[tuple[int, int], PairRegistrati
     return {(pair.image1, pair.image2): pair for pair in registration.pairs}
 
 
-def residuals(registration: Registration, fit: LinkFit) -> tuple[FloatArray, FloatArray]:
+def residuals(
+    registration: Registration, pairs: Mapping[tuple[int, int], PairRegistration], fit: LinkFit
+) -> tuple[FloatArray, FloatArray]:
     """Give where the matches of a link are in the second image, and how far from there the alignment puts them, pixels.
 
     Matches that the pair itself takes for wrong are left out, and those that miss by more than four times the link's
     error.
     """
-    pair = pairs_of(registration)[fit.image1, fit.image2]
+    pair = pairs[fit.image1, fit.image2]
     inliers = pair.relation.inliers
     given, measured = pair.correspondences.points1[inliers], pair.correspondences.points2[inliers]
     off = registration.alignment.transfer(fit.image1, fit.image2, given) - measured

@@ -9,8 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.choices import ChannelOrder
-from rdstitch.compositing import Canvas, Composite, CompositePlan, SeamQuality
+from rdstitch.compositing import Canvas, Composite, CompositePlan, FileComposite, SeamQuality
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference
 from rdstitch.inputs.frame import in_order
@@ -33,14 +32,15 @@ class OutputImage:
     ----------
     canvas : Canvas
         Where the images lie in the output.
+    options : StitchOptions
     output : Path or None
         File that the image was written to.
     composite : Composite or None
         The image itself; None where it went to a file, or was only planned.
     plan : CompositePlan or None
         Of a dry run.
-    fingerprint : Fingerprint or None
-        Size and digest of the file.
+    written : FileComposite or None
+        What was found while the file was written.
     georeference : Georeference or None
         Where the output lies on the Earth.
     not_georeferenced : str
@@ -50,28 +50,30 @@ class OutputImage:
     """
 
     canvas: Canvas
+    options: StitchOptions
     output: Path | None = None
     composite: Composite | None = None
     plan: CompositePlan | None = None
-    fingerprint: Fingerprint | None = None
+    written: FileComposite | None = None
     georeference: Georeference | None = None
     not_georeferenced: str = "not tried"
     seams: SeamQuality = field(default_factory=SeamQuality)
 
     @property
-    def output_fields(self) -> dict[str, Any]:
+    def fields(self) -> dict[str, Any]:
         """All of these by name, for a result that has the same image."""
         return {each.name: getattr(self, each.name) for each in fields(OutputImage)}
 
     @property
-    def image_order(self) -> ChannelOrder:
-        """Order of the channels of :attr:`image`."""
-        raise NotImplementedError
+    def fingerprint(self) -> Fingerprint | None:
+        """Size and digest of the file."""
+        return None if self.written is None else self.written.fingerprint
 
     @property
     def summary(self) -> str:
         """What was made, in one line."""
-        raise NotImplementedError
+        name, (width, height) = "" if self.output is None else f"{self.output}: ", self.canvas.size
+        return f"{name}{width} x {height} pixels"
 
     @property
     def image(self) -> NDArray[Any]:
@@ -79,7 +81,7 @@ class OutputImage:
 
         An image that went to a file is read from there.
         """
-        return in_order(self._samples()[0], self.image_order)
+        return in_order(self._samples()[0], self.options.channel_order)
 
     @property
     def alpha(self) -> NDArray[np.uint8]:
@@ -117,13 +119,11 @@ class StitchResult(OutputImage):
     ----------
     registration : Registration
         With all that there is to know of the result in its ``messages``.
-    options : StitchOptions
     local_alignment : LocalAlignment
         Displacement fields of the images that are used, in their order.
     """
 
     registration: Registration
-    options: StitchOptions
     local_alignment: LocalAlignment = field(default_factory=partial(no_local_alignment, "not tried"))
 
     @property
@@ -151,12 +151,6 @@ class StitchResult(OutputImage):
         return replace(self, registration=self.registration.with_messages(messages))
 
     @property
-    def image_order(self) -> ChannelOrder:
-        """Order of the channels of :attr:`image`."""
-        return self.options.channel_order
-
-    @property
     def summary(self) -> str:
         """What was made, of how many images, and λ with its standard deviation, in one line."""
-        name, (width, height) = "" if self.output is None else f"{self.output}: ", self.canvas.size
-        return f"{name}{width} x {height} pixels, {self.registration.summary}"
+        return f"{super().summary}, {self.registration.summary}"

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing import Canvas
+from rdstitch.compositing import Canvas, SeamQuality
 from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
 from rdstitch.export.georeference import Georeference, Residual
@@ -67,20 +67,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
             "cells": local.cells,
             "held_out_px": {"before": local.before, "after": local.after},
         },
-        "seams": {
-            "places": len(result.seams.places),
-            "broken": int(result.seams.broken.sum()),
-            "breaks": [
-                {
-                    "images": [registration.used_names[k] for k in one.images],
-                    "x": one.position[0],
-                    "y": one.position[1],
-                    "length_px": one.length,
-                    "shift_px": one.size,
-                }
-                for one in result.seams.breaks
-            ],
-        },
+        "seams": seams_fields(result.seams, registration.used_names),
         "stage": _stage(registration),
         "images": _images(result),
         "pairs": _pairs(result),
@@ -150,6 +137,21 @@ def output_geometry(canvas: Canvas, *, turned: bool) -> dict[str, Any]:
         "field_of_view_deg": np.degrees(field_of_view(canvas)) if turned else None,
         "center_deg": np.degrees(center_of_view(canvas)) if turned else None,
     }
+
+
+def seams_fields(seams: SeamQuality, names: Sequence[str]) -> dict[str, Any]:
+    """Where the seams between images of these names hold and where they break."""
+    breaks = [
+        {
+            "images": [names[k] for k in one.images],
+            "x": one.position[0],
+            "y": one.position[1],
+            "length_px": one.length,
+            "shift_px": one.size,
+        }
+        for one in seams.breaks
+    ]
+    return {"places": len(seams.places), "broken": int(seams.broken.sum()), "breaks": breaks}
 
 
 def georeference_fields(place: Georeference | None, reason: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.planar_motion import rotation_from_tilt
-from rdstitch.inputs.sensor_streams import DELAY_STD, at_delay, smooth
+from rdstitch.inputs.delays import DELAY_STD, at_delay, smooth
 from rdstitch.robust.posterior import WRONG_GIVEN_FOCAL
 
 _POINTS = 32  # of a pair

@@ -13,7 +13,7 @@ from rdstitch.features.corner_flow import corners_of
 from rdstitch.features.prepared_image import PreparedImage
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane
-from rdstitch.inputs.sensor_streams import BodyPose
+from rdstitch.inputs.odometry import BodyPose
 from rdstitch.tracking.placement import CameraPose, Placement
 
 MIN_INLIERS = 15

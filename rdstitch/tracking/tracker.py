@@ -20,7 +20,8 @@ from rdstitch.features import Features, Matcher
 from rdstitch.features.corner_flow import CornerFlow, matched_corners
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.sensor_streams import DELAY_STD, BodyPose, at_delay, change_with_delay, motion_between
+from rdstitch.inputs.delays import DELAY_STD, at_delay, change_with_delay
+from rdstitch.inputs.odometry import BodyPose, motion_between
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
@@ -155,7 +156,7 @@ class Tracker:
         camera : Camera
             Of the size of ``image``.
         attitude : ndarray of shape (S, 2), optional
-            (ψ, θ), radians, as it was measured at :data:`rdstitch.inputs.sensor_streams.DELAYS`.
+            (ψ, θ), radians, as it was measured at :data:`rdstitch.inputs.delays.DELAYS`.
         body : BodyPose, optional
             By odometry.
         """

@@ -88,8 +88,8 @@ class ComparedImage:
 
 def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> Grey:
     pixels = image.pixels
-    full = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else max(float(pixels.max()), 1e-12)
-    black = 0.0
+    largest = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else np.nanmax(pixels, initial=1e-12)
+    black, full = 0.0, float(largest)
     if stretch is not None:
         # Correlations of small differences on a large base would be lost in rounding.
         black, full = stretch[0], max(stretch[1] - stretch[0], 1e-12)

@@ -4,9 +4,11 @@ import base64
 import io
 import re
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -176,9 +178,7 @@ def test_names_are_escaped_and_vanished_images_do_not_matter(frames: list[Path],
     assert page.sources == []
 
 
-def test_of_a_large_tiff_an_overview_is_read(
-    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_overviews_are_read(rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = pano(frames[:2], tmp_path / "large.tif", replace(OPTIONS, composite=CompositeOptions(scale=3.0)))
     monkeypatch.setattr(report, "_MOSAIC_SIDE", 300)
     whole = _decoded(report._thumbnail(result))
@@ -207,9 +207,7 @@ def test_the_best_pair_has_many_matches(frames: list[Path]) -> None:
     assert "Best pair: " in shown
 
 
-def test_an_image_larger_than_any_cameras_is_shown_or_said_to_be_too_large(
-    pair: StitchResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_too_large_an_image_it_is_said(pair: StitchResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(MAX_IMAGE_GB, "0.0001")
     for suffix, shown in ((".jpg", True), (".png", False)):
         file = tmp_path / f"large{suffix}"
@@ -217,6 +215,26 @@ def test_an_image_larger_than_any_cameras_is_shown_or_said_to_be_too_large(
         page = report_page(replace(pair, composite=None, output=file))
         assert ("too large to be shown here" in page) is not shown
         assert "Match graph" in page
+
+
+def test_tiles_in_a_folder_are_not_called_too_large_and_pairs_are_looked_through_once(
+    pair: StitchResult, tmp_path: Path
+) -> None:
+    looked_through = []
+
+    class Pairs(tuple[Any, ...]):
+        __slots__ = ()
+
+        def __iter__(self) -> Iterator[Any]:
+            looked_through.append(self)
+            return super().__iter__()
+
+    registration = pair.registration
+    alignment = replace(registration.alignment, links=registration.alignment.links * 40)
+    registration = replace(registration, alignment=alignment, pairs=Pairs(registration.pairs))
+    page = report_page(replace(pair, composite=None, output=tmp_path / "a.zarr", registration=registration))
+    assert "a folder of tiles, which is not shown here" in page
+    assert len(looked_through) < 20
 
 
 def test_the_dots_of_a_thousand_seams_are_as_many_as_can_be_told_apart_and_hide_no_break() -> None:

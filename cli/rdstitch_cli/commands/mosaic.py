@@ -93,8 +93,10 @@ def mosaic(
     patterns = _bands(bands)
     if patterns and (all_blocks or following or given["dry_run"]):
         raise click.UsageError("--bands goes neither with --all-blocks, --follow nor --dry-run")
-    if map_server is not None and output.suffix.lower() == ".dzi":
-        raise click.UsageError("--map-server is made from the output: write .png, .jpg or .tif instead of .dzi")
+    if map_server is not None and (suffix := output.suffix.lower()) in (".dzi", ".zarr"):
+        raise click.UsageError(f"--map-server is made from the output: write .png, .jpg or .tif instead of {suffix}")
+    if map_server is not None and given["height"] is None:
+        raise click.UsageError("--map-server is in metres: give the height of the first image's camera with --height")
     if map_server is not None and not given["dry_run"]:
         map_files(map_server, overwrite=given["overwrite"])
     with ExitStack() as stack:
@@ -123,7 +125,7 @@ def mosaic(
             else:
                 summarize(result, reporter, as_json=as_json)
             if map_server is not None and result.plan is None and result is results[0]:
-                write_map(result, map_server, beside.height, overwrite=stitch.overwrite)
+                write_map(result, map_server, beside.height or 1.0, overwrite=stitch.overwrite)
             if result.plan is None:
                 images = f" ({shortened(result.registration.used_names)})" if all_blocks else ""
                 reporter.made(f"{result.summary}{images}")

@@ -51,7 +51,7 @@ def trajectory(
             "bottom, z down; default of kitti. yaw_deg is counterclockwise as seen from above in all."
         ),
     ] = None,
-    height: Height = 1.0,
+    height: Height = None,
     plot: Annotated[Path | None, Option("Draw the path to FILE (SVG).", "FILE")] = None,
     every: Every = 1,
     following: bool,

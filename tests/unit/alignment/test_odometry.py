@@ -15,8 +15,9 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.sensor_streams import BodyPose, read_odometry
+from rdstitch.inputs.odometry import BodyPose, read_odometry
 from rdstitch.synthetic import Sequence
+from rdstitch.tracking import Tracked
 
 HEIGHT, LEVER, MOUNT = 0.42, 0.15 - 0.06j, np.exp(0.5j * np.pi)  # metres; the top of the image is ahead
 
@@ -124,6 +125,13 @@ def test_offline_and_live_give_metres_and_bridge_what_shows_nothing(drive: Seque
     places = np.array([poses[k].position[:2] for k in late])
     assert np.abs(places - _metres(drive).position[late]).max() < 0.08 * HEIGHT + 0.03
     assert 0.01 < poses[15].length_std < 0.03
+
+
+def test_a_height_of_one_is_a_height() -> None:
+    known = Tracked(0, None, DISTORTION, 0.0, True, 0, True, 0, length_std=0.01, unit=0.3, unit_std=0.05)
+    for given, length, std in ((None, 0.3, 0.05), (1.0, 1.0, 0.01)):
+        poses = rdstitch.FollowedPoses(given)
+        assert (poses.unit(known), poses.length_std(known)) == (length, std)
 
 
 def test_odometry_is_read_from_tum_and_refused_by_line(tmp_path: Path) -> None:

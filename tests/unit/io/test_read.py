@@ -1,6 +1,7 @@
 """Reading images and their metadata."""
 
 import struct
+import tracemalloc
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,11 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
-from rdstitch.io import read_image, read_metadata
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.lens_model import LensModel
+from rdstitch.io import Metadata, read_image, read_metadata
+from rdstitch.io.lens_correction import corrected
+from rdstitch.io.read import DecodedImage
 
 Samples = NDArray[Any]
 
@@ -22,14 +27,6 @@ def colours() -> Samples:
     """A small image whose every pixel differs, with 8 bits."""
     v, u = np.mgrid[:23, :31]
     return np.stack([u * 8, v * 11, (u * v) % 256], axis=-1).astype(np.uint8)
-
-
-def test_colour_is_in_rgb_order(tmp_path: Path, colours: Samples) -> None:
-    for suffix in ("png", "tif", "bmp"):
-        Image.fromarray(colours).save(tmp_path / f"a.{suffix}")
-        image = read_image(tmp_path / f"a.{suffix}")
-        np.testing.assert_array_equal(image.pixels, colours)
-        assert image.alpha is None
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -83,14 +80,6 @@ def test_not_a_number_becomes_transparent(tmp_path: Path) -> None:
     assert image.alpha is not None
     assert np.isfinite(image.pixels).all()
     np.testing.assert_array_equal(image.alpha == 0, ~np.isfinite(values))
-
-
-def test_alpha_is_apart(tmp_path: Path, colours: Samples) -> None:
-    alpha = np.where(colours[..., 0] > 100, 255, 0).astype(np.uint8)
-    Image.fromarray(np.dstack([colours, alpha])).save(tmp_path / "a.png")
-    image = read_image(tmp_path / "a.png")
-    np.testing.assert_array_equal(image.pixels, colours)
-    np.testing.assert_array_equal(image.alpha, alpha)
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "CMYK", "YCbCr", "LAB", "I", "F", "I;16"])
@@ -242,3 +231,15 @@ def test_a_png_that_ends_early_is_no_image_without_metadata(tmp_path: Path) -> N
     file.write_bytes(file.read_bytes()[:-40])
     with pytest.raises(Exception, match="cut"):
         read_metadata(file)
+
+
+def test_correction_of_a_lens_keeps_nothing_of_the_size_of_images() -> None:
+    model = LensModel((1500.0, 1500.0), (1000.0, 600.0), (-0.1, 0.01, 0.0, 0.0, 0.0))
+    camera = Camera((2000, 1200), -0.1, lens_model=model)
+    image = DecodedImage(np.zeros((1200, 2000), np.uint8), None, Metadata((2000, 1200)))
+    tracemalloc.start()
+    try:
+        corrected(image, camera, 1)
+        assert tracemalloc.get_traced_memory()[0] < image.pixels.nbytes
+    finally:
+        tracemalloc.stop()

@@ -1,5 +1,6 @@
 """Another band by the registration of a first one: which image belongs where, and what its lens is."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,7 +72,25 @@ def test_a_band_by_another_lens_is_registered(rig: Path, tmp_path: Path) -> None
     assert _shift_between(rig / "red.tif", tmp_path / "nir.tif") < 0.3
     again = apply(tmp_path / "nir.tif.json", [rig / "nir"], tmp_path / "again.tif", workers=1)
     assert not [message for message in again.messages if message.code == "band-lens"]
-    assert _shift_between(rig / "red.tif", tmp_path / "again.tif") < 0.3
+    assert _same_pixels(tmp_path / "nir.tif", tmp_path / "again.tif")
+    assert [source.camera for source in result.sources] == list(result.placed.cameras)
+
+
+def test_seams_of_a_sidecar_are_those_of_its_image(rig: Path, tmp_path: Path) -> None:
+    smaller = CompositeOptions(scale=0.3)
+    result = apply(rig / "red.tif.json", [rig / "red"], tmp_path / "small.tif", smaller, workers=1)
+    told = json.loads((tmp_path / "small.tif.json").read_text(encoding="utf-8"))["seams"]
+    assert told["places"] == len(result.seams.places) > 0
+
+
+@pytest.mark.parametrize("kind", ["size", "depth"])
+def test_bands_that_cannot_have_one_grid_are_refused_before_the_work(rig: Path, tmp_path: Path, kind: str) -> None:
+    for file in (rig / "nir").iterdir():
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(tmp_path / file.name), image[::2, ::2] if kind == "size" else image.astype(np.uint16) * 256)
+    with pytest.raises(ArgumentError, match=r"bands: images of R have .*, those of N "):
+        mosaic_bands([rig / "red", tmp_path], tmp_path / "f.tif", {"R": "*_red.png", "N": "*_nir.png"})
+    assert not list(tmp_path.glob("f*.tif"))
 
 
 def test_all_bands_of_a_rig_at_once(rig: Path, tmp_path: Path) -> None:

@@ -50,6 +50,13 @@ def test_positions_that_are_no_numbers_of_each_tile_are_refused(places: object) 
         rdstitch.tiles(TILES, positions=places)
 
 
+def test_a_list_of_positions_that_is_not_there_is_told_before_a_tile_is_read(tmp_path: Path) -> None:
+    lazy = [_Lazy(tile) for tile in TILES]
+    with pytest.raises(InputError, match="missing"):
+        rdstitch.tiles(lazy, positions=tmp_path / "missing.csv", flat_field="auto")
+    assert not any(item.reads for item in lazy)
+
+
 def test_one_array_of_all_tiles_is_read_tile_by_tile() -> None:
     zarr = pytest.importorskip("zarr")
     result = rdstitch.tiles(zarr.array(TILES, chunks=(1, 256, 256)), positions=STAGE.nominal)

@@ -10,11 +10,23 @@ from typing import Any
 import cv2
 import pytest
 
+from rdstitch.io.video import opened_capture
 from rdstitch.system.opencv_state import one_opencv_thread, silent_opencv
 
 LOGGING: Any = getattr(cv2.utils, "logging", cv2)
 THREADS = (one_opencv_thread, cv2.getNumThreads, cv2.setNumThreads, 1)
 LEVEL = (silent_opencv, LOGGING.getLogLevel, LOGGING.setLogLevel, 0)
+
+
+@pytest.mark.parametrize("level", [None, "16"])
+def test_a_video_leaves_the_environment_as_it_was(monkeypatch: pytest.MonkeyPatch, level: str | None) -> None:
+    monkeypatch.delenv("OPENCV_FFMPEG_LOGLEVEL", raising=False)
+    if level is not None:
+        monkeypatch.setenv("OPENCV_FFMPEG_LOGLEVEL", level)
+    before = dict(os.environ)
+    with opened_capture("nothing.mp4"):
+        pass
+    assert dict(os.environ) == before
 
 
 @pytest.mark.parametrize("state", [THREADS, LEVEL], ids=["threads", "log level"])
@@ -76,6 +88,7 @@ import os, sys
 import cv2
 import numpy as np
 from rdstitch.features.detect import detect
+from rdstitch.io.video import opened_capture
 from rdstitch.system.opencv_state import one_opencv_thread
 
 image = np.random.default_rng(0).integers(0, 255, (400, 600), dtype=np.uint8)

@@ -32,11 +32,6 @@ def _said(*kinds: Kind, found: Evidence = SHAPED) -> list[Kind]:
     return [finding.kind for finding in _aloud(findings, found) if finding.severity == "warning"]
 
 
-def test_what_is_not_said_is_a_detail() -> None:
-    (note,) = _aloud([Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "warning", {"size": 3.0})], SHAPED)
-    assert note == Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "detail", {"size": 3.0})
-
-
 TURNED = evidence(registration(model="rotation"), alike=0.8)
 UNLIKE = evidence(TURNED.registration, alike=0.1)
 SMALL = evidence(registration(shape=replace(SHAPE, shift=1e4)), alike=0.8)
@@ -51,20 +46,18 @@ SMALL = evidence(registration(shape=replace(SHAPE, shift=1e4)), alike=0.8)
         (SHAPED, [Kind.RELIEF], [Kind.RELIEF]),
         (SHAPED, [Kind.RELIEF, Kind.SHAPE_BENT], [Kind.SHAPE_BENT]),  # one line says that the plane may be none
         (SMALL, [Kind.SHAPE_BENT], []),  # by more than an image
-        (
-            evidence(TURNED.registration, Purpose.MOSAIC, alike=0.1),
-            [Kind.RELIEF, Kind.ROUGH],
-            [],
-        ),
+        (evidence(TURNED.registration, Purpose.MOSAIC, alike=0.1), [Kind.RELIEF, Kind.ROUGH], []),
     ],
 )
 def test_what_is_said_aloud(found: Evidence, kinds: list[Kind], said: list[Kind]) -> None:
     assert _said(*kinds, found=found) == said
 
 
-def test_failures_stay() -> None:
+def test_failures_stay_and_what_is_not_said_is_a_detail() -> None:
     given = (Finding(Kind.ERRORS), Finding(Kind.IMAGE_MISFITS, (1,)))
     assert _aloud(given, TURNED) == given
+    (note,) = _aloud([Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "warning", {"size": 3.0})], SHAPED)
+    assert note == Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "detail", {"size": 3.0})
 
 
 def test_there_are_a_few_lines_of_a_run_the_gravest_first_and_one_of_a_kind() -> None:
@@ -132,12 +125,6 @@ def _texts(*sources: Source) -> list[str]:
     return [message.text for message in messages_of(rules._inputs(evidence(given)), given)]
 
 
-def test_images_of_one_camera_are_fine() -> None:
-    assert _texts(*(source(f"{k}.jpg", model="A", serial="1", focal_px=900.0) for k in range(3))) == []
-    assert _texts(source("a"), source("b")) == []
-    assert _texts() == []
-
-
 @pytest.mark.parametrize("other", [{"model": "B"}, {"model": "A", "serial": "2"}, {"make": "X", "model": "A"}])
 def test_several_cameras_are_named_the_commonest_first(other: dict[str, Any]) -> None:
     (text,) = _texts(source("z.jpg", **other), *(source(f"{k}.jpg", model="A") for k in range(2)))
@@ -145,7 +132,9 @@ def test_several_cameras_are_named_the_commonest_first(other: dict[str, Any]) ->
     assert "(1: z.jpg); stitch those of each on their own" in text
 
 
-def test_a_serial_number_is_enough_and_no_header_is_no_camera() -> None:
+def test_images_of_one_camera_are_fine_a_serial_number_is_enough_and_no_header_is_no_camera() -> None:
+    assert _texts(*(source(f"{k}.jpg", model="A", serial="1", focal_px=900.0) for k in range(3))) == []
+    assert _texts(source("a"), source("b")) == _texts() == []
     assert len(_texts(source("a", serial="1"), source("b", serial="2"))) == 1
     assert _texts(source("a", serial="1"), source("b", make="X")) == []
 

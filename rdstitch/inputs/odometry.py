@@ -1,0 +1,118 @@
+"""Poses of a robot's body by its wheels."""
+
+import cmath
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.errors import InputError
+from rdstitch.inputs.tables import TIME_NAMES, csv_rows, is_number
+from rdstitch.system.file_access import file_state, read_text
+
+_COLUMNS = {"timestamp": TIME_NAMES} | {
+    name: name.replace("_", "")
+    for name in ("x", "y", "yaw", "yaw_deg", "qx", "qy", "qz", "qw", "cov_x_x", "cov_y_y", "cov_yaw_deg_yaw_deg")
+}
+_SLIP = 0.02  # share of distances and turns that wheels are off by if they do not say
+
+
+class BodyPose(NamedTuple):
+    """A pose of a body (x ahead, y left), as its wheels have measured it."""
+
+    x: float
+    y: float
+    yaw: float  # radians, counterclockwise from above
+    variance: float = math.nan  # variance, yaw_variance: of a coordinate and of the yaw, since the start; NaN: unknown
+    yaw_variance: float = math.nan
+
+
+class BodyMotion(NamedTuple):
+    """How a body has moved, in its axes at the beginning."""
+
+    moved: complex  # ahead, and to the left as the imaginary part
+    turn: float  # radians, counterclockwise from above
+    variance: float  # of each coordinate
+    turn_variance: float
+
+
+def motion_between(start: BodyPose, end: BodyPose) -> BodyMotion:
+    """The motion from one pose to another."""
+    moved = complex(end.x - start.x, end.y - start.y) * cmath.exp(-1j * start.yaw)
+    turn = math.remainder(end.yaw - start.yaw, math.tau)
+    usual = [(_SLIP * abs(size)) ** 2 for size in (moved, turn)]
+    stated = [abs(end.variance - start.variance), abs(end.yaw_variance - start.yaw_variance)]
+    known = [one if math.isfinite(one) and one > 0.0 else other for one, other in zip(stated, usual, strict=True)]
+    return BodyMotion(moved, turn, *known)
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Poses of a body by time."""
+
+    times: FloatArray  # (M,), s, ascending
+    poses: FloatArray  # (M, 5): as in BodyPose, the yaw continuous
+
+    def at(self, time: float) -> BodyPose | None:
+        """The pose at a time, interpolated; None beyond what was measured."""
+        if not self.times[0] <= time <= self.times[-1]:
+            return None
+        return BodyPose(*(float(np.interp(time, self.times, values)) for values in self.poses.T))
+
+
+def read_odometry(file: str | Path) -> Odometry:
+    """Wheel odometry of a file: TUM's lines, or a CSV table of ``timestamp,x,y,yaw_deg`` as ``trajectory`` writes it.
+
+    Covariances ``cov_x_x``, ``cov_y_y`` and ``cov_yaw_deg_yaw_deg`` are used where the table has them; instead of the
+    yaw it may have a quaternion.
+    """
+    return _read_odometry(file, file_state(file))
+
+
+@lru_cache(maxsize=1)  # frames that are followed ask one after the other
+def _read_odometry(file: str | Path, state: tuple[int, int] | None) -> Odometry:
+    text, where = read_text(file), str(file)
+    first = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
+    if len(first.split()) == 8 and all(is_number(part) for part in first.split()):
+        rows = []
+        for number, line in enumerate(text.splitlines(), start=1):
+            if line.strip() and not line.startswith("#"):
+                parts = line.split()
+                if len(parts) != 8 or not all(map(is_number, parts)):
+                    raise InputError(f"{file}: line {number}: expected timestamp tx ty tz qx qy qz qw, found '{line}'")
+                time, x, y, _, qx, qy, qz, qw = map(float, parts)
+                rows.append((time, x, y, yaw_of(qx, qy, qz, qw), math.nan, math.nan))
+        return odometry_of(rows, where)
+    wanted = ("timestamp,x,y,yaw_deg", "timestamp,x,y,yaw", "timestamp,x,y,qx,qy,qz,qw")
+    table = []
+    for row in csv_rows(text, where, _COLUMNS, wanted, ("s", "m", "deg", "rad")):
+        yaw = row.number("yaw")
+        if yaw is None and (degrees := row.number("yaw_deg")) is not None:
+            yaw = math.radians(degrees)
+        if yaw is None:
+            yaw = yaw_of(*(row.needed(name) for name in ("qx", "qy", "qz", "qw")))
+        x_x, y_y, turn = (row.number(name) for name in ("cov_x_x", "cov_y_y", "cov_yaw_deg_yaw_deg"))
+        place = math.nan if x_x is None or y_y is None else (x_x + y_y) / 2.0
+        turned = math.nan if turn is None else math.radians(math.sqrt(max(turn, 0.0))) ** 2
+        table.append((row.needed("timestamp"), row.needed("x"), row.needed("y"), yaw, place, turned))
+    return odometry_of(table, where)
+
+
+def odometry_of(rows: Sequence[tuple[float, ...]], where: str) -> Odometry:
+    """From rows of time, x, y, yaw (radians), and the variances of a coordinate and of the yaw."""
+    values = np.array(sorted(rows), dtype=np.float64).reshape(-1, 6)
+    values = values[np.append(np.diff(values[:, 0]) > 0.0, True)] if len(values) else values
+    if len(values) < 2:
+        raise InputError(f"{where}: has no odometry at two times")
+    values[:, 3] = np.unwrap(values[:, 3])
+    return Odometry(values[:, 0], values[:, 1:])
+
+
+def yaw_of(x: float, y: float, z: float, w: float) -> float:
+    """The turn about z of a quaternion, radians."""
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

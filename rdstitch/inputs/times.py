@@ -1,0 +1,92 @@
+"""When images were taken: by a file, else by the video, the bag or EXIF."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.errors import InputError
+from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.source import Source
+from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, by_image, csv_rows, is_number
+from rdstitch.system.file_access import canonical_name, file_state, read_text
+
+_COLUMNS = {"name": IMAGE_NAMES, "timestamp": TIME_NAMES}
+
+
+def timestamps_of(sources: Sequence[Source]) -> FloatArray:
+    """Time stamps (N,), s; NaN where nothing is known.
+
+    That of a table, see :func:`with_times`, or of the video (from its beginning) or bag, else that of EXIF (since 1970,
+    in UTC where EXIF has no time zone).
+    """
+    own = [(None if source.frame is None else source.frame.timestamp) for source in sources]
+    times = [s.metadata.timestamp if known is None else known for s, known in zip(sources, own, strict=True)]
+    return np.array([math.nan if time is None else time for time in times])
+
+
+def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
+    """Everything that was named, each with its time by a file; before anything of it is left out.
+
+    The file is a CSV with the columns ``name`` and ``timestamp``; or has lines ``TIMESTAMP NAME`` as in the lists of
+    the TUM benchmark; or one time a line, the n-th for the n-th image or frame of the video, as KITTI's ``times.txt``.
+    Lines that begin with ``#`` are ignored.
+    """
+    if file is None:
+        return list(frames)
+    named = _read_times(file, file_state(file))
+    if not isinstance(named, list):
+        return [replace(frame, timestamp=_time_of(frame, named, file)) for frame in frames]
+    numbers = np.array([position if frame.number is None else frame.number for position, frame in enumerate(frames)])
+    if len(np.unique(numbers)) < len(numbers):  # of several videos
+        numbers = np.arange(len(frames))
+    steps = np.unique(np.diff(np.sort(numbers)))
+    # Of every n-th frame of a video up to n - 1 may follow the last; of chosen ones, any number.
+    most = numbers.max() + steps[0] if len(steps) == 1 else math.inf if len(steps) else 1
+    if not numbers.max() < len(named) <= most:
+        last = f" or frames, the last with the number {numbers.max()} from 0" if most != len(frames) else ""
+        raise InputError(f"{file}: has {len(named)} times for {len(frames)} images{last}; give one for each, in order")
+    return [replace(frame, timestamp=named[number]) for frame, number in zip(frames, numbers.tolist(), strict=True)]
+
+
+def time_of(frame: Frame, file: str | Path) -> float | None:
+    """The same of one frame, by its number or name; None where a file that grows as the frames do has no time yet."""
+    try:
+        named = _read_times(file, file_state(file))
+        if isinstance(named, list):
+            return named[frame.number] if frame.number is not None and frame.number < len(named) else None
+        return _time_of(frame, named, file)
+    except InputError:
+        return None
+
+
+def _time_of(frame: Frame, named: dict[str, float], file: str | Path) -> float:
+    name = canonical_name(frame.path.name)
+    if name not in named:
+        raise InputError(f"{file}: has no time for {name}; add a line with its name and time")
+    return named[name]
+
+
+@lru_cache(maxsize=1)  # frames that are followed ask one after the other
+def _read_times(file: str | Path, state: tuple[int, int] | None) -> list[float] | dict[str, float]:
+    """The times in order, or by the names of the images, of a file in a state."""
+    text, where = read_text(file), str(file)
+    lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1)]
+    lines = [(n, line) for n, line in lines if line and not line.startswith("#")]
+    if lines and all(is_number(line) for _, line in lines):
+        return [float(line) for _, line in lines]
+    if not lines or not is_number(lines[0][1].split()[0]):
+        rows = csv_rows(text, where, _COLUMNS, ("name,timestamp",), ("s",))
+    else:
+        rows = []
+        for number, line in lines:
+            time, name = (*line.split(maxsplit=1), "")[:2]
+            if not name or not is_number(time):
+                wanted = f"a table with the columns {','.join(_COLUMNS)}, lines TIMESTAMP NAME, or one time a line"
+                raise InputError(f"{file}: line {number}: found '{line}'; give {wanted}")
+            rows.append(Row(f"{file}: line {number}", {"name": name, "timestamp": time}, "."))
+    return {name: row.needed("timestamp") for name, row in by_image(rows).items()}

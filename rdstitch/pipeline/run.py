@@ -1,0 +1,20 @@
+"""What all stages of one run have in common."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rdstitch.choices import Purpose
+from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.system.progress import Progress, silent
+
+
+@dataclass(frozen=True)
+class Run:
+    """What the user decided, and where results and progress go."""
+
+    options: StitchOptions
+    output: str | Path | None = None  # image to write; None for one in memory
+    beside: FilesBeside = NOTHING_BESIDE
+    progress: Progress = silent
+    purpose: Purpose = Purpose.MOSAIC
