@@ -115,7 +115,7 @@ def _fit(i: int, j: int, inliers: int = 50) -> LinkFit:
 def test_a_place_that_a_float_image_does_not_know_spoils_no_other() -> None:
     pixels = PLANE[:300, :400].astype(np.float32)
     pixels[10, 20] = np.nan
-    grey = ComparedImage.of(DecodedImage(pixels, None, Metadata()), LENS, np.eye(3)).grey
+    grey = ComparedImage.of(DecodedImage(pixels, None, Metadata(SIZE)), LENS, np.eye(3)).grey
     assert np.isfinite(grey).mean() > 0.99
 
 
