@@ -227,7 +227,7 @@ OF_PLACES = {
 as before."""
 
 
-SEEN_AT_SEAMS = {Kind.ROUGH, Kind.RELIEF, Kind.DEPTH_OF_A_TURN}
+SEEN_AT_SEAMS = {Kind.RELIEF, Kind.DEPTH_OF_A_TURN}
 """Kinds that the seams of a picture show, or do not."""
 
 
@@ -249,7 +249,9 @@ class Aloud(NamedTuple):
 
 ALOUD = {
     **dict.fromkeys((Kind.SHAPE_UNKNOWN, Kind.SHAPE_BENT, Kind.SHAPE_FREE), Aloud("flatness", _bent)),
-    **dict.fromkeys((Kind.ROUGH, Kind.RELIEF), Aloud("flatness", lambda evidence: evidence.flat or _seen(evidence))),
+    # Local alignment makes the seams of a picture hold over any ground, and leaves the whole bent.
+    Kind.ROUGH: Aloud("flatness", lambda evidence: evidence.flat or (_seen(evidence) and not evidence.purpose.picture)),
+    Kind.RELIEF: Aloud("flatness", lambda evidence: evidence.flat or _seen(evidence)),
     Kind.DEPTH_OF_A_TURN: Aloud("flatness", _seen),
 }
 """The gravest first; other kinds are always said, and before these."""

@@ -47,6 +47,8 @@ SMALL = evidence(registration(shape=replace(SHAPE, shift=1e4)), alike=0.8)
         (SHAPED, [Kind.RELIEF, Kind.SHAPE_BENT], [Kind.SHAPE_BENT]),  # one line says that the plane may be none
         (SMALL, [Kind.SHAPE_BENT], []),  # by more than an image
         (evidence(TURNED.registration, Purpose.MOSAIC, alike=0.1), [Kind.RELIEF, Kind.ROUGH], []),
+        # What local alignment hides along the seams of a plane leaves the whole bent.
+        (evidence(SHAPED.registration, Purpose.MOSAIC, alike=0.8), [Kind.RELIEF, Kind.ROUGH], [Kind.ROUGH]),
     ],
 )
 def test_what_is_said_aloud(found: Evidence, kinds: list[Kind], said: list[Kind]) -> None:
