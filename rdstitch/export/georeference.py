@@ -204,7 +204,7 @@ def has_place(positions: Sequence[GpsPosition | None]) -> bool:
     return len(known) >= MIN_POSITIONS
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Located:
     """Registered images, and what is known of where they are."""
 

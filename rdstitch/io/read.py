@@ -69,7 +69,7 @@ def _is_padding(complaint: str, data: bytes) -> bool:
 Pixels = NDArray[Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DecodedImage:
     """One image in memory."""
 

@@ -55,7 +55,7 @@ class Agreement:
         return 0.0 if math.isnan(self.coarsely) else self.cells * (1.0 - self.coarsely)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ComparedImage:
     """A registered image as it is compared."""
 
