@@ -131,7 +131,7 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         tried.append(laid(registration, no_local_alignment("seams hold better without it")))
     others = _others(registration, options, aligner, tried[0] if tried else None)
     # Of those that nothing speaks against, the most probable is taken.
-    while not (tried and tried[-1].clipped <= tried[0].clipped and not any(tried[-1].faults)):
+    while not (tried and tried[-1].clipped <= tried[0].clipped and not tried[-1].faults):
         if (other := next(others, None)) is None:
             break
         try:
