@@ -83,7 +83,7 @@ def _second_motions(
             camera = first.without_lens().with_focal()
             matches, other = pair.correspondences.take(rests[pair.images]), camera.resized(second.image_size)
             given.append(PairMatches(matches.points1, matches.points2, camera, other, -matches.ratio))
-        motions = estimate_radial_homographies(given, EstimationOptions("auto", None, threshold))
+        motions = estimate_radial_homographies(given, EstimationOptions(threshold=threshold))
         for pair, motion in zip(batch, motions, strict=True):
             if motion and int(motion.inliers.sum()) >= limit("inliers of a motion"):
                 inliers = np.zeros(len(pair.matches), dtype=np.bool_)
