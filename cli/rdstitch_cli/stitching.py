@@ -16,7 +16,6 @@ from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.option import Option
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import bytes_in_words, seconds_in_words
-from rdstitch.system.progress import StageTimer
 from rdstitch_cli.config import CONFIG_FILE
 from rdstitch_cli.flags import flags, flags_of, is_given, taken
 from rdstitch_cli.terminal import Reporter
@@ -118,11 +117,9 @@ def _check_written(read: Iterable[Path | None]) -> None:
             check_not_read([context.params[name]], files)
 
 
-def files_beside(reporter: Reporter, given: dict[str, Any]) -> FilesBeside:
+def files_beside(given: dict[str, Any]) -> FilesBeside:
     """Take the options of what is written beside a result out of a command's flags."""
-    return FilesBeside(
-        **taken(FilesBeside, given), command=shlex.join(["rdstitch", *sys.argv[1:]]), timer=StageTimer(reporter)
-    )
+    return FilesBeside(**taken(FilesBeside, given), command=shlex.join(["rdstitch", *sys.argv[1:]]))
 
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:

@@ -46,7 +46,7 @@ from rdstitch.sidecar.write import (
 from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
-from rdstitch.system.progress import Progress, silent
+from rdstitch.system.progress import Progress, StageTimer, silent
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -99,6 +99,7 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
     content = {
         **then,
         "version": VERSION,
+        "lambda": camera.distortion,
         "lambda_px": camera.distortion_px,
         "lambda_focal": camera.distortion_focal,
         "camera": {
@@ -229,22 +230,22 @@ def apply(
     if strict and doubts:
         raise InputError(doubts[0].text)
     given = as_inputs(images, channel_order)
-    if saved.content.get("stage") is not None:
+    if (stage := saved.record.stage) is not None:
         given = with_position_folders(given)
     with found_images(given, output=output, every=every, topic=topic) as listed, Outputs(overwrite) as outputs:
         if output is not None:
             check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
         given_frames: Sequence[Frame] = listed.frames
-        if (stage := saved.content.get("stage")) is not None:
-            given_frames, _, said = tile_frames(given_frames, stage.get("z"), stage.get("time"))
+        if stage is not None:
+            given_frames, _, said = tile_frames(given_frames, stage.z, stage.time)
             doubts += said
         chosen, matched, said = counterparts(saved, given_frames, match)
         doubts += said
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
         used = _used(saved, sources, left_out, mask, strict=strict)
-        if stage is not None and stage["pixel_um"] is not None:
-            used = {k: replace(s, metadata=replace(s.metadata, pixel_size=stage["pixel_um"])) for k, s in used.items()}
+        if stage is not None and stage.pixel_um is not None:
+            used = {k: replace(s, metadata=replace(s.metadata, pixel_size=stage.pixel_um)) for k, s in used.items()}
         if flat_field != "off":
             check_size(list(used.values()))
             corrected, said = with_flat_field(list(used.values()), flat_field)
@@ -266,7 +267,7 @@ def apply(
         settings = StitchOptions(
             composite=options, reference=reference, channel_order=channel_order, workers=workers, dry_run=dry_run
         )
-        run = Run(settings, output, progress=progress)
+        run = Run(settings, output, progress=StageTimer(progress))
         composed, said = compose_images(Layout.of(placed, options), run, outputs)
         result = Recomposition(
             saved=saved,
@@ -306,13 +307,12 @@ def _same_grid(
     saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions
 ) -> tuple[FloatArray, tuple[int, int], Georeference | None] | None:
     """The pixels of the saved output, where images of the same sizes are to have the same: bands, and dates."""
-    output = saved.content["output"]
+    output = saved.record.output
     asked = any(getattr(options, name) != getattr(saved.composite, name) for name in _GEOMETRY)
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
-    if asked or not same_sizes or saved.turned or not options.same_turn(saved.composite) or not output.get("size"):
+    if asked or not same_sizes or saved.turned or not options.same_turn(saved.composite) or output.size is None:
         return None
-    width, height = output["size"]
-    return np.array(output["plane_to_output"], dtype=np.float64), (width, height), saved.output_place
+    return np.array(output.plane_to_output, dtype=np.float64), output.size, saved.output_place
 
 
 def _lens_of_band(
@@ -344,7 +344,7 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens
         ],
         saved.turned,
         saved.place,
-        whole=saved.content.get("stage") is not None,
+        whole=saved.record.stage is not None,
         orientation=saved.orientation,
     )
 

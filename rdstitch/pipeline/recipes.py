@@ -36,7 +36,7 @@ from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.write import sidecar
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, TemporaryFolder, check_not_read, check_outputs, json_bytes, text_bytes
-from rdstitch.system.progress import Progress, silent
+from rdstitch.system.progress import Progress, StageTimer, silent
 from rdstitch.verification.verdict import RefusedError
 
 _NO_TIMES = Message(
@@ -88,7 +88,7 @@ def pano(
     >>> result.image.shape[2], result.ok
     (3, True)
     """
-    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, progress, Purpose.PANO))
+    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, StageTimer(progress), Purpose.PANO))
 
 
 @one_opencv_thread()
@@ -132,7 +132,7 @@ def mosaic(
     >>> result.output.name, result.registration.alignment.used.all()
     ('small.tif', np.True_)
     """
-    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, progress))
+    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, StageTimer(progress)))
 
 
 @one_opencv_thread()
@@ -182,7 +182,7 @@ def mosaic_blocks(
         options = replace(options, timestamps=None)
         frames = selected(listed.frames, options.exclude, options.include_only)
         names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
-        run = Run(options, beside=beside, progress=progress)
+        run = Run(options, beside=beside, progress=StageTimer(progress))
         further = names[1:]
         found = replace(listed, outputs=[], notes=())
         while len(frames) > 1 or not results:
@@ -301,7 +301,7 @@ def calibrate(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = options or StitchOptions()
-    run = Run(options, None, beside, progress, Purpose.CALIBRATE)
+    run = Run(options, None, beside, StageTimer(progress), Purpose.CALIBRATE)
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
         check_run(run, listed.files, ())
         sources, unread = read_inputs(with_times(listed.frames, options.timestamps), options, skip_bad=True)
@@ -309,7 +309,7 @@ def calibrate(
             result = _finished(at_full_size(_accepted(sources, [*unread, *listed.messages], run, executor)))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
-        return result.with_messages(stage_beside(beside, outputs, result))
+        return result.with_messages(stage_beside(run, outputs, result))
 
 
 @one_opencv_thread()
@@ -369,7 +369,7 @@ def trajectory(
         frames = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
         sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
         with options.executor(len(sources)) as executor:
-            run = Run(options, progress=progress, purpose=Purpose.TRAJECTORY)
+            run = Run(options, progress=StageTimer(progress), purpose=Purpose.TRAJECTORY)
             registration = at_full_size(_accepted(sources, [*unread, *listed.messages, *notes], run, executor))
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.
@@ -413,7 +413,7 @@ def _accepted(sources: Sequence[Source], known: Sequence[Message], run: Run, exe
         told = [str(replace(message, code="")) for message in told_once([*unread, *sources[0].guard.complaints])]
         error.args = ("; ".join([str(error), *told]),)
         if isinstance(error, RefusedError):
-            report_refused(run.beside, error.registration)
+            report_refused(run, error.registration)
         raise
 
 
@@ -432,7 +432,7 @@ def compose_registration(chosen: LaidOut, run: Run, outputs: Outputs, executor: 
     failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, options, outputs))
     failed += write_page(result, outputs, partial(viewed_images, result))
     result = result.with_messages(failed)
-    result = result.with_messages(stage_beside(run.beside, outputs, result))
+    result = result.with_messages(stage_beside(run, outputs, result))
     if run.output is not None:
         # Last: whoever finds it finds what it belongs to.
         outputs.write(f"{run.output}.json", json_bytes(sidecar(result)))

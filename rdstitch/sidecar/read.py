@@ -123,6 +123,24 @@ class LocalAlignmentRecord(Struct):
     held_out_px: BeforeAfter
 
 
+class BreakRecord(Struct):
+    """Where a seam is broken, px of the output."""
+
+    images: tuple[str, str]
+    x: float
+    y: float
+    length_px: NonNegative
+    shift_px: NonNegative | None
+
+
+class SeamsRecord(Struct):
+    """Where seams can be judged, and where they are broken."""
+
+    places: Count
+    broken: Count
+    breaks: list[BreakRecord]
+
+
 class Displacement(Struct):
     """What local alignment adds to the pixels of an image, on a grid from its first to its last pixel."""
 
@@ -293,6 +311,7 @@ class SidecarRecord(Struct, kw_only=True):
     reference: str
     output: OutputRecord
     local_alignment: LocalAlignmentRecord | None = None
+    seams: SeamsRecord | None = None
     stage: StageRecord | None = None
     images: Annotated[list[ImageRecord], Meta(min_length=1)]
     pairs: list[PairRecord]
@@ -314,24 +333,37 @@ def json_schema() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class SavedRegistration:
-    """A registration as its sidecar tells it."""
+    """A registration as its sidecar has it."""
 
     path: Path  # of the sidecar
-    images: tuple[ImageRecord, ...]
+    record: SidecarRecord
     reference: int  # the image whose resolution the output has
-    distortion: float  # λ in the half-diagonal frame
-    turned: bool  # whether the camera turned on the spot, so that ``to_plane`` leads to directions
     composite: CompositeOptions  # what the image was composited with
-    orientation: FloatArray | None  # (3, 3): what the registered images were turned by to be at ``to_plane``
     output_place: Georeference | None  # of the output's pixels, where that was georeferenced
-    content: dict[str, Any]  # the whole sidecar
+    content: dict[str, Any]  # the whole sidecar, with fields that this version does not have
+
+    @property
+    def images(self) -> list[ImageRecord]:
+        """Those of the registration, used or not."""
+        return self.record.images
+
+    @property
+    def turned(self) -> bool:
+        """Whether the camera turned on the spot, so that ``to_plane`` leads to directions."""
+        return self.record.model == "rotation"
+
+    @property
+    def orientation(self) -> FloatArray | None:
+        """What the registered images were turned by to be at ``to_plane``, (3, 3); None where they were not."""
+        matrix = self.record.output.orientation
+        return None if matrix is None else np.array(matrix, dtype=np.float64)
 
     @property
     def place(self) -> Georeference | None:
         """Of the plane, where the output was georeferenced."""
         if self.output_place is None:
             return None
-        matrix = np.array(self.content["output"]["plane_to_output"], dtype=np.float64)
+        matrix = np.array(self.record.output.plane_to_output, dtype=np.float64)
         return self.output_place.after(np.linalg.inv(matrix).astype(np.float64))
 
 
@@ -348,30 +380,25 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
         composite = CompositeOptions(**record.options.composite)
     except ArgumentError as error:
         raise InputError(f"{path}: options.composite.{error}") from error
-    turned = record.model == "rotation"
-    if composite.projection == "auto" and turned:
+    if composite.projection == "auto" and record.model == "rotation":
         composite = replace(composite, projection=record.output.projection or "auto")
     reference = next(k for k, image in enumerate(record.images) if image.name == record.reference and image.used)
     try:
         place = _place(record.output)
     except ArgumentError as error:
         raise InputError(f"{path}: output.georeference.crs: {error}") from error
-    matrix = record.output.orientation
-    orientation = None if matrix is None else np.array(matrix, dtype=np.float64)
-    return SavedRegistration(
-        Path(path), tuple(record.images), reference, record.lambda_, turned, composite, orientation, place, content
-    )
+    return SavedRegistration(Path(path), record, reference, composite, place, content)
 
 
 def mismatch_with_image(saved: SavedRegistration) -> str:
     """Why the image beside a sidecar is not the one that it was written with; empty where it is, or is not there."""
-    output = saved.content["output"]
-    if output.get("sha256") is None or output.get("file") is None:
+    output = saved.record.output
+    if output.sha256 is None or output.bytes is None or output.file is None:
         return ""
-    image = saved.path.with_name(output["file"])
+    image = saved.path.with_name(output.file)
     tiles = tiles_folder(image) if image.suffix.lower() == ".dzi" else None
     try:
-        same = fingerprint(image, tiles) == Fingerprint(output.get("bytes"), output["sha256"])
+        same = fingerprint(image, tiles) == Fingerprint(output.bytes, output.sha256)
     except OSError:
         return ""
     return "" if same else f"{image}: is not the image that {saved.path.name} was written with; one of them is newer"

@@ -80,7 +80,7 @@ def _reads_or_complains(content: bytes) -> None:
 def test_a_good_one_is_read_whole(tmp_path: Path) -> None:
     saved = read_sidecar(_write(tmp_path, json.dumps(GOOD).encode()))
     used, left_out, unread = saved.images
-    assert (saved.reference, saved.distortion, saved.composite) == (0, -0.2, StitchOptions().composite)
+    assert (saved.reference, saved.record.lambda_, saved.composite) == (0, -0.2, StitchOptions().composite)
     assert (used.camera.image_size, used.camera.focal, used.camera.focal_source) == ((400, 300), 380.0, "exif")
     assert list(map(list, used.to_plane)) == _IMAGE["to_plane"]
     assert (left_out.to_plane, left_out.reason) == (None, "no overlap")

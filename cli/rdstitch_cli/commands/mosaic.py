@@ -102,13 +102,13 @@ def mosaic(
     with ExitStack() as stack:
         named = list(inputs) if following else resolve(inputs)
         with_poses = given["poses"] is not None
-        beside = files_beside(reporter, given)
+        beside = files_beside(given)
         stitch = stitch_options(reporter, given, pose_covariance=with_poses)
         paths: Sequence[Named] = named
         if following:
             watched: dict[str, Any] = {"output": output, "every": every, "idle": idle, "refresh": refresh}
             paths = stack.enter_context(live.followed(inputs, stitch, reporter, **watched, beside=beside))
-        how: dict[str, Any] = {"every": every, "progress": beside.timer, "beside": beside}
+        how: dict[str, Any] = {"every": every, "progress": reporter, "beside": beside}
         others: Sequence[Recomposition] = ()
         if patterns:
             from rdstitch.pipeline.bands import mosaic_bands
