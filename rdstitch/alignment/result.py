@@ -97,7 +97,7 @@ class ShapeTest:
     cause: str  # what is most likely to be left out
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class Alignment:
     """All images registered as one.
 
@@ -166,17 +166,17 @@ class Alignment:
     reference: int
     model: str
     model_reason: str
-    poses: PlanarPoses | None
-    tilt: tuple[float, float] | None
-    tilt_spread: float
-    focal: float | None
-    focal_std: float | None
+    poses: PlanarPoses | None = None
+    tilt: tuple[float, float] | None = None
+    tilt_spread: float = 0.0
+    focal: float | None = None
+    focal_std: float | None = None
     distortion: float
     distortion_std: float
-    lens: str
+    lens: str = "division"
     lens_reason: str
-    parameters: tuple[str, ...]
-    covariance: FloatArray
+    parameters: tuple[str, ...] = ()
+    covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     rms: float
     links: tuple[LinkFit, ...]
     relief: ReliefTest

@@ -201,6 +201,19 @@ def has_place(positions: Sequence[GpsPosition | None]) -> bool:
     return len(known) >= MIN_POSITIONS
 
 
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """Places that were measured, of cameras or of points on the ground (N)."""
+
+    source: str
+    names: list[str]
+    degrees: list[tuple[float, float]]  # latitude and longitude
+    altitude: FloatArray  # (N,), m; NaN where not known
+    std: FloatArray  # (N, 2): of a horizontal coordinate and of the altitude, m; NaN where not known
+    leverage: FloatArray  # (N,): how far each has put itself where the images have it
+    views: Views  # where they are in the output
+
+
 @dataclass(frozen=True)
 class Located:
     """Registered images, and what is known of where they are."""
@@ -238,14 +251,16 @@ def _by_positions(located: Located, epsg: int | None, force: bool) -> tuple[Geor
         return None, "all images have the same GPS position"
     views = views_of(located.cameras, located.to_output, located.nadirs).of(known)
     std = np.array([(np.nan, np.nan) if place.std is None else place.std for place in places])
-    names = [name for name, is_known in zip(located.names, known.tolist(), strict=True) if is_known]
-    leverage = [located.leverage.get(k, 0.0) for k in np.flatnonzero(known).tolist()]
-    degrees = [(p.latitude, p.longitude) for p in places]
-    return _placed(located, views, degrees, _altitudes(places), std, leverage, names, epsg, force, GPS)
-
-
-def _altitudes(places: Sequence[GpsPosition]) -> FloatArray:
-    return np.array([np.nan if place.altitude is None else place.altitude for place in places])
+    measured = _Measured(
+        GPS,
+        [name for name, is_known in zip(located.names, known.tolist(), strict=True) if is_known],
+        [(place.latitude, place.longitude) for place in places],
+        np.array([np.nan if place.altitude is None else place.altitude for place in places]),
+        std,
+        np.array([located.leverage.get(k, 0.0) for k in np.flatnonzero(known).tolist()]),
+        views,
+    )
+    return _placed(located, measured, epsg, force)
 
 
 def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georeference | None, str]:
@@ -264,12 +279,17 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
         epsg = control[0][0].epsg
     seen = views_of(located.cameras, located.to_output, located.nadirs)
     views = replace(Views.of_ground(np.array([pixel for _, pixel in control])), pixel=seen.pixel)
-    std = np.array([[np.nan if point.std is None else point.std] * 2 for point, _ in control])
-    degrees = [(point.place.latitude, point.place.longitude) for point, _ in control]
     names = [point.name for point, _ in control]
-    leverage = [located.leverage.get(name, 0.0) for name in names]
-    none = np.full(len(names), np.nan)
-    place, reason = _placed(located, views, degrees, none, std, leverage, names, epsg, force, CONTROL)
+    measured = _Measured(
+        CONTROL,
+        names,
+        [(point.place.latitude, point.place.longitude) for point, _ in control],
+        np.full(len(names), np.nan),
+        np.array([[np.nan if point.std is None else point.std] * 2 for point, _ in control]),
+        np.array([located.leverage.get(name, 0.0) for name in names]),
+        views,
+    )
+    place, reason = _placed(located, measured, epsg, force)
     if place is None or not checks:
         return place, reason
     latitude, longitude = np.array([(p.place.latitude, p.place.longitude) for p, _ in checks]).T
@@ -281,28 +301,18 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
     return replace(place, checks=tuple(residuals)), reason
 
 
-def _placed(
-    located: Located,
-    views: Views,
-    degrees: Sequence[tuple[float, float]],
-    altitude: FloatArray,
-    accuracy: FloatArray,
-    leverage: Sequence[float],
-    names: Sequence[str],
-    epsg: int | None,
-    force: bool,
-    source: str,
-) -> tuple[Georeference | None, str]:
+def _placed(located: Located, measured: _Measured, epsg: int | None, force: bool) -> tuple[Georeference | None, str]:
     """Place the output by some positions."""
-    latitude, longitude = np.array(degrees).T
+    source, names, views = measured.source, measured.names, measured.views
+    latitude, longitude = np.array(measured.degrees).T
     crs = Crs.nearest(latitude, longitude) if epsg is None else Crs(epsg)
     map_scale = crs.map_scale(*middle(latitude, longitude))
     places = crs.project(latitude, longitude) @ np.array([1, 1j])
     usable: BoolArray = np.isfinite(places) & views.usable
     if usable.sum() < MIN_POSITIONS:
         return None, f"{crs.name} does not reach the {source}"
-    own = np.array(leverage)[usable]
-    fit = fit_map(views.of(usable), places[usable], altitude[usable], accuracy[usable], map_scale, own)
+    altitude, std, leverage = (part[usable] for part in (measured.altitude, measured.std, measured.leverage))
+    fit = fit_map(views.of(usable), places[usable], altitude, std, map_scale, leverage)
     used = np.zeros(len(names), dtype=bool)
     used[usable] = fit.used
     off = np.full(len(names), complex(np.inf))
@@ -323,9 +333,9 @@ def _placed(
     hills = located.relief * views.pixel
     if located.lever_std and np.isfinite(views.height).any():
         hills = located.lever_std * float(np.nanmedian(views.height))
-    std = None if fit.std is None else math.hypot(fit.std, hills * abs(fit.scale))
+    map_std = None if fit.std is None else math.hypot(fit.std, hills * abs(fit.scale))
     place = Georeference(
-        crs, fit.scale, fit.origin, rms, source, residuals, std, map_scale=map_scale, assumption=assumption
+        crs, fit.scale, fit.origin, rms, source, residuals, map_std, map_scale=map_scale, assumption=assumption
     )
     return place, reason
 

@@ -12,7 +12,7 @@ import tempfile
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
-from itertools import accumulate
+from itertools import accumulate, islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -70,13 +70,9 @@ def written_strips(path: Path) -> Iterator[Strip]:
         mask = next((each for each in (other.aspage() for other in others) if each.subfiletype == _MASK), None)
         width, height = page.imagewidth, page.imagelength
         across, last_is_alpha = -(-width // _TILE), any(page.extrasamples[-1:])
-        for top in range(0, height, _TILE):
-            first = top // _TILE * across
-            rows = [
-                np.concatenate([_tile(tiff, each, first + k) for k in range(across)], axis=1)[: height - top, :width]
-                for each in (page, mask)
-                if each is not None
-            ]
+        tiles = [each.segments(sort=True) for each in (page, mask) if each is not None]
+        for _ in range(0, height, _TILE):
+            rows = [_row(list(islice(each, across))) for each in tiles]
             if mask is not None:
                 yield rows[0], np.where(rows[1][..., 0] > 0, 255, 0).astype(np.uint8)
             elif last_is_alpha:
@@ -86,13 +82,9 @@ def written_strips(path: Path) -> Iterator[Strip]:
                 yield rows[0], None
 
 
-def _tile(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage", index: int) -> NDArray[Any]:
-    """A tile (h, w, C), completed."""
-    tiff.filehandle.seek(page.dataoffsets[index])
-    samples, _, _ = page.decode(tiff.filehandle.read(page.databytecounts[index]), index)
-    assert samples is not None
-    tile = samples[0]
-    return np.pad(tile, [(0, _TILE - tile.shape[0]), (0, _TILE - tile.shape[1]), (0, 0)])
+def _row(tiles: list[Any]) -> NDArray[Any]:
+    """Tiles beside each other as one (h, W, C), without what lies beyond the image; they come with place and shape."""
+    return np.concatenate([samples[0, : shape[1], : shape[2]] for samples, _, shape in tiles], axis=1)
 
 
 def _has_mask(layout: Layout) -> bool:

@@ -319,7 +319,6 @@ def trajectory(
     options: StitchOptions | None = None,
     *,
     layout: TrajectoryFormat = "csv",
-    timestamps: str | Path | None = None,
     plot: str | Path | None = None,
     height: float | None = None,
     frame: TrajectoryFrame | None = None,
@@ -337,8 +336,6 @@ def trajectory(
     layout : str
         "csv", "tum" or "kitti", see :mod:`rdstitch.export.trajectory_files`; "bag": ``nav_msgs/Odometry``, see
         :mod:`rdstitch.export.odometry_bag`.
-    timestamps : path, optional
-        As in ``options``.
     plot : path, optional
         SVG file to draw the path to.
     height : float, optional
@@ -353,7 +350,6 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = replace(options or StitchOptions(), pose_covariance=True)
-    options = options if timestamps is None else replace(options, timestamps=timestamps)
     replaced: list[Path] = []  # a bag that is a folder
     if layout == "bag" and output is not None:
         check_bag(Path(output), overwrite=options.overwrite)

@@ -77,13 +77,13 @@ def _check_place(file: Path, overwrite: bool) -> None:
     """What the file system says of one output."""
     folder = file.parent
     if is_zarr(file):
-        check_zarr_folder(file, overwrite)
+        check_folder(file, overwrite)
     elif file.is_dir():
         raise OutputError(f"{file}: is a folder; choose another name")
     if not folder.is_dir():
         raise OutputError(f"{file}: the folder {folder} does not exist; create it first")
     if file.suffix.lower() == ".dzi":
-        check_tiles_folder(tiles_folder(Path(os.path.realpath(file))), overwrite)
+        check_folder(tiles_folder(Path(os.path.realpath(file))), overwrite)
     if file.is_symlink() and not file.exists():
         raise OutputError(f"{file}: is a link to nothing; remove it, or choose another name")
     if file.exists() and not is_zarr(file):
@@ -142,28 +142,24 @@ def tiles_folder(path: Path) -> Path:
     return path.with_name(f"{path.stem}_files")
 
 
-def check_tiles_folder(folder: Path, overwrite: bool) -> None:
-    """Refuse to replace a folder that is to be kept, or in which anything is no tile."""
+def check_folder(folder: Path, overwrite: bool) -> None:
+    """Refuse to replace a folder that is to be kept, or that holds anything but Deep Zoom tiles, or an OME-Zarr image.
+
+    The latter's name says so.
+    """
     if not folder.exists():
         return
     if not overwrite:
         raise OutputError(f"{folder}: exists already; choose another name or use --overwrite")
-    if folder.is_symlink() or not folder.is_dir() or not holds_only_tiles(folder):
-        raise OutputError(f"{folder}: is a link, or holds other files than Deep Zoom tiles; choose another name")
+    chunks = is_zarr(folder)
+    holds_only, what = (_holds_only_chunks, "an OME-Zarr image") if chunks else (holds_only_tiles, "Deep Zoom tiles")
+    if folder.is_symlink() or not folder.is_dir() or not holds_only(folder):
+        raise OutputError(f"{folder}: is a link, or holds other files than {what}; choose another name")
 
 
 def is_zarr(path: str | Path) -> bool:
     """Whether an image is a folder of chunks."""
     return Path(path).suffix.lower() == ".zarr"
-
-
-def check_zarr_folder(folder: Path, overwrite: bool) -> None:
-    """Refuse to replace a folder that is to be kept, or that is no image in chunks."""
-    if folder.exists():
-        if not overwrite:
-            raise OutputError(f"{folder}: exists already; choose another name or use --overwrite")
-        if folder.is_symlink() or not folder.is_dir() or not _holds_only_chunks(folder):
-            raise OutputError(f"{folder}: is a link, or holds other files than an OME-Zarr image; choose another name")
 
 
 def _holds_only_chunks(folder: Path) -> bool:
@@ -416,7 +412,7 @@ class Outputs:
         if not item.is_folder:
             item.staged.chmod(item.place.stat().st_mode & 0o777)
         elif is_zarr(item.place):
-            check_zarr_folder(item.place, overwrite=True)
+            check_folder(item.place, overwrite=True)
         elif not holds_only_tiles(item.place):
             raise OutputError(f"{item.name}: holds other files than Deep Zoom tiles; choose another name")
 
