@@ -1,11 +1,13 @@
-"""Random damage to sidecars and camera files is refused by name."""
+"""Random damage to sidecars, camera files and other records is refused by name."""
 
 import json
 import re
 import tempfile
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,8 +16,10 @@ from rdstitch.camera_files import load_camera, save_camera
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.sidecar import write
 from rdstitch.sidecar.read import read_sidecar
 from rdstitch.sidecar.write import plain
+from rdstitch.system.records import parse_json
 from tests.damaged_texts import damaged, damaged_text
 
 _IMAGE = {
@@ -200,3 +204,29 @@ def test_damaged_camera_fields(content: object) -> None:
 @given(st.binary(max_size=100) | st.sampled_from(TEXTS).flatmap(damaged_text))
 def test_damaged_camera_text(content: bytes) -> None:
     _loads_or_complains(content)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"a": ["b", {"c": "x\\u0000y"}]}', "r.json: a[1].c: holds a NUL character"),
+        ('{"a": [1, NaN]}', "r.json: a[1]: expected a finite number, not nan"),
+        ("[" * 60 + "]" * 60, "is nested too deeply"),
+        ("{", "r.json: is not JSON: "),
+    ],
+)
+def test_what_no_record_may_hold_is_named(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=re.escape(message)):
+        parse_json(text, "r.json")
+
+
+def test_another_wheel_of_opencv_will_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    def only_rdstitch(name: str) -> str:
+        if name != "rdstitch":
+            raise PackageNotFoundError(name)
+        return "1.2"
+
+    monkeypatch.setattr("importlib.metadata.version", only_rdstitch)
+    found = write.versions()
+    assert (found["rdstitch"], found["opencv"]) == ("1.2", cv2.__version__)
+    assert all(found.values())

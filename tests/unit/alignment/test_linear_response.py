@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, FreeParameters, Parameters
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors, whitened_errors
@@ -14,7 +15,6 @@ from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.radial_homography import inverses, project
 from rdstitch.robust.posterior import Prior
-from tests.alignment_scenes import grid, scene
 
 LENS = np.array([True, True, False, False, False])
 
