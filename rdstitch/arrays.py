@@ -10,6 +10,11 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
+def evenly_spaced(count: int, most: int) -> IntArray:
+    """Indices of at most so many of ``count`` things, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
+
+
 class Rows:
     """Base of dataclasses of arrays, or of other such dataclasses, that have the first axis in common."""
 

@@ -19,6 +19,7 @@ from rdstitch.io.deepzoom import write_deep_zoom
 from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, as_eight_bit, check_strips, jpeg_pieces, png_pieces
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.ome_zarr import check_zarr, write_ome_zarr
+from rdstitch.io.samples import OPAQUE
 from rdstitch.io.tiff import OME_SUFFIXES, ExtraTag, write_ome_tiff, write_tiff
 from rdstitch.system.outputs import (
     IMAGE_SUFFIXES,
@@ -38,7 +39,6 @@ _JPEG = (".jpg", ".jpeg")
 _WEBP_EFFORT = 4
 # The samples, Pillow's copy of them, the encoder's own, and the output; measured: 13 to 16 with 4 and 16 megapixels.
 _WEBP_BYTES_PER_PIXEL = 20
-_OPAQUE = 255
 _ROWS_AT_A_TIME = 4 * STRIP_ROWS
 
 
@@ -172,7 +172,7 @@ def _webp(layout: Layout, strips: Iterable[Strip]) -> bytes:
         # Grey goes to all three colours.
         rows[..., :3] = as_eight_bit(strip[0])
         if layout.transparent:
-            rows[..., 3] = _OPAQUE if strip[1] is None else strip[1]
+            rows[..., 3] = OPAQUE if strip[1] is None else strip[1]
         top += len(rows)
     stream = io.BytesIO()
     Image.fromarray(samples).save(

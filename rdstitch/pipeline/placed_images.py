@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.choices import LocalAlignmentMode
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.compositing.canvas import NearPart
@@ -115,7 +115,7 @@ class PlacedImages:
         if self.whole or count < MIN_IMAGES:
             return None
         alike = [s for s, camera in zip(self.sources, self.cameras, strict=True) if camera.image_size == size]
-        chosen = np.linspace(0, count - 1, min(count, _COMPARED)).astype(np.intp).tolist()
+        chosen = evenly_spaced(count, _COMPARED).tolist()
         reduction = fitting_reduction(max(size) / _COMPARED_SIDE)
         return static_pixels([alike[k].read(reduction, keep=True).pixels for k in chosen])
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.result import LinkFit, ReliefTest, Unused
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Correspondences
 from rdstitch.geometry.camera import Camera
@@ -293,7 +293,7 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
     assert field is not None
     raw = [replace(source, flat_field=None) for source in sources]
     pairs = tiled.links.tiles[tiled.adjustment.weights > 0.5]
-    chosen = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _COMPARED)).astype(np.intp))]
+    chosen = pairs[evenly_spaced(len(pairs), _COMPARED)]
     places = tiled.adjustment.places
     compared = ((raw[a].read().pixels, raw[b].read().pixels, places[b] - places[a]) for a, b in chosen.tolist())
     return agrees_with_overlaps(field, compared)

@@ -11,6 +11,9 @@ from rdstitch.arrays import FloatArray
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a two-dimensional normal vector of standard deviation 1: ``sqrt(2 log 2)``."""
 
+NORMAL_MEDIAN = 0.6745
+"""Median absolute value of a normal variable of standard deviation 1."""
+
 PAIR_WIDTH, ALIGNMENT_WIDTH = 4.0, 3.5
 """Widths of the loss in standard deviations of an error's coordinate.
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.io.reduction import block_mean
+from rdstitch.robust.loss import NORMAL_MEDIAN
 from rdstitch.system.late_imports import fft
 
 Image = NDArray[np.float32]
@@ -250,7 +251,7 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
     aside = (np.abs(y)[:, None] > _ASIDE * height) | (np.abs(x) > _ASIDE * width)
     broad = (common[0][:, None] > 0.5 * height) | (common[1] > 0.5 * width)
     possible = aside & broad & (common[0][:, None] > least[0]) & (common[1] > least[1])
-    deviation = float(np.median(np.abs(surface[possible]))) / 0.6745 + 1e-12
+    deviation = float(np.median(np.abs(surface[possible]))) / NORMAL_MEDIAN + 1e-12
     found: dict[tuple[int, int], None] = {}
     # A pattern that repeats itself is as high in many places of the plain correlation, and in chance ones of the other.
     for values, threshold in ((surface, peak_threshold(deviation, surface.size)), (plain, 0.0)):
@@ -292,7 +293,7 @@ def noise_variance(part: Image) -> float:
     """Variance of white noise in an image, by second differences, which content hardly has; half of them count."""
     rows = part[::2]
     second = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]
-    deviation = float(np.median(np.abs(second))) / 0.6745
+    deviation = float(np.median(np.abs(second))) / NORMAL_MEDIAN
     return deviation**2 / 6.0
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
+from rdstitch.robust.loss import NORMAL_MEDIAN
 from rdstitch.stage.adjustment import Adjustment, LinkedPoints, adjust
 from rdstitch.stage.correlation import (
     CoarseTile,
@@ -380,7 +381,7 @@ def _transfer(overlap: Overlap, offset: FloatArray, camera: Camera) -> Transfer:
 
 def _threshold(total: FloatArray, radius: int) -> float:
     """Height that a peak of noise hardly reaches within a window."""
-    deviation = float(np.median(np.abs(total))) / 0.6745
+    deviation = float(np.median(np.abs(total))) / NORMAL_MEDIAN
     return peak_threshold(deviation, (2 * radius + 1) ** 2)
 
 
