@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rdstitch.alignment.result import Alignment
+from rdstitch.choices import Purpose
 from rdstitch.compositing.projection import PLANE
 from rdstitch.errors import ArgumentError, LimitError, RdstitchError
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
@@ -87,11 +88,12 @@ def lay_out(registration: Registration, local: LocalAlignment, options: Composit
     return LaidOut(registration, local, Layout.of(placed, options), tuple(said))
 
 
-def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner, *, pano: bool) -> LaidOut:
-    """The layout whose seams hold, or break the least.
+def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner) -> LaidOut:
+    """The layout whose seams hold, or break the least; of a panorama always in the frame of an image.
 
-    Pixels are those of the working size; with ``pano`` the output is always in the frame of an image.
+    Pixels are those of the working size.
     """
+    pano = aligner.options.purpose is Purpose.PANO
 
     def laid(candidate: Registration, local: LocalAlignment | None = None) -> LaidOut:
         whole = on_whole_pixels(with_frontal_reference(at_full_size(candidate), options, always=pano))

@@ -267,8 +267,7 @@ def _stitch_found(listed: FoundImages, run: Run, outputs: Outputs, further: Sequ
             run = replace(run, options=replace(options, reference=accepted.sources[first].name))
             accepted = _accepted(sources, known, run, executor)
         run.progress("laying out", 0, 1)
-        aligner = aligner_of(accepted, run.options, run.purpose)
-        chosen = choose_layout(accepted, run.options, aligner, pano=run.purpose is Purpose.PANO)
+        chosen = choose_layout(accepted, run.options, aligner_of(accepted, run.options, run.purpose))
         return compose_registration(chosen, run, outputs, executor)
 
 
