@@ -71,8 +71,13 @@ def written_strips(path: Path) -> Iterator[Strip]:
         width, height = page.imagewidth, page.imagelength
         across, last_is_alpha = -(-width // _TILE), any(page.extrasamples[-1:])
         tiles = [each.segments(sort=True) for each in (page, mask) if each is not None]
-        for _ in range(0, height, _TILE):
-            rows = [_row(list(islice(each, across))) for each in tiles]
+        for top in range(0, height, _TILE):
+            rows = [
+                np.concatenate([samples[0] for samples, *_ in islice(each, across) if samples is not None], axis=1)[
+                    : height - top, :width
+                ]
+                for each in tiles
+            ]
             if mask is not None:
                 yield rows[0], np.where(rows[1][..., 0] > 0, 255, 0).astype(np.uint8)
             elif last_is_alpha:
@@ -80,11 +85,6 @@ def written_strips(path: Path) -> Iterator[Strip]:
                 yield rows[0][..., :-1], np.rint(rows[0][..., -1] * (255.0 / full)).astype(np.uint8)
             else:
                 yield rows[0], None
-
-
-def _row(tiles: list[Any]) -> NDArray[Any]:
-    """Tiles beside each other as one (h, W, C), without what lies beyond the image; they come with place and shape."""
-    return np.concatenate([samples[0, : shape[1], : shape[2]] for samples, _, shape in tiles], axis=1)
 
 
 def _has_mask(layout: Layout) -> bool:
