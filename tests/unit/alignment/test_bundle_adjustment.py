@@ -7,7 +7,7 @@ from examples.worlds.alignment_scenes import Scene, grid, jittered, scene
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, sigma_of
 from rdstitch.alignment.link_equations import link_equations, squared_lengths, trial_errors
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, MotionModel
-from rdstitch.alignment.normal_equations import PoseBlocks, chain
+from rdstitch.alignment.normal_equations import SparseNormalEquations, chain
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors
 from rdstitch.geometry.radial_homography import transfer_jacobian
@@ -29,6 +29,19 @@ def _start(model: MotionModel, truth: Scene) -> Parameters:
     return Parameters(poses, shared, np.array([-0.23, 0.01, -0.02, 0.004, -0.006]))
 
 
+def _dense(normal: SparseNormalEquations, observations: Observations) -> np.ndarray:
+    """The whole matrix of the free parameters."""
+    (count, size), shared = normal.free.shape, len(normal.shared)
+    poses, images = np.zeros((count, count, size, size)), np.arange(count)
+    poses[images, images] = normal.poses
+    poses[observations.image2, observations.image1] += normal.links
+    poses[observations.image1, observations.image2] += normal.links.swapaxes(1, 2)
+    rows, coupling = poses.swapaxes(1, 2).reshape(count * size, -1), normal.coupling.reshape(-1, shared)
+    free = np.append(normal.free.ravel(), np.ones(shared, dtype=np.bool_))
+    dense: np.ndarray = np.block([[rows, coupling], [coupling.T, normal.shared]])[np.ix_(free, free)]
+    return dense
+
+
 @pytest.mark.parametrize("width", [2.0, 20.0])  # px; the errors at the start are of some twenty
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: float) -> None:
@@ -45,29 +58,28 @@ def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: flo
     free = np.ones((count, model.pose_size), dtype=np.bool_)
     free[0] = False
     matrices = model.matrices(start.poses, start.shared)
-    normal = chain(equations, observations, matrices, homographies(start), PoseBlocks.of(observations, free), 2.0)
+    normal = chain(equations, observations, matrices, homographies(start), free, 2.0)
 
     def cost(poses_step: np.ndarray, shared_step: np.ndarray) -> float:
-        step = np.zeros((count, model.pose_size))
-        step[free] = poses_step
-        moved = start.retract(model, step, shared_step, FREE_LENS)
+        moved = start.retract(model, poses_step, shared_step, FREE_LENS)
         errors = trial_errors(observations, homographies(moved), moved.lens, equations.whitening)
         return 2.0 * float(robust_cost(squared_lengths(errors), width).sum())
 
     rng = np.random.default_rng(0)
     for _ in range(4):
-        along = rng.normal(size=int(free.sum())), rng.normal(size=len(start.shared) + len(FREE_LENS))
+        along = rng.normal(size=free.shape) * free, rng.normal(size=len(start.shared) + len(FREE_LENS))
         step = 1e-6
         numeric = (cost(step * along[0], step * along[1]) - cost(-step * along[0], -step * along[1])) / (2 * step)
-        analytic = 2.0 * float(normal.gradient_poses @ along[0] + normal.gradient_shared @ along[1])
+        analytic = 2.0 * float(np.vdot(normal.gradient_poses, along[0]) + normal.gradient_shared @ along[1])
         assert analytic == pytest.approx(numeric, rel=1e-5)
 
     # the step solves the dense system
-    poses = normal.blocks.matrix(normal.poses).toarray()
-    dense = np.block([[poses, normal.coupling], [normal.coupling.T, normal.shared]])
-    right = -np.concatenate([normal.gradient_poses, normal.gradient_shared])
-    damped = dense + 1e-3 * np.diag(np.diag(dense))
-    np.testing.assert_allclose(np.concatenate(normal.solve(1e-3)), np.linalg.solve(damped, right), rtol=1e-6, atol=1e-9)
+    dense = _dense(normal, observations)
+    right = -np.concatenate([normal.gradient_poses[free], normal.gradient_shared])
+    poses, shared = normal.solve(1e-3)
+    expected = np.linalg.solve(dense + 1e-3 * np.diag(np.diag(dense)), right)
+    np.testing.assert_allclose(np.concatenate([poses[free], shared]), expected, rtol=1e-6, atol=1e-9)
+    assert not poses[~free].any()
 
 
 @pytest.mark.parametrize("free", [ONE_LENS, FREE_LENS, np.zeros(5, dtype=np.bool_)], ids=["one", "all", "none"])
@@ -102,14 +114,22 @@ def test_information_on_shared_parameters_is_what_elimination_leaves() -> None:
         observations,
         matrices,
         h,
-        PoseBlocks.of(observations, free),
+        free,
         1.0,
     )
-    normal = normal.with_priors(np.full(int(free.sum()), 1e4), np.zeros(int(free.sum())), np.eye(4), np.zeros(4))
-    poses = normal.blocks.matrix(normal.poses).toarray()
-    dense = np.block([[poses, normal.coupling], [normal.coupling.T, normal.shared]])
-    expected = np.linalg.inv(np.linalg.inv(dense)[-4:, -4:])
+    normal = normal.with_priors(np.full(free.shape, 1e4), np.zeros(free.shape), np.eye(4), np.zeros(4))
+    inverse = np.linalg.inv(_dense(normal, observations))
+    expected = np.linalg.inv(inverse[-4:, -4:])
     np.testing.assert_allclose(normal.shared_information(), expected, rtol=1e-5, atol=1e-5)
+    # and of the inverse each image's own block, and those with the shared parameters
+    whole, size = np.zeros((free.size + 4, free.size + 4)), free.shape[1]
+    whole[np.ix_(*[np.append(free.ravel(), [True] * 4)] * 2)] = inverse
+    own, by_shared, of_shared = normal.pose_covariances()
+    for k in range(len(free)):
+        rows = slice(k * size, (k + 1) * size)
+        np.testing.assert_allclose(own[k], whole[rows, rows], rtol=1e-6, atol=1e-9 * np.abs(inverse).max())
+        np.testing.assert_allclose(by_shared[k], whole[rows, -4:], rtol=1e-6, atol=1e-9 * np.abs(inverse).max())
+    np.testing.assert_allclose(of_shared, inverse[-4:, -4:], rtol=1e-6)
 
 
 def _adjust(model: MotionModel, truth: Scene, seen: Observations) -> tuple[float, float]:
