@@ -84,9 +84,9 @@ def mosaic(
     list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
+    from rdstitch.pipeline.blocks import mosaic_blocks
     from rdstitch.pipeline.map_server import map_files, write_map
     from rdstitch.pipeline.recipes import mosaic as recipe
-    from rdstitch.pipeline.recipes import mosaic_blocks
 
     if all_blocks and (following or given["strict"]):
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
