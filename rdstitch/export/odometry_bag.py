@@ -15,7 +15,8 @@ from rdstitch.export.trajectory_files import (
     positions_in_frame,
     ros_covariance,
 )
-from rdstitch.system.outputs import TemporaryFolder, naming
+from rdstitch.system.outputs import naming
+from rdstitch.system.temporary_folder import TemporaryFolder
 
 
 def check_bag(file: Path, *, overwrite: bool) -> None:

@@ -18,8 +18,9 @@ from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import Outputs, TemporaryFolder
+from rdstitch.system.outputs import Outputs
 from rdstitch.system.progress import Progress, StageTimer, silent
+from rdstitch.system.temporary_folder import TemporaryFolder
 from rdstitch.verification.verdict import RefusedError
 
 
