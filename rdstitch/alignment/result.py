@@ -166,20 +166,20 @@ class Alignment:
     reference: int
     model: str
     model_reason: str
+    distortion: float
+    distortion_std: float
+    rms: float
+    links: tuple[LinkFit, ...]
+    relief: ReliefTest
+    lens: str = "division"
+    lens_reason: str = "one parameter"
     poses: PlanarPoses | None = None
     tilt: tuple[float, float] | None = None
     tilt_spread: float = 0.0
     focal: float | None = None
     focal_std: float | None = None
-    distortion: float
-    distortion_std: float
-    lens: str = "division"
-    lens_reason: str
     parameters: tuple[str, ...] = ()
     covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    rms: float
-    links: tuple[LinkFit, ...]
-    relief: ReliefTest
     shape: ShapeTest | None = None
     leverage: Mapping[int | str, float] = field(default_factory=dict)
     lever_std: float = 0.0

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.io.flat_field import FlatField
 from rdstitch.io.reduction import block_mean
-from rdstitch.robust.loss import NORMAL_MEDIAN
+from rdstitch.robust.loss import NORMAL_MEDIAN, normal_std
 
 LEAST_TILES = 20  # fewer show one flat field as well as another
 LARGEST_ERROR = 0.01  # root mean square, by which two halves of the tiles may differ from their mean
@@ -197,7 +197,7 @@ def _fitted(light: FloatArray) -> FloatArray:
     for _ in range(5):
         solution = np.linalg.lstsq(matrix * weights[:, None], right * weights, rcond=None)[0]
         residual = right - matrix @ solution
-        scale = max(float(np.median(np.abs(residual))) / NORMAL_MEDIAN, 1e-12)
+        scale = max(normal_std(residual), 1e-12)
         weights = 1.0 / (1.0 + (residual / (3.0 * scale)) ** 2)
     return np.asarray(solution)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rdstitch.camera_files.own_format import camera_json
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs import source as sources
@@ -205,7 +206,7 @@ def _tables() -> list[tuple[str, int, str | tuple[str, ...], Files]]:
         (PATH.replace("path.csv", "c.toml --config c.toml --overwrite"), 6, "c.toml: is read as input",
          {"c.toml": "[common]\nseed = 1\n"}),
         (PATH.replace("path.csv", "c.json --camera c.json --overwrite"), 6, "c.json: is read as input",
-         {"c.json": json.dumps(Camera((400, 300), -0.2).as_dict())}),
+         {"c.json": json.dumps(camera_json(Camera((400, 300), -0.2)))}),
         ("trajectory @n.txt -o n.txt --overwrite", 6, "n.txt: is read as input", {"n.txt": "a.png\nb.png\n"}),
         ("mosaic more -o b.png --mask b.png --overwrite", 6, "b.png: is read as input", {}),
         ("mosaic more -o masks/frame_0000.png --mask masks --overwrite", 6, "frame_0000.png: is read as input",
