@@ -40,7 +40,7 @@ from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 from rdstitch.tracking.shown_camera import SeenPairs, ShownCamera, judged_focal, shown_camera
 from rdstitch.tracking.tracked_frame import Tracked, TrackedFrame
 
-_ALIGNMENT_IMPORTS = "scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial"
+_ALIGNMENT_IMPORTS = "scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial"
 _WINDOW = 48  # keyframes that are aligned together
 _FIRST_ALIGNMENT = 5  # keyframes that the first alignment takes
 _GROWTH = 1.5  # from one alignment to the next, while λ is not known
