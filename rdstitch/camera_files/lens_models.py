@@ -45,7 +45,7 @@ def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
     return solution
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LensSamples:
     """Radii of points all over what is drawn of an image, N of them."""
 

@@ -26,7 +26,7 @@ from rdstitch.system.outputs import Fingerprint, Outputs
 from rdstitch.system.progress import ShareProgress, unheard
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Composite:
     """The stitched image."""
 

@@ -217,7 +217,7 @@ class _Measured:
     views: Views  # where they are in the output
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Located:
     """Registered images, and what is known of where they are."""
 

@@ -65,7 +65,7 @@ def _is_padding(complaint: str, data: bytes) -> bool:
     return padding is not None and not data[max(0, end - int(padding[1])) : end].strip(b"\0\xff")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DecodedImage:
     """One image in memory."""
 

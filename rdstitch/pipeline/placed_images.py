@@ -73,7 +73,7 @@ def align_registration_locally(
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlacedImages:
     """The images that are used, and where they belong."""
 

@@ -24,7 +24,7 @@ _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
 _MATCHES_AT_ONCE = 1 << 14
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PairMatches:
     """Matches of one pair of images, and what is known of the cameras."""
 
