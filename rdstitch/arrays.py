@@ -11,8 +11,8 @@ IntArray = NDArray[np.intp]
 
 
 def evenly_spaced(count: int, most: int) -> IntArray:
-    """Indices of at most so many of ``count`` things, the first and the last among them."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
+    """So many of ``count`` indices at most, evenly from the first to the last."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.intp))
 
 
 class Rows:

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.export.map_fit import MapFit, Views, fit_map, views_of
+from rdstitch.export.map_fit import MapFit, Measured, Views, fit_map, views_of
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import WGS84, Crs, middle
+from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.io.tiff import ExtraTag
 
 MIN_POSITIONS = 3
@@ -205,19 +205,6 @@ def has_place(positions: Sequence[GpsPosition | None]) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _Measured:
-    """Places that were measured, of cameras or of points on the ground (N)."""
-
-    source: PositionKind
-    names: list[str]
-    degrees: list[tuple[float, float]]  # latitude and longitude
-    altitude: FloatArray  # (N,), m; NaN where not known
-    std: FloatArray  # (N, 2): of a horizontal coordinate and of the altitude, m; NaN where not known
-    leverage: FloatArray  # (N,): how far each has put itself where the images have it
-    views: Views  # where they are in the output
-
-
-@dataclass(frozen=True, eq=False)
 class Located:
     """Registered images, and what is known of where they are."""
 
@@ -254,16 +241,10 @@ def _by_positions(located: Located, epsg: int | None, force: bool) -> tuple[Geor
         return None, "all images have the same GPS position"
     views = views_of(located.cameras, located.to_output, located.nadirs).of(known)
     std = np.array([(np.nan, np.nan) if place.std is None else place.std for place in places])
-    measured = _Measured(
-        GPS,
-        [name for name, is_known in zip(located.names, known.tolist(), strict=True) if is_known],
-        [(place.latitude, place.longitude) for place in places],
-        np.array([np.nan if place.altitude is None else place.altitude for place in places]),
-        std,
-        np.array([located.leverage.get(k, 0.0) for k in np.flatnonzero(known).tolist()]),
-        views,
-    )
-    return _placed(located, measured, epsg, force)
+    names = [name for name, is_known in zip(located.names, known.tolist(), strict=True) if is_known]
+    leverage = [located.leverage.get(k, 0.0) for k in np.flatnonzero(known).tolist()]
+    altitude = np.array([np.nan if place.altitude is None else place.altitude for place in places])
+    return _placed(located, views, _MeasuredPlaces(GPS, names, places, altitude, std, leverage), epsg, force)
 
 
 def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georeference | None, str]:
@@ -282,17 +263,11 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
         epsg = control[0][0].epsg
     seen = views_of(located.cameras, located.to_output, located.nadirs)
     views = replace(Views.of_ground(np.array([pixel for _, pixel in control])), pixel=seen.pixel)
-    names = [point.name for point, _ in control]
-    measured = _Measured(
-        CONTROL,
-        names,
-        [(point.place.latitude, point.place.longitude) for point, _ in control],
-        np.full(len(names), np.nan),
-        np.array([[np.nan if point.std is None else point.std] * 2 for point, _ in control]),
-        np.array([located.leverage.get(name, 0.0) for name in names]),
-        views,
-    )
-    place, reason = _placed(located, measured, epsg, force)
+    std = np.array([[np.nan if point.std is None else point.std] * 2 for point, _ in control])
+    names, places = [point.name for point, _ in control], [point.place for point, _ in control]
+    leverage = [located.leverage.get(name, 0.0) for name in names]
+    measured = _MeasuredPlaces(CONTROL, names, places, np.full(len(names), np.nan), std, leverage)
+    place, reason = _placed(located, views, measured, epsg, force)
     if place is None or not checks:
         return place, reason
     latitude, longitude = np.array([(p.place.latitude, p.place.longitude) for p, _ in checks]).T
@@ -304,18 +279,32 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
     return replace(place, checks=tuple(residuals)), reason
 
 
-def _placed(located: Located, measured: _Measured, epsg: int | None, force: bool) -> tuple[Georeference | None, str]:
+@dataclass(frozen=True, eq=False)
+class _MeasuredPlaces:
+    """What places the output: positions of N images, or control points."""
+
+    source: PositionKind
+    names: Sequence[str]
+    places: Sequence[GpsPosition]
+    altitude: FloatArray  # altitude, std, leverage: as :class:`rdstitch.export.map_fit.Measured` has them
+    std: FloatArray
+    leverage: Sequence[float]
+
+
+def _placed(
+    located: Located, views: Views, measured: _MeasuredPlaces, epsg: int | None, force: bool
+) -> tuple[Georeference | None, str]:
     """Place the output by some positions."""
-    source, names, views = measured.source, measured.names, measured.views
-    latitude, longitude = np.array(measured.degrees).T
+    latitude, longitude = np.array([(place.latitude, place.longitude) for place in measured.places]).T
     crs = Crs.nearest(latitude, longitude) if epsg is None else Crs(epsg)
     map_scale = crs.map_scale(*middle(latitude, longitude))
     places = crs.project(latitude, longitude) @ np.array([1, 1j])
     usable: BoolArray = np.isfinite(places) & views.usable
+    source, names = measured.source, measured.names
     if usable.sum() < MIN_POSITIONS:
         return None, f"{crs.name} does not reach the {source}"
-    altitude, std, leverage = (part[usable] for part in (measured.altitude, measured.std, measured.leverage))
-    fit = fit_map(views.of(usable), places[usable], altitude, std, map_scale, leverage)
+    on_map = Measured(places, measured.altitude, measured.std, np.array(measured.leverage), map_scale)
+    fit = fit_map(views.of(usable), on_map.of(usable))
     used = np.zeros(len(names), dtype=bool)
     used[usable] = fit.used
     off = np.full(len(names), complex(np.inf))
@@ -336,9 +325,9 @@ def _placed(located: Located, measured: _Measured, epsg: int | None, force: bool
     hills = located.relief * views.pixel
     if located.lever_std and np.isfinite(views.height).any():
         hills = located.lever_std * float(np.nanmedian(views.height))
-    map_std = None if fit.std is None else math.hypot(fit.std, hills * abs(fit.scale))
+    std = None if fit.std is None else math.hypot(fit.std, hills * abs(fit.scale))
     place = Georeference(
-        crs, fit.scale, fit.origin, rms, source, residuals, map_std, map_scale=map_scale, assumption=assumption
+        crs, fit.scale, fit.origin, rms, source, residuals, std, map_scale=map_scale, assumption=assumption
     )
     return place, reason
 

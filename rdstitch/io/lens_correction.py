@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.geometry.camera import Camera
-from rdstitch.io.read import DecodedImage
-from rdstitch.io.samples import Pixels
+from rdstitch.io.read import DecodedImage, Pixels
 
 _NODES, _MAX_STEP = 320, 8  # along the width, and pixels between them, at which the displacement is computed
 _ROWS = 512  # that are resampled at a time

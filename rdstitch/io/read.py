@@ -14,11 +14,12 @@ from PIL import Image
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turned
 from rdstitch.io.colour import without_inks
-from rdstitch.io.metadata import Metadata, is_grey_palette, metadata_of, read_metadata, read_ome
+from rdstitch.io.metadata import Metadata, is_grey_palette, metadata_of, read_metadata
+from rdstitch.io.ome import read_ome
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image, read_raw
 from rdstitch.io.read_tiff import as_opacity, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
-from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, Pixels
+from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME
 from rdstitch.system.file_access import open_regular, read_beginning
 from rdstitch.system.late_imports import imagecodecs, tifffile
 
@@ -63,6 +64,9 @@ def _is_padding(complaint: str, data: bytes) -> bool:
     padding = _PADDING.search(complaint)
     end = data.rfind(_END_OF_IMAGE)
     return padding is not None and not data[max(0, end - int(padding[1])) : end].strip(b"\0\xff")
+
+
+Pixels = NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,13 +5,17 @@ data. An internal mask (a page of its own, as GDAL writes it), GDAL's NODATA and
 something.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.io.colour import srgb_of_lab, without_inks
-from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, Pixels
+from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME
 from rdstitch.system.late_imports import tifffile
+
+Pixels = NDArray[Any]
 
 _MASK, _MASK_WITHIN = 4, 40  # the kind of a page that masks the image, and how many pages are looked at for one
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _STENCIL, _INKS, _YCBCR = range(7)

@@ -1,13 +1,7 @@
-"""What readers and writers of images have in common."""
-
-from typing import Any
-
-from numpy.typing import NDArray
-
-Pixels = NDArray[Any]
+"""What readers and writers of samples share."""
 
 OPAQUE = 255
-"""Alpha of what an image shows entirely."""
+"""Alpha of what is there."""
 
 ROWS_AT_A_TIME = 128
-"""Rows that are converted together, so that what that takes is small beside the image."""
+"""Rows that are converted at once, so that no second image is in memory."""

@@ -19,8 +19,8 @@ from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference, Located, has_place
 from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.source import Source
-from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction

@@ -105,7 +105,7 @@ def tiles(
     run = Run(_stitch_options(options), output, beside, StageTimer(progress))
     with found_images(_as_tiles(inputs), output=output, topic=options.topic) as listed:
         registration, tiled = _registered(listed, run, options, positions_file)
-        with Outputs(options.overwrite) as outputs, run.options.executor(len(registration.sources)) as executor:
+        with Outputs(options.overwrite) as outputs, run.executor(len(registration.sources)) as executor:
             _write_beside(outputs, positions_file, options, registration, tiled)
             chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
             chosen = replace(chosen, layout=replace(chosen.layout, photographs=False))
