@@ -22,7 +22,7 @@ from examples.worlds.compositing_scenes import (
     side_by_side,
 )
 from rdstitch.compositing import CompositeOptions, compose, compose_to_file
-from rdstitch.compositing.preparation import prepare_composite
+from rdstitch.compositing.preparation import decide, prepare_composite
 from rdstitch.compositing.source_images import ImageLoader
 from rdstitch.compositing.survey import largest_rectangle
 from rdstitch.errors import ArgumentError, InputError
@@ -33,7 +33,7 @@ from tests.sampled import sampled
 
 def _seams(scene: Scene, options: CompositeOptions) -> NDArray[np.bool_]:
     """Px within two of a seam."""
-    with prepare_composite(scene.images, scene.canvas, options) as ready:
+    with prepare_composite(decide(scene.images, scene.canvas, options)) as ready:
         seams = ready.renderer.seams
     box = (0, 0, *scene.canvas.size)
     shares = np.stack([seams.share(k, box) for k in range(len(scene.frames))])
@@ -244,7 +244,8 @@ def test_file_is_what_memory_is(tmp_path: Path, suffix: str) -> None:
     result = scene.composed(tile_size=256)
     told: list[float] = []
     known, options = Metadata((1, 1), icc_profile=b"profile" * 30), CompositeOptions(tile_size=256)
-    compose_to_file(tmp_path / f"a.{suffix}", scene.images, scene.canvas, options, told.append, metadata=known)
+    decisions = decide(scene.images, scene.canvas, options)
+    compose_to_file(tmp_path / f"a.{suffix}", decisions, told.append, metadata=known)
     back = read_image(tmp_path / f"a.{suffix}")
     assert back.metadata.icc_profile == b"profile" * 30
     assert told == sorted(told)
