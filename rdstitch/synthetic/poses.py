@@ -24,7 +24,7 @@ from rdstitch.synthetic.lenses import Lens, focal_length
 Tilt = tuple[float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Poses:
     """Poses of N images."""
 
