@@ -84,11 +84,10 @@ class PlacedMatches(Rows):
         return len(self.images)
 
     @classmethod
-    def join(cls, parts: Iterable["PlacedMatches"]) -> Self:
+    def join(cls, parts: Iterable[Self]) -> Self:
         """All of them, one after the other."""
-        return cls.concatenate(
-            list(parts) or [cls(np.empty((0, 2), np.intp), np.empty((0, 2, 2)), np.empty((0, 2, 2)))]
-        )
+        none = cls(np.empty((0, 2), np.intp), np.empty((0, 2, 2)), np.empty((0, 2, 2)))
+        return cls.concatenate(list(parts) or [none])
 
     @cached_property
     def residual(self) -> FloatArray:
