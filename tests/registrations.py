@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.choices import Purpose
 from rdstitch.geometry.camera import Camera
@@ -16,7 +17,6 @@ from rdstitch.io.metadata import Metadata
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.verification.evidence import Evidence
-from tests.alignment_scenes import grid, scene
 
 CAMERA = Camera((400, 300))
 

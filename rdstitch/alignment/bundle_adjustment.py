@@ -20,7 +20,7 @@ from rdstitch.alignment.link_equations import (
     whitened_errors,
 )
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel
-from rdstitch.alignment.normal_equations import ImageEquations, PoseBlocks, SparseNormalEquations, chain
+from rdstitch.alignment.normal_equations import ImageEquations, SparseNormalEquations, chain
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import BoolArray, FloatArray
@@ -212,13 +212,11 @@ class BundleAdjuster:
                 normal, errors = self._normal_equations(state, sigma), state.equations.errors
                 cost = self._cost(parameters, errors, sigma, width)
             try:
-                flat, step_shared = normal.solve(damping)
-            except RuntimeError:  # singular: no correspondence of some images can be transferred
+                step_poses, step_shared = normal.solve(damping)
+            except np.linalg.LinAlgError:  # no correspondence of some images can be transferred
                 return _Descent(parameters, errors, damping, used, False)
-            step_poses = np.zeros(self.free.poses.shape)
-            step_poses[self.free.poses] = flat
             # The decrease of the quadratic model, less what the damping adds to it.
-            predicted = -(normal.gradient_poses @ flat + normal.gradient_shared @ step_shared)
+            predicted = -(np.vdot(normal.gradient_poses, step_poses) + normal.gradient_shared @ step_shared)
             if not np.isfinite(predicted):
                 return _Descent(parameters, errors, damping, used, False)
             if predicted <= self.min_gain * max(cost, 1e-12):
@@ -261,11 +259,6 @@ class BundleAdjuster:
             product: FloatArray = matrices.matrices[j] @ inverses(matrices.matrices)[i]
         return product
 
-    @cached_property
-    def _blocks(self) -> PoseBlocks:
-        """The pattern of the normal matrix."""
-        return PoseBlocks.of(self.observations, self.free.poses)
-
     def _rough_width(self, squared: FloatArray) -> float:
         """Width of the loss, pixels, at which most links still count, as far off as a chain may have put them."""
         medians = self.observations.medians(np.sqrt(squared))
@@ -307,11 +300,11 @@ class BundleAdjuster:
             self.observations,
             state.matrices,
             state.homographies,
-            self._blocks,
+            self.free.poses,
             self.weight(sigma),
             self._of_marks(state),
         )
-        p, free, lens = self.priors, self.free.poses, self.free.lens
+        p, lens = self.priors, self.free.lens
         physical, derivative = self.named_parameters(state.parameters.shared)
         slope, precision = (
             np.concatenate([of(p.shared, physical), of(p.lens, state.parameters.lens)[lens]])
@@ -319,8 +312,8 @@ class BundleAdjuster:
         )
         poses = self.model.prior_coordinates(state.parameters.poses) - p.poses
         return normal.with_priors(
-            p.poses_precision[free],
-            poses[free],
+            p.poses_precision,
+            poses,
             derivative.T @ (precision[:, None] * derivative),
             derivative.T @ slope,
         )

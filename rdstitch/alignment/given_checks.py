@@ -149,17 +149,16 @@ class _ShownTilts:
         tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
         images = np.unique(np.linspace(0, problem.count - 1, _MAX_IMAGES).astype(np.intp))
         focal = math.exp(adjusted.parameters.shared[-1])
-        number = np.cumsum(adjuster.free.poses.ravel()).reshape(adjuster.free.poses.shape) - 1
         rows = np.arange(2 * len(images))
-        by_pose = np.zeros((len(normal.gradient_poses), len(rows)))
+        by_pose = np.zeros((*normal.gradient_poses.shape, len(rows)))
         by_shared = np.zeros((len(normal.gradient_shared), len(rows)))
         for axis, column in enumerate((PSI, THETA)):
             if column in model.free:
-                by_pose[number[images, model.free.index(column)], rows[axis::2]] = focal
+                by_pose[images, model.free.index(column), rows[axis::2]] = focal
             by_shared[axis, rows[axis::2]] = focal
         by_shared[len(model.shared_names) - 1] = tilts[images].ravel()
         moved_poses, moved_shared = normal.responses(-by_pose, -by_shared)
-        covariance = by_pose.T @ moved_poses + by_shared.T @ moved_shared
+        covariance = np.einsum("ndb,ndc->bc", by_pose, moved_poses, optimize=True) + by_shared.T @ moved_shared
         if free_mount:
             covariance = covariance + _FREE_MOUNT**2 * np.tile(np.eye(2), (len(images), len(images)))
         variances, axes = np.linalg.eigh((covariance + covariance.T) / 2.0)

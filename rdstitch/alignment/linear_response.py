@@ -13,7 +13,7 @@ import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
 from rdstitch.alignment.link_equations import LinearizedErrors, linearized_errors
-from rdstitch.alignment.normal_equations import SparseNormalEquations, link_derivatives
+from rdstitch.alignment.normal_equations import SparseNormalEquations, link_derivatives, sums_by_image
 from rdstitch.arrays import FloatArray
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_slope, robust_weight
 
@@ -48,9 +48,9 @@ class LinearResponse:
         )
 
     def steps_of(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray]:
-        """By how much poses (F, C) and shared parameters (S, C) move when the errors change by so many ``fields``."""
-        start, blocks = self.adjuster.observations.start, self.normal.blocks
-        pair, padded = blocks.column.shape[1], np.zeros((blocks.free + 1, columns))
+        """Steps of poses (N, D, C) and shared parameters (S, C) when the errors change by so many ``fields``."""
+        observations, free = self.adjuster.observations, self.adjuster.free.poses
+        start, pair, of_poses = observations.start, 2 * free.shape[1], np.zeros((*free.shape, columns))
         of_shared = np.zeros((len(self.normal.gradient_shared), columns))
         for part in self.parts():
             weighted = fields(part) * (self.curvature * self.weight[part.rows])[:, None, None]
@@ -61,20 +61,18 @@ class LinearResponse:
                 jacobian = part.jacobian[rows].reshape(-1, derivative.shape[1])
                 answers[link - part.first] = jacobian.T @ weighted[rows].reshape(-1, columns)
             local = np.swapaxes(derivative, 1, 2) @ answers
-            np.add.at(padded, blocks.column[part.first : part.last], local[:, :pair])
+            of_poses += sums_by_image(free, observations, slice(part.first, part.last), local[:, :pair])
             of_shared += local[:, pair:].sum(axis=0)
-        return self.normal.responses(padded[:-1], of_shared)
+        return self.normal.responses(of_poses, of_shared)
 
     def changes(self, part: LinearizedErrors, poses: FloatArray, shared: FloatArray) -> FloatArray:
-        """By how much the errors change, (m, 2, C), with steps of the poses (F, C) and the shared parameters (S, C)."""
-        start, column = self.adjuster.observations.start, self.normal.blocks.column
-        columns = shared.shape[1]
-        padded = np.concatenate([poses, np.zeros((1, columns))])
+        """By how much the errors change, (m, 2, C), with steps of poses (N, D, C) and shared parameters (S, C)."""
+        o, columns = self.adjuster.observations, shared.shape[1]
         change, derivative = np.empty((*part.errors.shape, columns)), self._derivative(part)
         for link in range(part.first, part.last):
-            rows = slice(start[link] - part.rows.start, start[link + 1] - part.rows.start)
-            step = derivative[link - part.first] @ np.concatenate([padded[column[link]], shared])
-            change[rows] = part.jacobian[rows] @ step
+            rows = slice(o.start[link] - part.rows.start, o.start[link + 1] - part.rows.start)
+            steps = np.concatenate([poses[o.image1[link]], poses[o.image2[link]], shared])
+            change[rows] = part.jacobian[rows] @ (derivative[link - part.first] @ steps)
         return change
 
     def _derivative(self, part: LinearizedErrors) -> FloatArray:

@@ -47,7 +47,7 @@ def split_lens(lens: FloatArray) -> tuple[float, tuple[float, ...], FloatArray]:
 def folds(lens: FloatArray, reach: float = 1.0) -> bool:
     """Whether a lens with more than λ would show a place twice, out to a radius in half diagonals."""
     distortion, higher, center = split_lens(lens)
-    return bool(higher) and not is_one_to_one(reach + float(np.linalg.norm(center)), (distortion, *higher))
+    return bool(higher) and not is_one_to_one(reach + float(np.linalg.norm(center)), distortion, higher)
 
 
 @np.errstate(all="ignore")  # a long step may give homographies that are not finite

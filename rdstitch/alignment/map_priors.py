@@ -228,23 +228,22 @@ def _held(problem: Problem, fit: Fit, sides: list[_Side]) -> Held:
 def _leverage(problem: Problem, fit: Fit, sides: Sequence[_Side]) -> dict[int | str, float]:
     """How far (0 to 1) what is known puts itself where the fit has it; see :meth:`_Side.named`."""
     adjuster = problem.adjuster_of(fit)
-    normal, free = adjuster.normal_equations(fit.adjusted), adjuster.free.poses
-    row = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
+    normal, (count, size) = adjuster.normal_equations(fit.adjusted), adjuster.free.poses.shape
     leverage: dict[int | str, float] = {}
     for side in sides:
         image, derivative, precision = side.sightings(adjuster, fit)
         item, names = side.named()
         chosen = np.unique(np.linspace(0, len(names) - 1, min(len(names), _MANY)).astype(np.intp))
-        gradients = np.zeros((len(normal.gradient_poses), len(chosen), 2))
+        gradients = np.zeros((count, size, len(chosen), 2))
         of_shared = np.zeros((len(normal.gradient_shared), len(chosen), 2))
         counts, sums = np.bincount(item, minlength=len(names)), np.bincount(item, precision, len(names))
         for column, one in enumerate(chosen.tolist()):
             for m in np.flatnonzero(item == one).tolist():
-                gradients[row[image[m]], column] += derivative[m, :, : free.shape[1]].T / counts[one]
-                of_shared[:, column] += derivative[m, :, free.shape[1] :].T / counts[one]
-        flat = [part.reshape(len(part), -1) for part in (gradients, of_shared)]
+                gradients[image[m], :, column] += derivative[m, :, :size].T / counts[one]
+                of_shared[:, column] += derivative[m, :, size:].T / counts[one]
+        flat = gradients.reshape(count, size, -1), of_shared.reshape(len(of_shared), -1)
         steps = normal.responses(-flat[0], -flat[1])
-        variance = sum(np.einsum("pc,pc->c", one, other) for one, other in zip(flat, steps, strict=True))
+        variance = (flat[0] * steps[0]).sum(axis=(0, 1)) + (flat[1] * steps[1]).sum(axis=0)
         own = np.clip(np.reshape(variance, (-1, 2)).mean(axis=1) * sums[chosen], 0.0, _SURE)
         shares = np.full(len(names), np.median(own))
         shares[chosen] = own

@@ -4,120 +4,60 @@ The model's derivatives turn the Gram matrix of each link into the blocks of its
 parameters. Which poses the links couple is the pattern of the matrix, the same at every step.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
+from rdstitch.alignment.block_cholesky import BlockCholesky, Elimination
 from rdstitch.alignment.link_equations import LinkEquations
 from rdstitch.alignment.motion_models import ModelMatrices
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
-from rdstitch.system.late_imports import sparse, sparse_linalg
 
 _LINKS_AT_ONCE = 4096
 """Whose dense blocks are made at a time: those of all links would be most of an alignment's memory."""
 
 
-@dataclass(frozen=True, eq=False)
-class PoseBlocks:
-    """The normal matrix of F free pose parameters, put together from blocks of L links."""
-
-    # (L, 2 D): which of the free parameters those of the link's two images are; F for those that are not free
-    column: IntArray
-    free: int  # F
-    rank: IntArray  # (L, 2 D): which of the free parameters of its image each of them is
-    above: IntArray  # (L, 2, 2): entries above the block of two sides of a link, row and column, in each of its columns
-    indices: IntArray  # indices, indptr: of the matrix of E entries by columns; all of its diagonal is stored
-    indptr: IntArray
-    diagonal: IntArray  # (F,): where the diagonal lies in the entries
-
-    @classmethod
-    def of(cls, observations: Observations, free: BoolArray) -> Self:
-        """Of links between N images, whose parameters (N, D) may move where ``free``."""
-        total, count, sizes = int(free.sum()), len(free), free.sum(axis=1)
-        number = np.where(free, np.cumsum(free.reshape(-1)).reshape(free.shape) - 1, total)
-        rank, first = np.cumsum(free, axis=1) - 1, np.cumsum(sizes) - sizes
-        sides = np.stack([observations.image1, observations.image2], axis=1)
-        key_of_sides = sides[:, None, :] * count + sides[:, :, None]
-        # A block of each two images that a link joins, and of each with itself, one column of blocks after another.
-        key = np.unique(np.concatenate([key_of_sides.ravel(), np.arange(count) * (count + 1)]))
-        across, down = np.divmod(key, count)
-        rows = np.cumsum(sizes[down]) - sizes[down]
-        start = rows[np.searchsorted(across, np.arange(count))]
-        above, height = rows - start[across], np.bincount(across, sizes[down], count).astype(np.intp)
-        of_column = np.repeat(np.arange(count), sizes)
-        indptr = np.concatenate([[0], np.cumsum(height[of_column])])
-        row = np.repeat(first[down] - rows, sizes[down]) + np.arange(int(sizes[down].sum()))
-        place = np.repeat(start[of_column] - indptr[:-1], height[of_column]) + np.arange(indptr[-1])
-        own = above[np.searchsorted(key, of_column * (count + 1))]
-        return cls(
-            number[sides].reshape(len(sides), -1).astype(np.int32),
-            total,
-            rank[sides].reshape(len(sides), -1).astype(np.int32),
-            above[np.searchsorted(key, key_of_sides)].astype(np.int32),
-            row[place].astype(np.int32),
-            indptr.astype(np.int32),
-            indptr[:-1] + own + rank[free],
-        )
-
-    def entries(self, links: slice, local: FloatArray) -> FloatArray:
-        """Entries of the matrix (E,) that is the sum of blocks (l, 2 D, 2 D) of some links."""
-        column, rank = self.column[links], self.rank[links]
-        size = column.shape[1] // 2
-        above = np.repeat(np.repeat(self.above[links], size, axis=1), size, axis=2)
-        place = self.indptr[column][:, None, :] + above + rank[:, :, None]
-        kept = (column[:, None, :] < self.free) & (column[:, :, None] < self.free)
-        return np.bincount(place[kept], local[kept], minlength=len(self.indices)).astype(np.float64)
-
-    def with_diagonal(self, entries: FloatArray, added: FloatArray) -> FloatArray:
-        """The entries (E,) with something (F,) added to the diagonal."""
-        entries = entries.copy()
-        entries[self.diagonal] += added
-        return entries
-
-    def matrix(self, entries: FloatArray) -> "sparse.csc_array":
-        """The matrix of some entries (E,)."""
-        return sparse.csc_array((entries, self.indices, self.indptr), shape=(self.free, self.free))
-
-    def sums(self, links: slice, values: FloatArray) -> FloatArray:
-        """Of values (l, 2 D, ...) of some links the sum for each free parameter, (F, ...)."""
-        total = np.zeros((self.free + 1, *values.shape[2:]))
-        np.add.at(total, self.column[links], values)
-        return total[:-1]
-
-
-_LEAST_DAMPING = 1e-12
-"""Relative to the diagonal: what makes poses solvable that nothing holds."""
+_DAMPINGS = (0.0, 1e-12, 1e-8, 1e-4)
+"""Relative to the diagonal, from none up: the least of them makes poses solvable that nothing holds."""
 
 
 @dataclass(frozen=True, eq=False)
 class SparseNormalEquations:
-    """``[A B; B' C] step = -gradient`` for poses and shared parameters, in that order."""
+    """``[A B; B' C] step = -gradient`` for D parameters of each of N poses and S shared ones, in that order.
 
-    blocks: PoseBlocks  # the pattern of A
-    poses: FloatArray  # (E,): the entries of A, (F, F), of the F free pose parameters
-    coupling: FloatArray  # (F, S): B
+    Rows and columns of parameters that are not free are zero, and so are their steps.
+    """
+
+    elimination: Elimination  # of the images by the links of the blocks
+    free: BoolArray  # (N, D)
+    poses: FloatArray  # (N, D, D): the blocks of A on its diagonal
+    links: FloatArray  # (L, D, D): those of the links: rows of their second image, columns of their first
+    coupling: FloatArray  # (N, D, S): B
     shared: FloatArray  # (S, S): C
-    gradient_poses: FloatArray  # gradient_poses, gradient_shared: (F,) and (S,)
+    gradient_poses: FloatArray  # gradient_poses, gradient_shared: (N, D) and (S,)
     gradient_shared: FloatArray
 
     def solve(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """The step of poses and shared parameters, with the diagonal enlarged by ``1 + damping`` (Marquardt)."""
-        reduced, solved = self._eliminate(damping)
-        diagonal = np.diag(np.diag(self.shared)) * damping
-        right = self.coupling.T @ solved[:, -1] - self.gradient_shared
-        step_shared = _solve_scaled(reduced + diagonal, right)
-        return -solved[:, -1] - solved[:, :-1] @ step_shared, step_shared
+        """The steps (N, D) and (S,), with the diagonal enlarged by ``1 + damping`` (Marquardt).
+
+        :exc:`numpy.linalg.LinAlgError` where the images determine no step.
+        """
+        step_poses, step_shared = self._stepped(
+            self._factorized(damping),
+            self.gradient_poses[..., None],
+            self.gradient_shared[:, None],
+            np.diag(np.diag(self.shared)) * damping,
+        )
+        return step_poses[..., 0], step_shared[:, 0]
 
     def responses(self, gradient_poses: FloatArray, gradient_shared: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The steps, (F, C) and (S, C), for C gradients (F, C) and (S, C) in place of the equations' own."""
-        kept = self.coupling.shape[1]
-        reduced, solved = self._eliminate(_LEAST_DAMPING, gradient_poses)
-        step_shared = _solve_scaled(reduced, self.coupling.T @ solved[:, kept:] - gradient_shared)
-        return -solved[:, kept:] - solved[:, :kept] @ step_shared, step_shared
+        """The steps, (N, D, C) and (S, C), for C gradients of these shapes in place of the equations' own."""
+        return self._stepped(self._least_damped, gradient_poses, gradient_shared)
 
     def with_priors(
         self,
@@ -126,12 +66,13 @@ class SparseNormalEquations:
         information_shared: FloatArray,
         gradient_shared: FloatArray,
     ) -> Self:
-        """With priors added: on the poses as inverse variances and distances from the means, both (F,)."""
+        """With priors added: on the poses as inverse variances and distances from the means, both (N, D)."""
+        precision = np.where(self.free, precision_poses, 0.0)
         return replace(
             self,
-            poses=self.blocks.with_diagonal(self.poses, precision_poses),
+            poses=self.poses + precision[..., None] * np.eye(precision.shape[1]),
             shared=self.shared + information_shared,
-            gradient_poses=self.gradient_poses + precision_poses * error_poses,
+            gradient_poses=self.gradient_poses + precision * error_poses,
             gradient_shared=self.gradient_shared + gradient_shared,
         )
 
@@ -140,42 +81,65 @@ class SparseNormalEquations:
 
         Poses that nothing holds are damped as little as makes them solvable; where nothing does, nothing is known.
         """
-        for damping in (0.0, 1e-12, 1e-8, 1e-4):
+        for damping in _DAMPINGS:
             try:
-                information = self._eliminate(damping)[0]
-            except RuntimeError:  # singular
+                information = self.shared - self._coupled(self._factorized(damping).solve(self.coupling))
+            except np.linalg.LinAlgError:
                 continue
             if np.isfinite(information).all():
                 return information
         return np.zeros_like(self.shared)
 
     def pose_response(self) -> FloatArray:
-        """How the poses follow a unit step of each shared parameter, shape (F, S): ``-A⁻¹ B``."""
-        response: FloatArray = -self._eliminate(_LEAST_DAMPING)[1][:, : self.coupling.shape[1]]
+        """How the poses follow a unit step of each shared parameter, shape (N, D, S): ``-A⁻¹ B``."""
+        response: FloatArray = -self._least_damped.solve(self.coupling)
         return response
 
-    def _eliminate(self, damping: float, gradient: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """The Schur complement (S, S) and ``A⁻¹ [B, gradient]``, of the equations' own gradient if not given."""
-        right = np.column_stack([self.coupling, self.gradient_poses if gradient is None else gradient])
-        if self.blocks.free == 0:
-            return self.shared, right
-        factor = self._least_damped if damping == _LEAST_DAMPING else self._factorized(damping)
-        solved = factor.solve(right)
-        return self.shared - self.coupling.T @ solved[:, : self.coupling.shape[1]], solved
+    def pose_covariances(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of the inverse of the whole matrix each image's block with itself, (N, D, D), those with the shared
+        parameters (N, D, S), and the one of these (S, S).
+        """
+        by_shared, of_shared = self.responses(np.zeros_like(self.coupling), -np.eye(len(self.shared)))
+        own = np.where(self.free[:, :, None] & self.free[:, None], self._least_damped.inverse_diagonal(), 0.0)
+        return own + by_shared @ self.pose_response().swapaxes(1, 2), by_shared, of_shared
+
+    def _coupled(self, poses: FloatArray) -> FloatArray:
+        """``B' x`` (S, C) of some (N, D, C)."""
+        rows = self.coupling.shape[0] * self.coupling.shape[1]
+        return self.coupling.reshape(rows, -1).T @ poses.reshape(rows, -1)
+
+    def _stepped(
+        self, factors: BlockCholesky, poses: FloatArray, shared: FloatArray, added: FloatArray | float = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
+        """The steps for gradients (N, D, C) and (S, C), by the factors of A and with something added to C."""
+        size = len(self.shared)
+        solved = factors.solve(np.concatenate([self.coupling, np.where(self.free[..., None], poses, 0.0)], axis=2))
+        by_shared, alone = solved[..., :size], solved[..., size:]
+        step = _solve_scaled(self.shared - self._coupled(by_shared) + added, self._coupled(alone) - shared)
+        return -alone - by_shared @ step, step
 
     @cached_property
-    def _least_damped(self) -> Any:
+    def _least_damped(self) -> BlockCholesky:
         """The factors that all responses have in common."""
-        return self._factorized(_LEAST_DAMPING)
+        for damping in _DAMPINGS[1:-1]:
+            with suppress(np.linalg.LinAlgError):
+                return self._factorized(damping)
+        return self._factorized(_DAMPINGS[-1])
 
-    def _factorized(self, damping: float) -> Any:
-        diagonal = self.poses[self.blocks.diagonal]
+    def _factorized(self, damping: float) -> BlockCholesky:
+        diagonal = np.einsum("ndd->nd", self.poses)
         floor = max(float(diagonal.max()), 1e-300) * 1e-14
-        damped = self.blocks.with_diagonal(self.poses, damping * diagonal + floor)
-        options = {"SymmetricMode": True}
-        return sparse_linalg.splu(
-            self.blocks.matrix(damped), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
-        )
+        added = np.where(self.free, damping * diagonal + floor, 1.0)
+        return self.elimination.factorized(self.poses + added[..., None] * np.eye(added.shape[1]), self.links)
+
+
+def sums_by_image(free: BoolArray, observations: Observations, links: slice, values: FloatArray) -> FloatArray:
+    """Of values (l, 2 D, ...) of some links the sum for each free parameter, (N, D, ...)."""
+    total, size = np.zeros((*free.shape, *values.shape[2:])), free.shape[1]
+    np.add.at(total, observations.image1[links], values[:, :size])
+    np.add.at(total, observations.image2[links], values[:, size:])
+    total[~free] = 0.0
+    return total
 
 
 def _solve_scaled(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -221,7 +185,7 @@ def chain(
     observations: Observations,
     model: ModelMatrices,
     homographies: FloatArray,
-    blocks: PoseBlocks,
+    free: BoolArray,
     weight: float,
     known: ImageEquations | None = None,
 ) -> SparseNormalEquations:
@@ -231,8 +195,9 @@ def chain(
     ``known`` of single images comes besides.
     """
     size, others = model.by_pose.shape[1], model.by_shared.shape[1] + equations.gram.shape[1] - 9
-    pair, free = 2 * size, blocks.free
-    poses, coupling, gradient_poses = np.zeros(len(blocks.indices)), np.zeros((free, others)), np.zeros(free)
+    pair, count = 2 * size, len(free)
+    poses, of_links = np.zeros((count, size, size)), np.empty((len(observations), size, size))
+    coupling, gradient_poses = np.zeros((count, size, others)), np.zeros((count, size))
     shared, gradient_shared = np.zeros((others, others)), np.zeros(others)
     for first in range(0, len(observations), _LINKS_AT_ONCE):
         links = slice(first, min(first + _LINKS_AT_ONCE, len(observations)))
@@ -241,12 +206,18 @@ def chain(
         gradient = np.einsum("lpk,lp->lk", derivative, equations.gradient[links]) * weight
         if known is not None:
             known.add_to(local, gradient, observations, links)
-        poses += blocks.entries(links, local[:, :pair, :pair])
-        coupling += blocks.sums(links, local[:, :pair, pair:])
+        images = observations.image1[links], observations.image2[links]
+        moving = np.concatenate([free[images[0]], free[images[1]], np.ones((len(local), others))], axis=1)
+        local, gradient = local * moving[:, :, None] * moving[:, None, :], gradient * moving
+        of_links[links] = local[:, size:pair, :size]
+        for of, own in zip(images, (slice(size), slice(size, pair)), strict=True):
+            np.add.at(poses, of, local[:, own, own])
+            np.add.at(coupling, of, local[:, own, pair:])
+            np.add.at(gradient_poses, of, gradient[:, own])
         shared += local[:, pair:, pair:].sum(axis=0)
-        gradient_poses += blocks.sums(links, gradient[:, :pair])
         gradient_shared += gradient[:, pair:].sum(axis=0)
-    return SparseNormalEquations(blocks, poses, coupling, shared, gradient_poses, gradient_shared)
+    elimination = Elimination.of_links(count, observations.image1, observations.image2)
+    return SparseNormalEquations(elimination, free, poses, of_links, coupling, shared, gradient_poses, gradient_shared)
 
 
 def link_derivatives(

@@ -147,21 +147,20 @@ class ReliefField:
     response: LinearResponse
 
     def steps(self) -> tuple[FloatArray, FloatArray]:
-        """Steps of the free pose parameters (F, K) and the shared ones (S, K) by relief; ``x x'`` is its covariance.
+        """Steps of the poses (N, D, K) and the shared parameters (S, K) by relief; ``x x'`` is its covariance.
 
         By relief of the heights at which it leaves the agreement of errors that was found, at every distance, beyond
         that of independent errors. These agree less than not at all, since the parameters absorb what they have in
         common.
         """
-        normal = self.response.normal
-        agreement, std = self._agreement()
+        normal, (agreement, std) = self.response.normal, self._agreement()
         if not len(agreement) or agreement[0] <= 0.0:
-            return np.zeros((len(normal.gradient_poses), 0)), np.zeros((len(normal.gradient_shared), 0))
+            return np.zeros((*normal.gradient_poses.shape, 0)), np.zeros((len(normal.gradient_shared), 0))
         step = _WAVES // _BANDS
         answers = [self._answers(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
         power = _spectrum(np.stack([left for left, *_ in answers], axis=1), agreement, std)
         scale = np.repeat(np.sqrt(power / (2 * step)), 2 * step)
-        poses, shared = (np.concatenate([answer[k] for answer in answers], axis=1) for k in (1, 2))
+        poses, shared = (np.concatenate([answer[k] for answer in answers], axis=-1) for k in (1, 2))
         return poses * scale, shared * scale
 
     def _agreement(self) -> tuple[FloatArray, FloatArray]:
@@ -185,8 +184,8 @@ class ReliefField:
         return agreement, std
 
     def _answers(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Agreement (D,) at each distance, px², that fields leave in the mean, and the steps that answer each (F, C)
-        and (S, C).
+        """Agreement (D,) at each distance, px², that fields leave in the mean, and the steps that answer each,
+        (N, D, C) and (S, C).
         """
         poses, shared = self.response.steps_of(fields, columns)
         agreement = np.zeros(len(self._pairs))

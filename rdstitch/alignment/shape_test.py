@@ -251,7 +251,7 @@ class _Answers:
 
     adjuster: BundleAdjuster
     effects: Sequence[Effect]
-    # poses, shared: (F, E + S) and (S, E + S): steps of the free pose parameters, and of the shared ones
+    # poses, shared: (N, D, E + S) and (S, E + S): steps of the poses, and of the shared parameters
     poses: FloatArray
     shared: FloatArray
     # information, gradient: (E, E) and (E,): on the sizes of the effects, by what the parameters do not absorb
@@ -282,7 +282,7 @@ class _Answers:
 
         poses, shared = response.steps_of(fields, count)
         information = np.zeros((count, count))
-        gradient = poses.T @ normal.gradient_poses + shared.T @ normal.gradient_shared
+        gradient = np.einsum("ndc,nd->c", poses, normal.gradient_poses) + shared.T @ normal.gradient_shared
         for part in response.parts():
             changes = fields(part)
             left = changes + response.changes(part, poses, shared)
@@ -293,7 +293,7 @@ class _Answers:
         return cls(
             adjuster,
             effects,
-            np.hstack([poses, normal.pose_response()]),
+            np.concatenate([poses, normal.pose_response()], axis=2),
             np.hstack([shared, np.eye(len(shared))]),
             (information + information.T) / 2.0,
             gradient,
@@ -346,11 +346,10 @@ def _displacements(answers: _Answers, fit: Fit, count: int, cameras: Sequence[Ca
 
     of_shared = np.sqrt(np.maximum(np.diag(answers.covariance), 1e-300))
     sizes = [_STEP] * count + (_STEP * of_shared).tolist()
-    columns = [*range(count), *range(len(answers.effects), answers.poses.shape[1])]
+    columns = [*range(count), *range(len(answers.effects), answers.poses.shape[2])]
     moved = []
     for size, column in zip(sizes, columns, strict=True):
-        poses = np.zeros(free.poses.shape)
-        poses[free.poses] = answers.poses[:, column] * size
+        poses = answers.poses[..., column] * size
         moved.append(state(parameters.retract(fit.model, poses, answers.shared[:, column] * size, free.lens)))
     here = state(parameters)
 

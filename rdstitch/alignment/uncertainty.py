@@ -97,7 +97,7 @@ def _influence(response: LinearResponse) -> tuple[FloatArray, FloatArray]:
     """By how much each correspondence moves the shared parameters (M, S'), and their covariance by the priors alone."""
     normal = response.normal
     count = len(normal.gradient_shared)
-    poses, shared = normal.responses(np.zeros((len(normal.gradient_poses), count)), -np.eye(count))
+    poses, shared = normal.responses(np.zeros_like(normal.coupling), -np.eye(count))
     influence, information = np.empty((len(response.weight), count)), np.zeros((count, count))
     for part in response.parts():
         change, weight = response.changes(part, poses, shared), response.weight[part.rows]
@@ -220,20 +220,15 @@ def lever_std(problem: Problem, fit: Fit) -> float:
     adjuster, parameters, model = problem.adjuster_of(fit), fit.adjusted.parameters, fit.model
     assert isinstance(model, PlanarModel)
     steps_of_poses, steps_of_shared = _relief(adjuster, fit.adjusted).steps()
-    free, images = adjuster.free.poses, np.arange(problem.count)
+    size, images = model.pose_size, np.arange(problem.count)
     focal = float(np.exp(parameters.shared[2]))
     middles = PlaneMarks(images, np.zeros((len(images), 2)), np.zeros((len(images), 2)), np.ones(len(images)))
     derivative = middles.equations(fit.adjusted.matrices, parameters.lens, adjuster.free.lens, focal)[1]
     derivative[:, [0, 1], [model.free.index(column) for column in (X, Y)]] -= 1.0
-    moved = derivative[:, :, free.shape[1] :] @ steps_of_shared
-    of_images = np.zeros((*free.shape, steps_of_shared.shape[1]))
-    of_images[free] = steps_of_poses
-    moved += derivative[:, :, : free.shape[1]] @ of_images
+    moved = derivative[:, :, size:] @ steps_of_shared
+    moved += derivative[:, :, :size] @ steps_of_poses
     unit = focal * float(np.exp(parameters.poses[problem.reference, LOG_HEIGHT]))
     return float(np.sqrt((moved**2).sum(axis=2).mean())) / unit
-
-
-_COLUMNS = 512  # of the inverse at a time
 
 
 def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray]:
@@ -245,43 +240,26 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
         problem = replace(problem, free_lens=np.ones_like(problem.free_lens))
     adjuster, model, parameters = problem.adjuster_of(fit), fit.model, fit.adjusted.parameters
     assert isinstance(model, PlanarModel)
-    normal, free = adjuster.normal_equations(fit.adjusted), adjuster.free.poses
-    (count, size), shared = free.shape, len(normal.gradient_shared)
-    # Rows of the inverse, of which the pose parameters of the gauge have none.
-    row = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
-    jacobian = _jacobian(model, parameters.poses, parameters.shared, problem.reference, size + shared)
-    nothing = np.zeros((len(normal.gradient_poses), shared))
-    by_shared, of_shared = normal.responses(nothing, -np.eye(shared))
+    normal, (count, size) = adjuster.normal_equations(fit.adjusted), adjuster.free.poses.shape
+    own, by_shared, of_shared = normal.pose_covariances()
+    of_first = np.zeros((count, size, size))
+    of_first[0] = np.eye(size)
+    first = normal.responses(-of_first, np.zeros((len(of_shared), size)))[0]
 
-    def block(one: int, other: int, poses: FloatArray, columns: dict[int, int]) -> FloatArray:
-        """Covariance (D + S, D + S) of two images' parameters, by the columns of the inverse that are the other's."""
-        covariance = np.zeros((size + shared, size + shared))
-        covariance[size:, size:] = of_shared
-        rows, across = free[one], free[other]
-        covariance[: len(rows), size:][rows] = by_shared[row[one][rows]]
-        covariance[size:, :size][:, across] = by_shared[row[other][across]].T
-        inner = poses[row[one][rows]][:, [columns[k] for k in row[other][across].tolist()]]
-        covariance[:size, :size][np.ix_(rows, across)] = inner
-        return covariance
+    def joint(poses: FloatArray, other: FloatArray) -> FloatArray:
+        """Covariances (N, D + S, D + S) of all parameters of an image with those of another one."""
+        shared = np.broadcast_to(of_shared, (count, *of_shared.shape))
+        return np.concatenate(
+            [np.concatenate([poses, by_shared], axis=2), np.concatenate([other.swapaxes(1, 2), shared], axis=2)], axis=1
+        )
 
+    jacobian = _jacobian(model, parameters.poses, parameters.shared, problem.reference, size + len(of_shared))
     steps_of_poses, steps_of_shared = _relief(adjuster, fit.adjusted).steps()
-    by_relief = np.zeros((count, size + shared, steps_of_shared.shape[1]))
-    by_relief[:, :size][free] = steps_of_poses
-    by_relief[:, size:] = steps_of_shared
-    moved = jacobian @ by_relief
-    of_images, with_first = moved @ moved.transpose(0, 2, 1), moved @ moved[0].T
-    step = max(1, _COLUMNS // size)
-    for start in range(0, count, step):
-        images = range(start, min(start + step, count))
-        wanted = row[images.start : images.stop][free[images.start : images.stop]]
-        gradient = np.zeros((len(nothing), len(wanted)))
-        gradient[wanted, np.arange(len(wanted))] = -1.0
-        poses = normal.responses(gradient, np.zeros((shared, len(wanted))))[0]
-        columns = {int(k): place for place, k in enumerate(wanted)}
-        for k in images:
-            of_images[k] += jacobian[k] @ block(k, k, poses, columns) @ jacobian[k].T
-            with_first[k] += (jacobian[0] @ block(0, k, poses, columns) @ jacobian[k].T).T
-    return of_images, with_first
+    by_relief = np.broadcast_to(steps_of_shared, (count, *steps_of_shared.shape))
+    moved = jacobian @ np.concatenate([steps_of_poses, by_relief], axis=1)
+    of_images = jacobian @ joint(own, by_shared) @ jacobian.transpose(0, 2, 1)
+    with_first = jacobian @ joint(first, np.broadcast_to(by_shared[0], by_shared.shape)) @ jacobian[0].T
+    return of_images + moved @ moved.transpose(0, 2, 1), with_first + moved @ moved[0].T
 
 
 def _jacobian(model: PlanarModel, poses: FloatArray, shared: FloatArray, reference: int, size: int) -> FloatArray:

@@ -27,10 +27,11 @@ from typing import Any, TypeVar
 
 from rdstitch.camera_files import formats
 from rdstitch.camera_files.lens_models import CameraFile, LensFit
+from rdstitch.camera_files.own_format import CameraRecord, camera_json
 from rdstitch.camera_files.polynomials import hugin_project, is_hugin, lensfun_xml, read_hugin, read_lensfun
 from rdstitch.choices import CameraFormat
 from rdstitch.errors import ArgumentError, InputError, OutputError
-from rdstitch.geometry.camera import Camera, CameraRecord
+from rdstitch.geometry.camera import Camera
 from rdstitch.system.file_access import read_text
 from rdstitch.system.outputs import json_bytes, text_bytes, write_bytes_atomic
 from rdstitch.system.records import convert, parse_json, parse_yaml
@@ -183,7 +184,7 @@ def export_note(camera: Camera, path: str | Path, camera_format: CameraFormat = 
 
 
 _WRITERS: dict[CameraFormat, Callable[[Camera], str]] = {
-    "rdstitch": lambda camera: json_bytes(camera.as_dict()).decode(),
+    "rdstitch": lambda camera: json_bytes(camera_json(camera)).decode(),
     "opencv": formats.opencv_text,
     "opencv-json": partial(formats.opencv_text, yaml=False),
     "fisheye": partial(formats.opencv_text, fisheye=True),

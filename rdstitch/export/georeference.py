@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +25,9 @@ MIN_POSITIONS = 3
 # Positions must agree with the images to this share of their own spread: else it is no view from above, or the GPS
 # says less than nothing.
 _MAX_ERROR = 0.25
-GPS, CONTROL = "GPS positions", "ground control points"
+PositionKind = Literal["GPS positions", "ground control points"]
+GPS: PositionKind = "GPS positions"
+CONTROL: PositionKind = "ground control points"
 MODEL_SCALE, MODEL_TIEPOINT, MODEL_TRANSFORMATION, GEO_KEYS = 33550, 33922, 34264, 34735
 _SHORT, _DOUBLE = 3, 12
 
@@ -53,7 +56,7 @@ class Georeference:
     origin: complex  # easting + i northing of the centre of the top-left pixel, m
     # root mean square distance of the positions used from where all others and the images put them, m
     rms: float
-    source: str = GPS  # what the positions are
+    source: PositionKind = GPS  # what the positions are
     residuals: tuple[Residual, ...] = ()  # of every position
     # standard deviation of one coordinate of a place on the ground, in the mean over the positions, m
     std: float | None = None
@@ -291,7 +294,7 @@ def _placed(
     names: Sequence[str],
     epsg: int | None,
     force: bool,
-    source: str,
+    source: PositionKind,
 ) -> tuple[Georeference | None, str]:
     """Place the output by some positions."""
     latitude, longitude = np.array(degrees).T

@@ -17,6 +17,7 @@ from rdstitch.alignment import Alignment
 from rdstitch.alignment.result import LinkFit, ReliefTest, Unused
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
+from rdstitch.export.places_files import fiji_list, places_table
 from rdstitch.features import Correspondences
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
@@ -49,18 +50,15 @@ from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.positions import (
     Scan,
-    fiji_list,
     grid_from_arrays,
     grid_from_names,
     grid_from_table,
     grid_from_tiles,
 )
 from rdstitch.stage.register_tiles import (
+    SearchPlan,
     TileRegistration,
-    coarse_factor,
-    places_table,
     register_tiles,
-    search_radius,
 )
 from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.system.opencv_state import one_opencv_thread
@@ -273,13 +271,14 @@ def _placed(
     else:
         sources, said = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
-    search, factor = search_radius(nominal, options.search), coarse_factor(nominal)
-    grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, search)
+    plan = SearchPlan.of(nominal, options.search)
+    factor = plan.factor
+    grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
     if shown:
         said.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
-    tiled = register_tiles(grid, read, search=search, distortion=options.distortion, progress=progress)
+    tiled = register_tiles(replace(plan, grid=grid), read, distortion=options.distortion, progress=progress)
     for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
         read(index)
     if options.flat_field == "auto" and sources[0].flat_field is not None and not _overlaps_show(sources, tiled):
@@ -380,17 +379,8 @@ def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registr
         reference=0,
         model="rigid",
         model_reason="a stage moves without turning",
-        poses=None,
-        tilt=None,
-        tilt_spread=0.0,
-        focal=None,
-        focal_std=None,
         distortion=fitted.distortion,
         distortion_std=fitted.distortion_std,
-        lens="division",
-        lens_reason="one parameter",
-        parameters=(),
-        covariance=np.empty((0, 0)),
         rms=rms,
         links=fits,
         relief=ReliefTest(False, 0.0, 0.0, "Taken to be flat: tiles on a stage."),

@@ -72,9 +72,7 @@ def errors_of(sequence: Sequence, orientations: tuple[int, ...], result: rdstitc
 
 
 @pytest.mark.parametrize("orientations", [MIRRORED, pytest.param(PROPER, marks=pytest.mark.slow)])
-def test_a_mosaic_finds_the_lens_of_the_stored_frame(
-    sequence: Sequence, orientations: tuple[int, ...], tmp_path: Path
-) -> None:
+def test_a_mosaic_finds_the_stored_lens(sequence: Sequence, orientations: tuple[int, ...], tmp_path: Path) -> None:
     files = written(sequence, orientations, tmp_path / "frames")
     options = rdstitch.StitchOptions(save_camera=tmp_path / "camera.json")
     result = rdstitch.mosaic(files, tmp_path / "out.png", options)

@@ -60,9 +60,7 @@ def test_local_alignment_is_applied_again(rdstitch: Run, frames: list[Path], tmp
     assert "images[0].displacement: expected" in refused.err
 
 
-def test_given_options_win_over_those_of_the_sidecar(
-    rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path
-) -> None:
+def test_given_options_win_over_the_sidecar(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     changed, direct = tmp_path / "changed.png", tmp_path / "direct.png"
     options = ("--scale", "0.4", "--rotate", "0", "--blend", "feather")
     _apply(rdstitch, _sidecar(stitched), frames[0].parent, changed, *options)
@@ -143,9 +141,7 @@ def test_images_of_one_name_in_two_folders(rdstitch: Run, frames: list[Path], tm
     _apply(rdstitch, _sidecar(output), folders[1], tmp_path / "one.png", told=f"left out {folders[0] / 'x.png'}")
 
 
-def test_layers_whose_masks_would_have_the_name_of_another_layer(
-    rdstitch: Run, frames: list[Path], tmp_path: Path
-) -> None:
+def test_layers_whose_masks_would_be_called_like_another(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     for name, frame in zip(("a.png", "a_mask.png"), frames, strict=False):
         shutil.copy(frame, tmp_path / name)
     layers = tmp_path / "layers"
@@ -174,9 +170,7 @@ def test_what_does_not_fit_is_refused(rdstitch: Run, frames: list[Path], stitche
     assert not (tmp_path / "out.tif").exists()
 
 
-def test_never_writes_over_the_sidecar_that_it_applies(
-    rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path
-) -> None:
+def test_never_writes_over_its_sidecar(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     for file in (stitched, _sidecar(stitched)):
         shutil.copy(file, tmp_path)
     own = tmp_path / stitched.name

@@ -105,7 +105,7 @@ def test_a_generator_that_reuses_its_buffer(arrays: list[NDArray[np.uint8]], of_
     assert rdstitch.pano(stream(), options=_DRY).distortion == of_files.distortion
 
 
-def test_arrays_mix_with_paths_and_the_sidecar_names_them(
+def test_arrays_mix_with_paths_and_are_named(
     arrays: list[NDArray[np.uint8]], frames: list[Path], tmp_path: Path
 ) -> None:
     result = rdstitch.pano([frames[0], arrays[1], str(frames[2])], tmp_path / "mix.png", _OPTIONS)

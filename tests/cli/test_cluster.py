@@ -58,9 +58,7 @@ def _record(output: Path) -> dict[str, Any]:
     return record
 
 
-def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(
-    images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_same_bytes_though_a_worker_dies(images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     features = rdstitch.FeatureOptions(max_features=600)
     here, there = tmp_path / "here" / "out.png", tmp_path / "there" / "out.png"
     here.parent.mkdir()
@@ -86,7 +84,7 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(
 
 
 @pytest.mark.slow
-def test_one_and_four_worker_processes_give_the_same_bytes(
+def test_same_bytes_of_one_and_four_workers(
     images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All work on images and pairs is in tasks: each kind of them was handed over."""

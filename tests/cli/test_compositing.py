@@ -41,9 +41,7 @@ WAYS: list[tuple[str, ...]] = [
 ]
 
 
-def test_every_way_makes_another_image_of_the_same_place(
-    rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path
-) -> None:
+def test_every_way_shows_the_same_place(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
     images = []
     for number, way in enumerate(WAYS):
         output = tmp_path / f"{number}.png"
@@ -99,20 +97,8 @@ def test_deep_zoom_is_the_same_image(rdstitch: Run, frames: list[Path], tmp_path
     assert np.abs(tiles - whole.pixels)[sure].mean() < 0.5 * np.abs(np.roll(tiles, 1, 1) - whole.pixels)[sure].mean()
 
 
-def test_deep_zoom_is_replaced_only_on_request(
-    rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path
-) -> None:
-    command = ("apply", sidecar, "--images", frames[0].parent, "-o", tmp_path / "a.dzi", "--scale", "0.3")
-    rdstitch(*command)
-    (tmp_path / "a.dzi").unlink()
-    (tmp_path / "a.dzi.json").unlink()
-    (tmp_path / "a.html").unlink()
-    rdstitch(*command, status=6, told="a_files: exists already")
-    rdstitch(*command, "--overwrite")
-
-
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
-def test_profile_and_exif_are_kept_and_the_image_is_upright(
+def test_tags_are_kept_and_upright(
     rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path, suffix: str
 ) -> None:
     profile, folder = bytes(range(256)) * 2, tmp_path / "turned"
@@ -134,20 +120,8 @@ def test_profile_and_exif_are_kept_and_the_image_is_upright(
         assert written.getexif().get(ExifTags.Base.Orientation, 1) == 1
 
 
-@pytest.mark.parametrize(
-    ("output", "more"),
-    [("layers/a.tif", "--layers layers"), ("x.dzi", "--report x.html"), ("x.png", "--poses x.png.json")],
-)
-def test_two_outputs_of_one_name_are_refused_before_the_work(rdstitch: Run, here: Path, output: str, more: str) -> None:
-    (here / "layers").mkdir()
-    rdstitch("mosaic", "a.png", "b.png", "-o", output, *more.split(), status=6, told="is the name of two outputs")
-    assert not list((here / "layers").iterdir())
-
-
 @pytest.mark.parametrize("whole", [False, True])
-def test_layers_by_their_masks_are_the_composite(
-    rdstitch: Run, frames: list[Path], tmp_path: Path, whole: bool
-) -> None:
+def test_layers_by_masks_are_the_composite(rdstitch: Run, frames: list[Path], tmp_path: Path, whole: bool) -> None:
     output, folder = tmp_path / "all.png", tmp_path / "layers"
     more = ["--whole-layers"] if whole else []
     rdstitch("mosaic", frames[0].parent, "-o", output, "--blend", "none", "--layers", folder, *more, *CACHED, err="")
@@ -175,11 +149,3 @@ def test_layers_by_their_masks_are_the_composite(
     # Seams are found once more, on the same small versions of the images.
     shown = np.where(owners[..., None] > 0, np.atleast_3d(composite.pixels), 0)
     np.testing.assert_array_equal(np.atleast_3d(joined), shown)
-
-
-def test_what_is_there_is_kept(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    folder = tmp_path / "layers"
-    folder.mkdir()
-    (folder / f"{frames[0].stem}.tif").write_bytes(b"mine")
-    rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "a.png", "--layers", folder, status=6, told="exists already")
-    assert [file.read_bytes() for file in folder.iterdir()] == [b"mine"]

@@ -51,9 +51,7 @@ def _rest(process: "subprocess.Popen[bytes]") -> list[dict[str, Any]]:
     return [json.loads(line) for line in output.splitlines()]
 
 
-def test_a_growing_folder_gives_poses_at_once_and_then_the_same_image(
-    rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path
-) -> None:
+def test_poses_at_once_and_then_the_same_image(rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path) -> None:
     output, whole = tmp_path / "live.png", tmp_path / "whole.png"
     process = start("mosaic", folder, "-o", output, "--follow", "--idle", "4", "--refresh", "0.1", *FAST)
     lines = []
@@ -117,7 +115,7 @@ def test_names_on_standard_input_are_taken_as_they_come(drive: list[Path], tmp_p
 
 
 @pytest.mark.parametrize("frame", sampled(["enu", "camera"]))
-def test_lines_have_the_units_and_the_times_of_the_table(
+def test_lines_are_those_of_the_table(
     rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path, frame: str
 ) -> None:
     for image in drive:
@@ -140,9 +138,7 @@ def test_lines_have_the_units_and_the_times_of_the_table(
     assert float(table[0]["height"]) == pytest.approx(0.42)
 
 
-def test_a_frame_that_cannot_be_read_has_a_line_with_the_reason(
-    rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path
-) -> None:
+def test_the_line_of_what_cannot_be_read(rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path) -> None:
     for image in drive[:3]:
         shutil.copy(image, folder)
     (folder / "frame_0001.png").write_bytes(b"no image")

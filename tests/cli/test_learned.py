@@ -39,9 +39,7 @@ def test_a_network_that_is_not_there_is_named(rdstitch: Run, frames: list[Path],
     assert not (tmp_path / "pano.png").exists()
 
 
-def test_an_opencv_without_networks_is_said_so(
-    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_opencv_has_none(rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(cv2, "ALIKED")
     arguments = ("--features", "aliked", "--aliked-model", tmp_path / "absent.onnx")
     done = rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.png", *arguments, *FAST, status=2)

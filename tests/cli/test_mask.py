@@ -42,9 +42,7 @@ def leg_pixels(output: Path) -> int:
 
 @pytest.mark.parametrize("command", ["mosaic", "pano"])
 @pytest.mark.parametrize("one", [True, False])
-def test_a_leg_is_neither_matched_nor_shown(
-    rdstitch: Run, legs: Path, tmp_path: Path, command: str, *, one: bool
-) -> None:
+def test_a_leg_is_not_matched_nor_shown(rdstitch: Run, legs: Path, tmp_path: Path, command: str, *, one: bool) -> None:
     mask = tmp_path / "mask.png"
     if not one:
         (tmp_path / "masks").mkdir()

@@ -14,9 +14,7 @@ from rdstitch.synthetic import Sequence
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, transfers
 
 
-def test_writes_image_sidecar_and_camera_and_prints_lambda(
-    rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path
-) -> None:
+def test_writes_image_sidecar_and_camera(rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path) -> None:
     output, camera = tmp_path / "pano.png", tmp_path / "camera.json"
     done = rdstitch("pano", *frames, "-o", output, "--save-camera", camera, *CACHED, err="")
     assert done.out == f"{float(done.out):.6f}\n"
@@ -77,9 +75,7 @@ def test_an_image_without_overlap_is_named(rdstitch: Run, frames: list[Path], st
     assert not (tmp_path / "strict.jpg").exists()
 
 
-def test_quiet_prints_nothing_and_verbose_prints_more(
-    rdstitch: Run, frames: list[Path], stranger: Path, tmp_path: Path
-) -> None:
+def test_quiet_prints_nothing_verbose_more(rdstitch: Run, frames: list[Path], stranger: Path, tmp_path: Path) -> None:
     arguments = ("pano", *frames[:2], stranger, "-o", tmp_path / "pano.jpg", "--overwrite", *CACHED)
     quiet, usual, verbose = rdstitch(*arguments, "-q"), rdstitch(*arguments), rdstitch(*arguments, "-v")
     assert quiet.err == quiet.made == ""

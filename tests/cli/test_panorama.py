@@ -116,14 +116,6 @@ def test_a_view_of_a_plane_cannot_be_turned(rdstitch: Run, frames: list[Path], t
     rdstitch("pano", *frames, *how, status=2, told="turning on the spot")
 
 
-def test_a_lens_is_calibrated_by_turning(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
-    camera = tmp_path / "camera.json"
-    rdstitch("calibrate", around[0].parent, "-o", camera, *CACHE)
-    found = Camera.load(camera)
-    assert found.distortion == pytest.approx(-0.2, abs=0.005)
-    assert found.focal == pytest.approx(260.0, rel=0.003)
-
-
 def test_a_turning_camera_has_no_path(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
     rdstitch("trajectory", around[0].parent, "-o", tmp_path / "path.csv", *CACHE, status=2, told="turned on the spot")
 

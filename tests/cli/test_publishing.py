@@ -96,9 +96,7 @@ main()
 
 
 @pytest.mark.parametrize("published", sampled([1, 0]))
-def test_a_run_that_was_killed_while_it_published_can_be_run_again(
-    rdstitch: Run, frames: list[Path], tmp_path: Path, published: int
-) -> None:
+def test_killed_while_it_published(rdstitch: Run, frames: list[Path], tmp_path: Path, published: int) -> None:
     output, report = tmp_path / "out.png", tmp_path / "why.html"
     arguments: tuple[str | Path, ...] = ("mosaic", *frames, "-o", output, "--report", report, "--overwrite", *CACHED)
     killed = finished(start(*arguments, program=_KILLED_WHILE_PUBLISHING.format(published=published)))
@@ -207,7 +205,7 @@ def test_what_belongs_beside_an_image_never_costs_the_image(
     assert json.loads(Path(f"{output}.json").read_text())["images"]
 
 
-def test_a_page_of_an_earlier_run_is_called_older(
+def test_an_earlier_page_is_older(
     rdstitch: Run, located: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arguments = ("mosaic", located / "flight", "-o", tmp_path / "field.dzi", *FAST, "--overwrite")

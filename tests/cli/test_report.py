@@ -178,9 +178,7 @@ def test_names_are_escaped_and_vanished_images_do_not_matter(frames: list[Path],
     assert page.sources == []
 
 
-def test_of_a_large_tiff_an_overview_is_read(
-    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_overviews_are_read(rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = pano(frames[:2], tmp_path / "large.tif", replace(OPTIONS, composite=CompositeOptions(scale=3.0)))
     monkeypatch.setattr(report, "_MOSAIC_SIDE", 300)
     whole = _decoded(report._thumbnail(result))
@@ -209,9 +207,7 @@ def test_the_best_pair_has_many_matches(frames: list[Path]) -> None:
     assert "Best pair: " in shown
 
 
-def test_an_image_larger_than_any_cameras_is_shown_or_said_to_be_too_large(
-    pair: StitchResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_too_large_an_image_it_is_said(pair: StitchResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(MAX_IMAGE_GB, "0.0001")
     for suffix, shown in ((".jpg", True), (".png", False)):
         file = tmp_path / f"large{suffix}"

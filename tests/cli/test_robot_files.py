@@ -53,9 +53,7 @@ def test_map_poses_and_odometry_lie_in_one_frame(rdstitch: Run, frames: list[Pat
         assert message.pose.covariance.shape == (36,)
 
 
-def test_the_first_image_gives_the_frame_of_path_mosaic_and_sidecar(
-    rdstitch: Run, frames: list[Path], tmp_path: Path
-) -> None:
+def test_the_first_image_is_the_frame_of_all_that_is_written(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     known = ("--focal", "380", "--height", "0.42", "--frame", "first", *CACHED)
     rdstitch("trajectory", *frames, "-o", tmp_path / "path.csv", *known)
     beside = ("--poses", tmp_path / "poses.csv", "--map-server", tmp_path / "maps")
@@ -92,9 +90,7 @@ def test_a_folder_that_is_no_bag_is_not_replaced(rdstitch: Run, frames: list[Pat
     assert len(list((tmp_path / "notes").iterdir())) == 2
 
 
-def test_a_bag_replaces_another_one_whole_and_needs_rosbags_before_the_work(
-    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bag_is_replaced(rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     highlevel = pytest.importorskip("rosbags.highlevel")
     bag = tmp_path / "odom.bag"
     bag.write_bytes(b"older")

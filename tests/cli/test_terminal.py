@@ -1,13 +1,10 @@
 """Where a run stands: the terminal, the folder's surroundings, and interruptions."""
 
-import json
 import os
-import random
 import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -224,22 +221,3 @@ def test_termination_leaves_nothing_behind(place: Path, signal_number: int) -> N
     assert done.status == 128 + signal_number
     assert done.line.endswith("interrupted")
     assert state_of(place) == before
-
-
-@pytest.mark.parametrize("attempt", sampled(range(int(os.environ.get("RDSTITCH_KILLS", "4")))))
-def test_killed_at_any_moment(place: Path, attempt: int) -> None:
-    command = ("pano", place / "a.png", place / "b.png", "-o", place / "out.png", "--overwrite", *FAST)
-    assert finished(start(*command, "--max-size", "100")).status == 0
-    old = (place / "out.png").read_bytes()
-    process = start(*command, "-v")
-    assert process.stderr.readline()
-    time.sleep(random.Random(attempt).uniform(0.0, 1.5))
-    process.kill()
-    finished(process)
-    if (place / "out.png").read_bytes() != old:
-        assert read_image(place / "out.png").pixels.size > 0
-    assert json.loads((place / "out.png.json").read_text(encoding="utf-8"))["verdict"]["ok"]
-    # What a killed run leaves is hidden, and no input of the next one.
-    done = finished(start("mosaic", place, "-o", place / "out.png", "--overwrite", *FAST))
-    assert (done.status, done.err) == (0, "")
-    assert read_image(place / "out.png").pixels.size > 0

@@ -12,9 +12,7 @@ from rdstitch.synthetic import Sequence
 from tests.cli.running import DISTORTION, FAST, Run
 
 
-def test_undistorted_pixels_are_where_the_model_says(
-    rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path
-) -> None:
+def test_pixels_are_where_the_model_says(rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path) -> None:
     rdstitch("undistort", *frames, "--lambda", str(DISTORTION), "-o", tmp_path / "new" / "folder", out="", err="")
     written = sorted((tmp_path / "new" / "folder").iterdir())
     assert [path.name for path in written] == [path.name for path in frames]
@@ -133,9 +131,7 @@ def test_what_fails_leaves_no_folder(rdstitch: Run, frames: list[Path], tmp_path
         assert not (tmp_path / "a").exists()
 
 
-def test_a_camera_file_without_a_size_takes_it_from_the_images(
-    rdstitch: Run, frames: list[Path], tmp_path: Path
-) -> None:
+def test_a_camera_file_without_a_size_takes_that_of_images(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     camera = tmp_path / "camera.yml"
     matrix = "camera_matrix:\n   rows: 3\n   cols: 3\n   data: [380., 0., 199.5, 0., 403., 149.5, 0., 0., 1.]\n"
     values = "distortion_coefficients:\n   rows: 1\n   cols: 5\n   data: [-0.2, 0.05, 0., 0., 0.]\n"

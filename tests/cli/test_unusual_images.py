@@ -110,9 +110,7 @@ def test_odd_names_work(place: Path, name: str) -> None:
     assert len(record["images"]) == 2
 
 
-def test_images_that_nobody_here_can_read_are_named(
-    rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_nobody_here_can_read_is_named(rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for package in ("pillow_heif", "rawpy"):
         monkeypatch.setitem(sys.modules, package, None)
     for name in ("new.HEIC", "other.dng", "a.dng"):

@@ -146,9 +146,7 @@ def test_where_nothing_is_straight_nothing_is_turned(rdstitch: Run, tmp_path: Pa
     assert plain.read_bytes() == output.read_bytes()
 
 
-def test_an_unknown_focal_length_follows_from_the_rectangle(
-    facade: tuple[Sequence, list[Path]], rdstitch: Run, tmp_path: Path
-) -> None:
+def test_the_rectangle_tells_a_focal_length(facade: tuple[Sequence, list[Path]], rdstitch: Run, tmp_path: Path) -> None:
     sequence, paths = facade
     output = tmp_path / "up.png"
     how = ("--lambda", "-0.1", "--reference", paths[0].name, "--model", "homography")

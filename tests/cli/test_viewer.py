@@ -34,9 +34,7 @@ def _data(page: Path) -> dict[str, Any]:
     return data
 
 
-def test_the_page_knows_the_images_and_needs_no_network(
-    rdstitch: Run, page: Path, frames: list[Path], tmp_path: Path
-) -> None:
+def test_the_page_knows_its_images_and_is_alone(rdstitch: Run, page: Path, frames: list[Path], tmp_path: Path) -> None:
     data, text = _data(page), page.read_text(encoding="utf-8")
     record = json.loads((tmp_path / "x.dzi.json").read_text(encoding="utf-8"))
     assert data["size"] == record["output"]["size"]

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from examples.worlds.compositing_scenes import Scene, place_images, render
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.blender import MultibandBlender, margin, rounding_constant
 from rdstitch.compositing.boxes import aligned, grown
 from rdstitch.compositing.preparation import Prepared, prepare_composite
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import Scene, place_images, render
 
 WAYS = [("multiband", "graphcut"), ("multiband", "none"), ("feather", "none"), ("feather", "voronoi"), ("none", "none")]
 

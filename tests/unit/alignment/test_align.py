@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from examples.judging.trajectories import compare_trajectories
+from examples.worlds.alignment_scenes import Scene, aligned, grid, jittered, robot_path, scene
 from rdstitch.alignment import AlignmentOptions, align, most_matches_read
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
@@ -21,7 +22,6 @@ from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import RadialHomography, transfer
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import SpanningTree, spanning_tree
-from tests.alignment_scenes import Scene, aligned, grid, jittered, robot_path, scene
 from tests.sampled import sampled
 
 
@@ -62,26 +62,20 @@ def _wrong_link(given: Scene, i: int, j: int, rng: np.random.Generator) -> Link:
 
 
 @pytest.mark.parametrize(
-    ("columns", "rows", "size", "focal", "distortion", "tilt", "yaw"),
+    ("cells", "size", "focal", "distortion", "deg", "yaw"),
     [
-        (4, 3, (640, 480), 520.0, -0.25, (2.5, -2.0), 8.0),
-        (6, 2, (800, 600), 650.0, -0.25, (2.0, -1.5), 8.0),
-        (4, 3, (640, 480), 420.0, -0.45, (-6.0, 5.0), 15.0),
-        (4, 3, (640, 480), 520.0, 0.0, (0.0, 0.0), 180.0),
+        ((4, 3), (640, 480), 520.0, -0.25, (2.5, -2.0), 8.0),
+        ((6, 2), (800, 600), 650.0, -0.25, (2.0, -1.5), 8.0),
+        ((4, 3), (640, 480), 420.0, -0.45, (-6.0, 5.0), 15.0),
+        ((4, 3), (640, 480), 520.0, 0.0, (0.0, 0.0), 180.0),
     ],
 )
 def test_a_robots_grid_is_rigid(
-    columns: int,
-    rows: int,
-    size: tuple[int, int],
-    focal: float,
-    distortion: float,
-    tilt: tuple[float, float],
-    yaw: float,
+    cells: tuple[int, int], size: tuple[int, int], focal: float, distortion: float, deg: tuple[float, float], yaw: float
 ) -> None:
-    rng = np.random.default_rng(columns)
-    poses = grid(columns, rows, (0.5, 0.4), math.radians(yaw), rng)
-    tilt = (math.radians(tilt[0]), math.radians(tilt[1]))
+    rng = np.random.default_rng(cells[0])
+    poses = grid(*cells, (0.5, 0.4), math.radians(yaw), rng)
+    tilt = (math.radians(deg[0]), math.radians(deg[1]))
     given = scene(poses, size=size, focal=focal, distortion=distortion, tilt=tilt, rng=rng)
     found = aligned(given)
     assert found.model == "rigid"
@@ -301,9 +295,7 @@ def test_links_need_no_more_matches_than_are_read(most: int, read: int | None) -
     every = align(given.cameras, given.links, options)
     assert np.array_equal(few.homographies, every.homographies)
     assert few.links == every.links
-
-
-def test_many_links_are_read_in_part_and_those_of_a_short_turn_whole() -> None:
+    # Many links are read in part, and those of a short turn whole.
     options = AlignmentOptions(most=100)
     assert [most_matches_read(links, options) for links in (10, 100, 6000, 50_000)] == [None, 100, 83, 40]
 

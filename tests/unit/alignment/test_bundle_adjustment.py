@@ -1,17 +1,17 @@
-"""The adjustment: derivatives checked numerically, priors, robustness, covariance against scatter."""
+"""The adjustment: flat observations, derivatives checked numerically, priors, covariance against scatter."""
 
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import Scene, grid, jittered, scene
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, sigma_of
 from rdstitch.alignment.link_equations import link_equations, squared_lengths, trial_errors
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, MotionModel
-from rdstitch.alignment.normal_equations import PoseBlocks, chain
+from rdstitch.alignment.normal_equations import SparseNormalEquations, chain
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors
 from rdstitch.geometry.radial_homography import transfer_jacobian
 from rdstitch.robust.loss import robust_cost, robust_weight
-from tests.alignment_scenes import Scene, grid, jittered, scene
 
 FREE_LENS = np.array([True, True, True, True, True])
 ONE_LENS = np.array([True, False, False, False, False])
@@ -27,6 +27,19 @@ def _start(model: MotionModel, truth: Scene) -> Parameters:
     shared = model.shared_from_physical(np.array([0.05, -0.04, np.log(1.3)])) if model.shared_names else np.zeros(0)
     poses = model.nearest_poses(truth.truth, shared, np.zeros((len(truth.truth), 2)))
     return Parameters(poses, shared, np.array([-0.23, 0.01, -0.02, 0.004, -0.006]))
+
+
+def _dense(normal: SparseNormalEquations, observations: Observations) -> np.ndarray:
+    """The whole matrix of the free parameters."""
+    (count, size), shared = normal.free.shape, len(normal.shared)
+    poses, images = np.zeros((count, count, size, size)), np.arange(count)
+    poses[images, images] = normal.poses
+    poses[observations.image2, observations.image1] += normal.links
+    poses[observations.image1, observations.image2] += normal.links.swapaxes(1, 2)
+    rows, coupling = poses.swapaxes(1, 2).reshape(count * size, -1), normal.coupling.reshape(-1, shared)
+    free = np.append(normal.free.ravel(), np.ones(shared, dtype=np.bool_))
+    dense: np.ndarray = np.block([[rows, coupling], [coupling.T, normal.shared]])[np.ix_(free, free)]
+    return dense
 
 
 @pytest.mark.parametrize("width", [2.0, 20.0])  # px; the errors at the start are of some twenty
@@ -45,29 +58,28 @@ def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: flo
     free = np.ones((count, model.pose_size), dtype=np.bool_)
     free[0] = False
     matrices = model.matrices(start.poses, start.shared)
-    normal = chain(equations, observations, matrices, homographies(start), PoseBlocks.of(observations, free), 2.0)
+    normal = chain(equations, observations, matrices, homographies(start), free, 2.0)
 
     def cost(poses_step: np.ndarray, shared_step: np.ndarray) -> float:
-        step = np.zeros((count, model.pose_size))
-        step[free] = poses_step
-        moved = start.retract(model, step, shared_step, FREE_LENS)
+        moved = start.retract(model, poses_step, shared_step, FREE_LENS)
         errors = trial_errors(observations, homographies(moved), moved.lens, equations.whitening)
         return 2.0 * float(robust_cost(squared_lengths(errors), width).sum())
 
     rng = np.random.default_rng(0)
     for _ in range(4):
-        along = rng.normal(size=int(free.sum())), rng.normal(size=len(start.shared) + len(FREE_LENS))
+        along = rng.normal(size=free.shape) * free, rng.normal(size=len(start.shared) + len(FREE_LENS))
         step = 1e-6
         numeric = (cost(step * along[0], step * along[1]) - cost(-step * along[0], -step * along[1])) / (2 * step)
-        analytic = 2.0 * float(normal.gradient_poses @ along[0] + normal.gradient_shared @ along[1])
+        analytic = 2.0 * float(np.vdot(normal.gradient_poses, along[0]) + normal.gradient_shared @ along[1])
         assert analytic == pytest.approx(numeric, rel=1e-5)
 
     # the step solves the dense system
-    poses = normal.blocks.matrix(normal.poses).toarray()
-    dense = np.block([[poses, normal.coupling], [normal.coupling.T, normal.shared]])
-    right = -np.concatenate([normal.gradient_poses, normal.gradient_shared])
-    damped = dense + 1e-3 * np.diag(np.diag(dense))
-    np.testing.assert_allclose(np.concatenate(normal.solve(1e-3)), np.linalg.solve(damped, right), rtol=1e-6, atol=1e-9)
+    dense = _dense(normal, observations)
+    right = -np.concatenate([normal.gradient_poses[free], normal.gradient_shared])
+    poses, shared = normal.solve(1e-3)
+    expected = np.linalg.solve(dense + 1e-3 * np.diag(np.diag(dense)), right)
+    np.testing.assert_allclose(np.concatenate([poses[free], shared]), expected, rtol=1e-6, atol=1e-9)
+    assert not poses[~free].any()
 
 
 @pytest.mark.parametrize("free", [ONE_LENS, FREE_LENS, np.zeros(5, dtype=np.bool_)], ids=["one", "all", "none"])
@@ -102,14 +114,22 @@ def test_information_on_shared_parameters_is_what_elimination_leaves() -> None:
         observations,
         matrices,
         h,
-        PoseBlocks.of(observations, free),
+        free,
         1.0,
     )
-    normal = normal.with_priors(np.full(int(free.sum()), 1e4), np.zeros(int(free.sum())), np.eye(4), np.zeros(4))
-    poses = normal.blocks.matrix(normal.poses).toarray()
-    dense = np.block([[poses, normal.coupling], [normal.coupling.T, normal.shared]])
-    expected = np.linalg.inv(np.linalg.inv(dense)[-4:, -4:])
+    normal = normal.with_priors(np.full(free.shape, 1e4), np.zeros(free.shape), np.eye(4), np.zeros(4))
+    inverse = np.linalg.inv(_dense(normal, observations))
+    expected = np.linalg.inv(inverse[-4:, -4:])
     np.testing.assert_allclose(normal.shared_information(), expected, rtol=1e-5, atol=1e-5)
+    # and of the inverse each image's own block, and those with the shared parameters
+    whole, size = np.zeros((free.size + 4, free.size + 4)), free.shape[1]
+    whole[np.ix_(*[np.append(free.ravel(), [True] * 4)] * 2)] = inverse
+    own, by_shared, of_shared = normal.pose_covariances()
+    for k in range(len(free)):
+        rows = slice(k * size, (k + 1) * size)
+        np.testing.assert_allclose(own[k], whole[rows, rows], rtol=1e-6, atol=1e-9 * np.abs(inverse).max())
+        np.testing.assert_allclose(by_shared[k], whole[rows, -4:], rtol=1e-6, atol=1e-9 * np.abs(inverse).max())
+    np.testing.assert_allclose(of_shared, inverse[-4:, -4:], rtol=1e-6)
 
 
 def _adjust(model: MotionModel, truth: Scene, seen: Observations) -> tuple[float, float]:
@@ -176,3 +196,53 @@ def test_what_leaves_most_matches_behind_the_camera_is_no_solution(behind: list[
 def test_errors_of_a_given_scatter_give_their_sigma() -> None:
     errors = np.random.default_rng(0).normal(0, 0.7, (20_000, 2))
     assert sigma_of((errors**2).sum(axis=1)) == pytest.approx(0.7, rel=0.03)
+
+
+def _observations(counts: list[int]) -> Observations:
+    rng = np.random.default_rng(0)
+    total, links = sum(counts), len(counts)
+    points = rng.uniform(-0.8, 0.8, (total, 2))
+    return Observations(
+        np.arange(links),
+        np.arange(links) + 1,
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
+        points,
+        points + rng.normal(0.0, 0.05, points.shape),
+        np.full(links, 400.0),
+        np.full(links, 400.0),
+        np.array(counts),
+    )
+
+
+def test_medians_of_links_of_any_length() -> None:
+    counts = [5, 0, 1, 8, 2, 0]
+    observations = _observations(counts)
+    values = np.random.default_rng(1).normal(size=sum(counts))
+    values[3] = np.inf
+    found = observations.medians(values)
+    parts = np.split(values, np.cumsum(counts)[:-1])
+    assert found.tolist() == [float(np.median(part)) if len(part) else np.inf for part in parts]
+    assert _observations([0, 0]).medians(np.empty(0)).tolist() == [np.inf, np.inf]
+
+
+def test_areas_of_links_with_few_correspondences_or_many() -> None:
+    corners = np.array([(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)])
+    points = np.concatenate([corners, 0.5 * corners + 0.2, corners * (1.0, 0.0), corners[:1]])
+    start = np.array([0, 4, 8, 12, 13, 13])
+    sizes = np.full(5, 400.0)
+    made = Observations(np.arange(5), np.arange(5) + 1, start, points, points, sizes, sizes, np.diff(start))
+    np.testing.assert_allclose(made.areas, [1.0, 0.25, 0.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_sums_of_a_link_do_not_depend_on_the_other_links() -> None:
+    """Whether these have as many correspondences or not."""
+    observations = _observations([30, 12, 30, 0, 7])
+    homographies = np.eye(3) + np.random.default_rng(2).normal(0.0, 0.01, (5, 3, 3))
+    lens, free = np.array([-0.2, 0.0, 0.0, 0.0, 0.0]), np.array([True, False, False, True, True])
+    together = link_equations(observations, homographies, lens, 20.0, free)
+    for link in range(5):
+        alone = link_equations(observations.subset(np.array([link])), homographies[[link]], lens, 20.0, free)
+        np.testing.assert_allclose(together.gram[link], alone.gram[0], rtol=1e-12, atol=1e-9)
+        np.testing.assert_allclose(together.gradient[link], alone.gradient[0], rtol=1e-12, atol=1e-9)
+    assert (together.gram[3] == 0.0).all()
+    assert (together.gram[0] != 0.0).any()

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import Scene, grid, scene
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import Link
-from tests.alignment_scenes import Scene, grid, scene
 
 
 def _cut(given: Scene, margins: list[tuple[int, int]]) -> tuple[list[Camera], list[Link]]:

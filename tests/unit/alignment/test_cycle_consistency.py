@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from examples.worlds.alignment_scenes import Scene, grid, scene
 from rdstitch.alignment.adjustment_problem import independent_pairs, relations_at
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links, triangles
@@ -15,7 +16,6 @@ from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import BoolArray
 from rdstitch.geometry.camera import LENS_PARAMETERS
 from rdstitch.matching.links import Link
-from tests.alignment_scenes import Scene, grid, scene
 
 
 def test_triangles_of_a_complete_graph() -> None:

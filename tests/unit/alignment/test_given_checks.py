@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import Scene, aligned, grid, jittered, scene
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.motion_models import PSI, THETA
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.inputs.delays import DELAYS
-from tests.alignment_scenes import Scene, aligned, grid, jittered, scene
 
 _ONE = math.radians(1.0)
 

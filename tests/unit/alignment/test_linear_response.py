@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, FreeParameters, Parameters
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors, whitened_errors
@@ -14,7 +15,6 @@ from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.radial_homography import inverses, project
 from rdstitch.robust.posterior import Prior
-from tests.alignment_scenes import grid, scene
 
 LENS = np.array([True, True, False, False, False])
 
@@ -36,14 +36,12 @@ def _adjusted(model: MotionModel) -> tuple[BundleAdjuster, BundleAdjustmentResul
 def test_changes_are_the_derivatives_of_the_errors(model: MotionModel) -> None:
     adjuster, adjusted = _adjusted(model)
     response, rng = LinearResponse.of(adjuster, adjusted), np.random.default_rng(0)
-    poses = rng.normal(size=(int(adjuster.free.poses.sum()), 2))
+    poses = rng.normal(size=(*adjuster.free.poses.shape, 2)) * adjuster.free.poses[..., None]
     shared = rng.normal(size=(len(adjusted.parameters.shared) + 2, 2))
     found = np.concatenate([response.changes(part, poses, shared) for part in response.parts()])
 
     def errors(size: float, column: int) -> FloatArray:
-        step = np.zeros(adjuster.free.poses.shape)
-        step[adjuster.free.poses] = size * poses[:, column]
-        moved = adjusted.parameters.retract(model, step, size * shared[:, column], LENS)
+        moved = adjusted.parameters.retract(model, size * poses[..., column], size * shared[:, column], LENS)
         matrices = model.matrices(moved.poses, moved.shared).matrices
         i, j = adjuster.observations.image1, adjuster.observations.image2
         return whitened_errors(adjuster.observations, matrices[j] @ inverses(matrices)[i], moved.lens)
@@ -72,9 +70,7 @@ def test_steps_are_what_adjusting_anew_finds(model: str) -> None:
     lens = again.parameters.lens - adjusted.parameters.lens
     np.testing.assert_allclose(shared[size:, 0], lens[LENS], rtol=0.2, atol=0.1 * np.abs(lens[LENS]).max())
     centres = [project(inverses(found.matrices.matrices)[:, :, 2]) for found in (adjusted, again)]
-    step = np.zeros(adjuster.free.poses.shape)
-    step[adjuster.free.poses] = poses[:, 0]
-    there = adjusted.parameters.retract(adjuster.model, step, shared[:, 0], LENS)
+    there = adjusted.parameters.retract(adjuster.model, poses[..., 0], shared[:, 0], LENS)
     predicted = project(inverses(adjuster.model.matrices(there.poses, there.shared).matrices)[:, :, 2])
     assert np.linalg.norm(predicted - centres[1]) < 0.25 * np.linalg.norm(centres[1] - centres[0])
 

@@ -4,13 +4,13 @@ from functools import cache
 
 import numpy as np
 
+from examples.worlds.alignment_scenes import Scene, grid, jittered, scene
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.motion_models import TILTING, X, Y
 from rdstitch.alignment.plane_marks import PlaneMarks, Sighting
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
-from tests.alignment_scenes import Scene, grid, jittered, scene
 
 _HEIGHT = 300.0
 """Metres above the ground."""
@@ -71,20 +71,15 @@ def test_over_a_plane_positions_change_nothing_that_the_images_know() -> None:
     assert _bend(held, given) < _bend(without, given) + 0.001
 
 
-def test_positions_that_the_images_contradict_are_not_used_and_named() -> None:
+def test_positions_that_the_images_contradict_are_not_used_and_named_and_those_of_one_place_say_nothing() -> None:
     given = _strip(0.0)
-    positions = np.random.default_rng(3).permutation(_positions(given, 2.0))
-    without, ignored = _without(0.0), _aligned(given, positions)
-    np.testing.assert_array_equal(ignored.homographies, without.homographies)
-    assert [message.text[:28] for message in ignored.messages] == ["the GPS positions contradict"]
-
-
-def test_positions_of_one_place_say_nothing() -> None:
-    given = _strip(0.0)
-    positions = np.random.default_rng(4).normal(0.0, 3.0, (len(given.cameras), 2))
-    found = _aligned(given, positions)
-    np.testing.assert_array_equal(found.homographies, _without(0.0).homographies)
-    assert found.messages == ()
+    for positions, told in (
+        (np.random.default_rng(3).permutation(_positions(given, 2.0)), ["the GPS positions contradict"]),
+        (np.random.default_rng(4).normal(0.0, 3.0, (len(given.cameras), 2)), []),
+    ):
+        ignored = _aligned(given, positions)
+        np.testing.assert_array_equal(ignored.homographies, _without(0.0).homographies)
+        assert [message.text[:28] for message in ignored.messages] == told
 
 
 def test_errors_of_marks_have_the_derivatives_that_are_told() -> None:
@@ -136,11 +131,16 @@ def _off(found: Alignment, sightings: tuple[Sighting, ...]) -> FloatArray:
     return off
 
 
+def _along(given: Scene, count: int) -> FloatArray:
+    """So many places along the strip."""
+    along = np.linspace(given.poses[0, X], given.poses[-1, X], count)
+    return np.stack([along, np.interp(along, given.poses[:, X], given.poses[:, Y])], axis=1)
+
+
 def test_a_strip_bends_back_onto_its_control_points() -> None:
     """Points that take no part are much nearer too, and what is told of leaving one out is no less than that."""
     given = _strip(0.3)
-    along = np.linspace(given.poses[0, X], given.poses[-1, X], 13)
-    places = np.stack([along, np.interp(along, given.poses[:, X], given.poses[:, Y])], axis=1)
+    places = _along(given, 13)
     control, checks = _control(given, places[::3]), _control(given, places[1::3])
     options = AlignmentOptions(model="similarity", lens="division", control=control)
     without, held = _without(0.3), align(given.cameras, given.links, options)
@@ -162,8 +162,7 @@ def test_control_points_that_the_images_contradict_bend_nothing() -> None:
 
 def test_one_wrong_control_point_of_eight_does_no_harm() -> None:
     given = _strip(0.3)
-    along = np.linspace(given.poses[0, X], given.poses[-1, X], 15)
-    places = np.stack([along, np.interp(along, given.poses[:, X], given.poses[:, Y])], axis=1)
+    places = _along(given, 15)
     control, checks = _control(given, places[::2], off=np.eye(8)[3] * 150.0), _control(given, places[1::2])
     options = AlignmentOptions(model="similarity", lens="division", control=control)
     held = align(given.cameras, given.links, options)

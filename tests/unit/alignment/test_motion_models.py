@@ -1,12 +1,16 @@
-"""The motion models give what they promise: derivatives, inverses, and the homographies of planar motion."""
+"""The motion models give what they promise: derivatives, inverses, and poses from homographies of a plane."""
+
+import tracemalloc
 
 import numpy as np
 import pytest
 
+from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import (
     HOMOGRAPHY,
     LOG_HEIGHT,
     MODELS,
+    POSE,
     RIGID,
     SIMILARITY,
     TILTING,
@@ -92,3 +96,34 @@ def test_a_step_of_the_general_model_keeps_the_determinant() -> None:
     poses, _ = _some(HOMOGRAPHY, 3, np.random.default_rng(2))
     moved = HOMOGRAPHY.retract(poses, np.full((3, 8), 0.01)).reshape(-1, 3, 3)
     np.testing.assert_allclose(np.abs(np.linalg.det(moved)), 1.0, atol=1e-12)
+
+
+_FOCAL = 1.3  # half diagonals
+
+
+def _homographies(count: int) -> np.ndarray:
+    """Plane-to-image homographies of tilted cameras over a plane, in a projective frame of it."""
+    rng = np.random.default_rng(3)
+    poses = np.zeros((count, 6))
+    poses[:, :3] = rng.normal(0.0, 1.0, (count, 3))
+    poses[:, 4:] = rng.normal(0.0, 0.1, (count, 2))
+    shared = np.array([0.1, -0.2, np.log(_FOCAL)])
+    return POSE.matrices(poses, shared).matrices
+
+
+def test_memory_does_not_grow_with_images_times_tilts() -> None:
+    homographies = _homographies(800)
+    tracemalloc.start()
+    try:
+        metric_upgrade(homographies, 0, np.log(_FOCAL), 0.3)
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_blocks_find_what_few_images_find() -> None:
+    """Images enough for many blocks of tilts, of the same poses as those that need one."""
+    few = _homographies(30)
+    one, many = (metric_upgrade(own, 0, np.log(_FOCAL), 0.3) for own in (few, np.tile(few, (15, 1, 1))))
+    np.testing.assert_allclose(many.poses[:30] - many.poses[0], one.poses - one.poses[0], atol=1e-9)
+    assert many.log_focal == one.log_focal

@@ -1,24 +1,40 @@
-"""What the agreement of neighbouring residuals says of the scene, whatever the size of the images."""
+"""What the agreement of neighbouring residuals says of the scene, and how many of them are independent."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from rdstitch.alignment.noise import Coherence, coherence, judge_relief
+from rdstitch.alignment.link_equations import squared_lengths
+from rdstitch.alignment.noise import Coherence, coherence, evidence_of, judge_relief
+from rdstitch.alignment.noise import independent_errors as independent
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import FloatArray
+from rdstitch.robust.posterior import EXACTNESS
+from tests.alignment_stubs import SHIFT, independent_errors, observations
 
 
 @pytest.mark.parametrize(
-    ("correlation", "relative_size", "found"),
-    [(0.9, 0.001, True), (0.9, 0.0005, False), (0.4, 0.01, False), (0.51, 0.0008, True)],
+    ("correlation", "relative_size", "model", "links", "found", "says"),
+    [
+        (0.9, 0.001, "rigid", 9, True, "not one plane"),
+        (0.51, 0.0008, "rigid", 9, True, "not one plane"),
+        (0.9, 0.0005, "rigid", 9, False, "flat"),
+        (0.4, 0.01, "rigid", 9, False, "flat"),
+        # Of a turn what neighbours share is parallax.
+        (0.9, 0.001, "rotation", 9, True, "parallax"),
+        (0.9, 0.0005, "rotation", 9, False, "hardly moved"),
+        (0.6, 0.0001, "pose", 9, False, "nearly flat"),
+        (0.4, 0.0001, "pose", 9, False, "the scene is flat"),
+        (0.4, 0.0001, "pose", 1, False, "no relief shows, but hills"),
+    ],
 )
-def test_relief_needs_agreement_and_size(correlation: float, relative_size: float, found: bool) -> None:
+def test_relief_needs_agreement_and_size(
+    correlation: float, relative_size: float, model: str, links: int, found: bool, says: str
+) -> None:
     for diagonal in (500.0, 2000.0):
-        relief = judge_relief(Coherence(correlation, relative_size * diagonal, relative_size, 3.0), "rigid", 9)
-        assert relief.found is found
-        assert ("not one plane" in relief.explanation) is found
+        relief = judge_relief(Coherence(correlation, relative_size * diagonal, relative_size, 3.0), model, links)
+        assert (relief.found, says in relief.explanation) == (found, True)
 
 
 def _residuals(common: float, own: float, *, links: int = 8, seed: int = 0) -> tuple[Observations, FloatArray]:
@@ -50,10 +66,12 @@ def test_what_neighbours_have_in_common_is_measured(common: float, own: float) -
 
 
 def test_independent_errors_have_nothing_in_common() -> None:
-    seen, errors = _residuals(0.0, 1.0)
-    found = coherence(seen, errors, ALL)
+    found = coherence(*_residuals(0.0, 1.0), ALL)
     assert abs(found.correlation) < 0.1
     assert found.overdispersion < 1.5
+    # With one point a cell nothing is overdispersed.
+    inliers = np.isin(np.arange(100), np.array([0, 9, 90, 99]))
+    assert coherence(*_residuals(1.0, 0.1, links=1), inliers).overdispersion == 1.0
 
 
 def test_the_overdispersion_is_that_of_sums_over_cells() -> None:
@@ -78,44 +96,46 @@ def test_only_inliers_count_and_few_say_nothing() -> None:
 def test_a_feature_found_twice_is_no_neighbour() -> None:
     """Pairs of points a few thousandths apart, with the same error; what is farther off is independent."""
     seen, errors = _residuals(0.0, 1.0)
-    twice = replace(
-        seen, points1=np.repeat(seen.points1[::2], 2, axis=0) + np.tile([[0.0, 0.0], [0.003, 0.0]], (400, 1))
+    twice, both = np.repeat(seen.points1[::2], 2, axis=0), np.repeat(errors[::2], 2, axis=0)
+    near, apart = (
+        coherence(replace(seen, points1=twice + np.tile([[0.0, 0.0], [off, 0.0]], (400, 1))), both, ALL).correlation
+        for off in (0.003, 0.007)
     )
-    found = coherence(twice, np.repeat(errors[::2], 2, axis=0), ALL)
-    assert abs(found.correlation) < 0.2
-    apart = replace(
-        seen, points1=np.repeat(seen.points1[::2], 2, axis=0) + np.tile([[0.0, 0.0], [0.007, 0.0]], (400, 1))
-    )
-    assert coherence(apart, np.repeat(errors[::2], 2, axis=0), ALL).correlation > 0.8
-
-
-def test_what_is_far_away_is_no_neighbour() -> None:
+    assert abs(near) < 0.2
+    assert apart > 0.8
+    # Nor is what is far away.
     seen, errors = _residuals(2.0, 0.01)
-    for factor, near in ((2.0, True), (3.0, False)):
+    for factor, agrees in ((2.0, True), (3.0, False)):
         wide = replace(seen, points1=factor * seen.points1)
-        assert (coherence(wide, errors, ALL).correlation > 0.5) is near
+        assert (coherence(wide, errors, ALL).correlation > 0.5) is agrees
 
 
-@pytest.mark.parametrize(("correlation", "relative_size", "moved"), [(0.9, 0.001, True), (0.9, 0.0005, False)])
-def test_of_a_turn_what_neighbours_share_is_parallax(correlation: float, relative_size: float, moved: bool) -> None:
-    relief = judge_relief(Coherence(correlation, relative_size * 800.0, relative_size, 3.0), "rotation", 9)
-    assert relief.found is moved
-    assert ("parallax" in relief.explanation) is moved
-    assert ("hardly moved" in relief.explanation) is not moved
+def _found(errors: np.ndarray, images: int = 6) -> tuple[float, float]:
+    seen = observations(errors, images)
+    return independent(seen, np.tile(SHIFT, (len(seen), 1, 1)), np.zeros(5))
 
 
-@pytest.mark.parametrize(
-    ("correlation", "links", "says"),
-    [(0.6, 9, "nearly flat"), (0.4, 9, "the scene is flat"), (0.4, 1, "no relief shows, but hills")],
-)
-def test_flat_scenes_are_called_flat_where_there_is_more_than_one_pair(
-    correlation: float, links: int, says: str
-) -> None:
-    assert says in judge_relief(Coherence(correlation, 0.1, 0.0001, 3.0), "pose", links).explanation
+def test_links_measure_points_again_and_only_inliers_of_links_that_fit_count() -> None:
+    errors = independent_errors(sigma=0.5)
+    shared, count = _found(errors)
+    # Nine links of six images measure each point about twice; the errors themselves are independent.
+    assert shared == pytest.approx(9 / 5, rel=0.35)
+    assert count == pytest.approx(2.0 * 540 / shared, rel=0.02)
+    errors[4] += 40.0
+    errors[0, ::10] = [9.0, 6.0]
+    shared, count = _found(errors)
+    assert count == pytest.approx(2.0 * (480 - 6) / shared, rel=0.02)
 
 
-def test_with_one_point_a_cell_nothing_is_overdispersed() -> None:
-    seen, errors = _residuals(1.0, 0.1, links=1)
-    corners = np.array([0, 9, 90, 99])
-    inliers = np.isin(np.arange(100), corners)
-    assert coherence(seen, errors, inliers).overdispersion == 1.0
+def test_there_are_two_observations_at_least() -> None:
+    assert _found(np.full((1, 1, 2), 0.3), 2)[1] == 2.0
+
+
+def test_what_cannot_be_transferred_is_infinitely_off() -> None:
+    assert squared_lengths(np.array([[3.0, 4.0], [np.nan, 1.0]])).tolist() == [25.0, np.inf]
+
+
+@pytest.mark.parametrize(("sigma", "noise"), [(0.5, 0.5), (0.01, EXACTNESS)])
+def test_the_noise_is_the_scatter_or_what_no_model_is_exact_to(sigma: float, noise: float) -> None:
+    errors = independent_errors(sigma=sigma)
+    assert evidence_of(observations(errors), errors.reshape(-1, 2)).noise[0] == pytest.approx(noise, rel=0.05)

@@ -1,20 +1,21 @@
-"""Heights of the ground explain errors along the parallax, and nothing else moves with them."""
+"""Heights of the ground explain errors along the parallax, and nothing else moves with them; how wide hills are."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import Scene, aligned, grid, scene
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.align import from_another_start
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.relief_field import _spectrum
 from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.choices import Purpose
 from rdstitch.geometry.radial_homography import measurement_whitening
-from tests.alignment_scenes import Scene, aligned, grid, scene
 
 
 def _scene(relief: float, seed: int = 0) -> Scene:
@@ -49,14 +50,12 @@ def test_hills_hardly_move_the_lens(relief: float) -> None:
     assert max(misses) < 3.0
 
 
-def test_over_a_plane_nothing_changes() -> None:
+def test_over_a_plane_and_of_two_images_nothing_changes() -> None:
+    """Of two images tilts do what heights do."""
     problem, fit = _fitted(_scene(0.0))
     choice = ModelChoice(fit, "")
     assert weighted_by_relief(problem, fit) is problem
     assert choose_over_relief(problem, choice, ["similarity", "tilting"], Purpose.MOSAIC) is choice
-
-
-def test_of_two_images_tilts_do_what_heights_do() -> None:
     given = _scene(0.08)
     pair = replace(given, cameras=given.cameras[:2], links=[k for k in given.links if max(k.image1, k.image2) == 1])
     problem, fit = _fitted(pair)
@@ -76,6 +75,11 @@ def test_heights_are_found_as_they_scatter() -> None:
     # Of images that hardly turn, a place as high as the amplitude moves by that share of how far it moves anyway.
     assert 0.02 < np.median(moved / baseline) < 0.08
     assert 0.25 < noise < 0.6
+    # The displacements go with their observations.
+    every = weighted.observations
+    for own in (every.subset(np.array([2, 0])), every.thinned(20)):
+        rows = [int(np.flatnonzero((every.points1 == point).all(axis=1))[0]) for point in own.points1]
+        np.testing.assert_array_equal(own.relief, every.relief[rows])
 
 
 def test_a_common_displacement_adds_its_square_to_the_covariance() -> None:
@@ -84,16 +88,6 @@ def test_a_common_displacement_adds_its_square_to_the_covariance() -> None:
     whitening = measurement_whitening(by_point, common)
     covariance = (np.eye(2) + by_point @ np.swapaxes(by_point, 1, 2)) / 2.0 + common[:, :, None] * common[:, None, :]
     np.testing.assert_allclose(np.linalg.inv(np.swapaxes(whitening, 1, 2) @ whitening), covariance, rtol=1e-9)
-
-
-def test_the_displacements_go_with_their_observations() -> None:
-    problem, fit = _fitted(_scene(0.08))
-    o = weighted_by_relief(problem, fit).observations
-    few, thin = o.subset(np.array([2, 0])), o.thinned(20)
-    for own in (few, thin):
-        assert own.relief.shape == own.points1.shape
-        rows = [int(np.flatnonzero((o.points1 == point).all(axis=1))[0]) for point in own.points1]
-        np.testing.assert_array_equal(own.relief, o.relief[rows])
 
 
 def test_nothing_is_the_best_of_layouts_that_nobody_would_keep() -> None:
@@ -126,3 +120,22 @@ def test_what_did_not_converge_is_tried_from_another_start() -> None:
     assert found.adjusted.converged
     assert found.adjusted.sigma == pytest.approx(fit.adjusted.sigma, rel=0.01)
     assert from_another_start(problem, fit) is fit
+
+
+LEFT = np.array([[1.0, 1.0, 1.0, 1.0], [0.2, 0.6, 0.9, 1.0], [-0.2, 0.1, 0.5, 0.9]])
+"""Agreement at three distances that four bands of waves leave, from short to long ones."""
+
+
+@pytest.mark.parametrize("band", range(4))
+def test_the_band_that_errors_agree_like_is_found(band: int) -> None:
+    power = _spectrum(LEFT, 0.5 * LEFT[:, band], np.full(3, 1e-4))
+    assert power[band] > 0.3
+    np.testing.assert_allclose(LEFT @ power, 0.5 * LEFT[:, band], atol=0.03)
+
+
+def test_where_errors_do_not_tell_waves_are_equally_steep() -> None:
+    np.testing.assert_allclose(_spectrum(LEFT, np.array([0.5, 0.3, 0.3]), np.full(3, 1e3)), 0.125, rtol=1e-3)
+
+
+def test_without_agreement_there_are_no_hills() -> None:
+    np.testing.assert_array_equal(_spectrum(LEFT, np.array([-0.1, 0.0, 0.0]), np.full(3, 0.1)), 0.0)

@@ -1,13 +1,16 @@
-"""Turning on the spot: derivatives of the model, the level frame, the choice between a turn and a plane."""
+"""Turning on the spot: derivatives of the model, the level frame, a turn or a plane; the image whose frame it is."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from rdstitch.alignment import align
-from rdstitch.alignment.frames import level_frame
+from examples.worlds.alignment_scenes import aligned, scene
+from rdstitch.alignment import Alignment, align
+from rdstitch.alignment.frames import frontal_reference, in_frame_of, level_frame
+from rdstitch.alignment.motion_models import POSE, PSI, X
 from rdstitch.alignment.motion_models.rotation import ROTATION, rotation_from_vector
+from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.geometry.radial_homography import RadialHomography
@@ -67,22 +70,17 @@ def test_the_horizon_is_level_whatever_the_frame(pitch: float) -> None:
     assert middle.max() == pytest.approx(65.0, abs=1e-6)
 
 
-def test_two_images_one_above_the_other_are_shown_as_they_were_taken() -> None:
-    """They hardly turn about the vertical: what hands roll says nothing of the horizon."""
+def test_neither_a_roll_of_hands_nor_a_camera_on_its_side_tips_the_horizon() -> None:
+    """Two images one above the other hardly turn about the vertical; their x axes alone say 45 degrees."""
     rotations = camera_rotations(np.radians([0.0, 3.0]), np.radians([-5.0, 5.0]), np.radians([1.5, -1.5]))
     ahead = (rotations @ level_frame(rotations, 0).T)[:, 2]
-    assert np.abs(np.degrees(np.arcsin(ahead[:, 1].mean()))) < 15.0  # their x axes alone say 45
-
-
-def test_images_taken_with_the_camera_on_its_side_do_not_tip_the_horizon() -> None:
+    assert np.abs(np.degrees(np.arcsin(ahead[:, 1].mean()))) < 15.0
     heading, roll = np.radians(np.arange(6) * 25.0), np.radians([2.0, -1.0, 91.0, -2.0, -89.0, 1.0])
     rotations = camera_rotations(heading, 0.1, roll)
     down = (rotations @ level_frame(rotations, 0).T)[:, :, 1]
     np.testing.assert_allclose(down[:, 2], -np.sin(0.1), atol=0.03)
     np.testing.assert_allclose(np.degrees(np.arctan2(down[:, 0], down[:, 1])), np.degrees(roll), atol=2.0)
-
-
-def test_a_full_turn_has_the_reference_image_ahead() -> None:
+    # A full turn has the reference image ahead.
     rotations = camera_rotations(np.arange(12) * np.pi / 6)
     ahead = (rotations @ level_frame(rotations, 5).T)[5, 2]
     np.testing.assert_allclose(ahead, (0.0, 0.0, 1.0), atol=1e-9)
@@ -125,3 +123,44 @@ def test_a_turn_of_cropped_images_with_parallax_is_a_turn() -> None:
     axis = np.array(LENS.center) - cut
     np.testing.assert_allclose(found.cameras[0].center, axis, atol=6.0)
     assert found.focal * found.cameras[0].scale == pytest.approx(554.0, rel=0.02)
+
+
+def _tilted() -> Alignment:
+    """Three images, the first of which is oblique."""
+    poses = np.zeros((3, 6))
+    poses[:, X] = (0.0, 0.3, 0.6)
+    found = aligned(scene(poses, rng=np.random.default_rng(4)), model="homography", reference=0)
+    poses[0, PSI] = 1.1
+    to_images = POSE.matrices(poses, POSE.shared_from_physical(np.array([0.0, 0.0, 0.26]))).matrices
+    return replace(found, homographies=np.asarray(np.linalg.inv(to_images), dtype=np.float64))
+
+
+def test_an_oblique_reference_gives_way_to_one_whose_horizon_no_image_crosses() -> None:
+    tilted = _tilted()
+    oblique = in_frame_of(tilted, 0)
+    assert frontal_reference(oblique) in (1, 2)
+    frontal = in_frame_of(oblique, 1)
+    assert frontal_reference(frontal) == 1
+    assert np.allclose(frontal.homographies[1], np.eye(3), atol=1e-9)
+    for k in range(3):
+        a, b = frontal.relation(k, 0), tilted.relation(k, 0)
+        assert np.allclose(a / a[2, 2], b / b[2, 2], atol=1e-6)
+
+
+def test_each_border_is_undistorted_once_of_any_number_of_references(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, found = list[int](), _tilted()
+    many = replace(
+        found,
+        used=np.ones(60, dtype=np.bool_),
+        cameras=found.cameras * 20,
+        homographies=np.tile(found.homographies, (20, 1, 1)),
+    )
+    undistort = Camera.undistort
+
+    def counted(self: Camera, points: FloatArray) -> FloatArray:
+        calls.append(len(points))
+        return undistort(self, points)
+
+    monkeypatch.setattr(Camera, "undistort", counted)
+    assert frontal_reference(in_frame_of(many, 0)) in (1, 2)
+    assert len(calls) <= 60

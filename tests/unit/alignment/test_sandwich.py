@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import aligned, grid, scene
+from examples.worlds.lens_scenes import SIZE, lens_scene
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.noise import coherence
@@ -15,8 +17,6 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import LENS_STD, Camera
 from rdstitch.geometry.radial_homography import project
 from rdstitch.robust.posterior import Prior
-from tests.alignment_scenes import aligned, grid, scene
-from tests.lens_scenes import SIZE, lens_scene
 
 LENS, NOISE = Camera((640, 480), distortion=-0.2), 0.4
 KNOWN = (Prior(), Prior(), Prior(((1.0, float(np.log(1.3)), 0.01),)))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import aligned, grid, scene
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, RIGID, ROTATION, MotionModel
@@ -19,7 +20,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
 from rdstitch.synthetic.panorama import camera_rotations
-from tests.alignment_scenes import aligned, grid, scene
 
 SIZE, FOCAL = (640, 480), 520.0
 
@@ -134,9 +134,7 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
         (7.0, 1.1, "homography"),
     ],
 )
-def test_instead_of_an_implausible_plane_a_turn_may_leave_what_seams_hide_and_the_noise(
-    stretch: float, turn: float, chosen: str
-) -> None:
+def test_a_turn_may_leave_what_seams_hide(stretch: float, turn: float, chosen: str) -> None:
     problem: Any = SimpleNamespace(count=3)
     posterior = Posterior(problem)
     # A quarter of 4 px, and the noise: 1.17 px.

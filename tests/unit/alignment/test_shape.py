@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import Scene, aligned, grid, scene
 from rdstitch.alignment.motion_models import X
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
-from tests.alignment_scenes import Scene, aligned, grid, scene
 
 
 def _row(count: int = 6, **options: object) -> Scene:

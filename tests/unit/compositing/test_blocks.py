@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.worlds.compositing_scenes import Scene, grey, render
 from rdstitch import Composer
 from rdstitch.compositing import PlacedImage
 from rdstitch.compositing import plan as planning
@@ -26,7 +27,6 @@ from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import pano
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.system.cache import Cache, Stored
-from tests.compositing_scenes import Scene, grey, render
 
 
 def _planned(max_memory: int | None = None, *, masked: bool = False) -> CompositePlan:
@@ -36,9 +36,7 @@ def _planned(max_memory: int | None = None, *, masked: bool = False) -> Composit
 
 
 @pytest.mark.parametrize(("available", "taken"), [(0, 400 * 2**20), (10**9, 400 * 2**20), (8 * 10**9, 2 * 10**9)])
-def test_the_default_is_a_quarter_of_what_is_available(
-    available: int, taken: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_quarter_of_what_is_available_is_taken(available: int, taken: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planning, "available_memory", lambda: available)
     assert default_memory() == taken
     plan = _planned()

@@ -1,5 +1,7 @@
 """The canvas: its size, its boxes and what is cropped."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,16 +22,13 @@ def _shift(x: float, y: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float6
     return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
 
 
-def test_one_flat_image_is_its_own_canvas() -> None:
+def test_one_flat_image_is_its_own_canvas_and_neighbours_lie_side_by_side() -> None:
     canvas = plan_canvas([FLAT], np.eye(3)[None])
     assert canvas.size == (400, 300)
     # Plane coordinates of the top-left px go to (0, 0).
     point = canvas.matrix @ np.append(FLAT.normalize((0.0, 0.0)), 1.0)
     np.testing.assert_allclose(point, [0, 0, 1], atol=1e-9)
     assert canvas.box(0) == (0, 0, 400, 300)
-
-
-def test_neighbours_side_by_side() -> None:
     step = 100 / FLAT.scale
     canvas = plan_canvas([FLAT, FLAT], np.stack([np.eye(3), _shift(step, 0.0)]))
     assert canvas.size == (500, 300)
@@ -87,13 +86,11 @@ def test_absurd_canvases_are_refused_by_name() -> None:
         plan_canvas([FLAT] * 2, np.stack([np.eye(3), near_horizon]), names=names, reference=0)
 
 
-@pytest.mark.parametrize("options", [{"scale": 0.0}, {"scale": np.nan}, {"rotate": np.inf}])
-def test_wrong_options(options: dict[str, float]) -> None:
-    with pytest.raises(ArgumentError):
-        plan_canvas([FLAT], np.eye(3)[None], **options)  # type: ignore[arg-type]
-
-
-def test_wrong_homographies() -> None:
+def test_wrong_options_and_homographies() -> None:
+    options: list[dict[str, Any]] = [{"scale": 0.0}, {"scale": np.nan}, {"rotate": np.inf}]
+    for wrong in options:
+        with pytest.raises(ArgumentError):
+            plan_canvas([FLAT], np.eye(3)[None], **wrong)
     for matrices in (np.eye(3), np.zeros((1, 3, 3)), np.full((1, 3, 3), np.nan), np.stack([np.eye(3)] * 2)):
         with pytest.raises(ArgumentError):
             plan_canvas([FLAT], matrices)
@@ -213,12 +210,7 @@ def test_rows_that_keep_less_than_a_quarter_are_not_worth_it() -> None:
     assert box is None
     assert "would keep 22 %" in why
     covered[:, 3] = False
-    assert crop_rows(covered, 1, (10, 40), (0, 0, 10, 40)) == (
-        None,
-        "not cropped: the rows without holes would keep 0 % of the image",
-    )
-
-
-def test_the_largest_rectangle_of_nothing_is_empty() -> None:
+    found = crop_rows(covered, 1, (10, 40), (0, 0, 10, 40))
+    assert found == (None, "not cropped: the rows without holes would keep 0 % of the image")
     assert largest_rectangle(np.zeros((3, 4), dtype=np.bool_)) == (0, 0, 0, 0)
     assert largest_rectangle(np.eye(3, dtype=np.bool_)) == (0, 0, 1, 1)

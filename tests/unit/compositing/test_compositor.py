@@ -11,6 +11,16 @@ import tifffile
 from numpy.typing import NDArray
 
 from examples.judging.comparison import sharpness
+from examples.worlds.compositing_scenes import (
+    Scene,
+    as_image,
+    gradient,
+    grey,
+    inner,
+    place_images,
+    render,
+    side_by_side,
+)
 from rdstitch.compositing import CompositeOptions, compose, compose_to_file
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.source_images import ImageLoader
@@ -18,7 +28,6 @@ from rdstitch.compositing.survey import largest_rectangle
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.io import Metadata, read_image
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import Scene, as_image, gradient, grey, inner, place_images, render, side_by_side
 from tests.sampled import sampled
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from examples.worlds.compositing_scenes import Scene, as_image, place_images, render
 from rdstitch.compositing import CompositeOptions, compose
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.source_images import ImageOnDisk, ImageReader, PlacedImage, filled, prepare_image
@@ -24,7 +25,6 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import DecodedImage
 from rdstitch.io.read import reduced
-from tests.compositing_scenes import Scene, as_image, place_images, render
 
 
 class DecodedImageCache:

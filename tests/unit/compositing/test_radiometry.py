@@ -47,6 +47,8 @@ def test_ratios_of_bands_are_those_of_the_scene(times: tuple[float, ...]) -> Non
     assert ("one exposure by EXIF" in said.text) == (len(set(times)) > 1)
     unsaid = [replace(image, exposure=None) for image in images]
     assert "not every image says" in compose(unsaid, canvas, options).messages[0].text
+    # Scans are balanced.
+    assert not compose([replace(image, radiometry=None) for image in images], canvas, options).messages
 
 
 def test_light_that_changes_and_a_black_level_leave_an_index_as_it_is() -> None:
@@ -71,23 +73,12 @@ def test_light_that_changes_and_a_black_level_leave_an_index_as_it_is() -> None:
     assert ratio.max() / ratio.min() < 1.01
 
 
-def test_scans_are_balanced() -> None:
-    images, _ = _field((0.008, 0.01, 0.0125))
-    canvas = plan_canvas([image.camera for image in images], [image.homography for image in images])
-    scans = [replace(image, radiometry=None) for image in images]
-    assert not compose(scans, canvas, CompositeOptions(seam="none")).messages
-
-
 @pytest.mark.parametrize(
     ("xmp", "black", "expected"),
     [
         ("", None, None),
         ("<x Camera:BandName='Red'>", None, Radiometry()),
-        (
-            "<x a:HorizontalIrradiance='0.61' a:Irradiance='0.5'>",
-            (4800, 4800),
-            (0.61, "HorizontalIrradiance"),
-        ),
+        ("<x a:HorizontalIrradiance='0.61' a:Irradiance='0.5'>", (4800, 4800), (0.61, "HorizontalIrradiance")),
         ("<Camera:Irradiance><rdf:Seq> <rdf:li>0.5</rdf:li></rdf:Seq></Camera:Irradiance>", 4800, (0.5, "Irradiance")),
         ("<x Camera:IrradianceList='@'>", 4800, (8.48, "IrradianceList")),
         ("<x Camera:IrradianceList='&#xA;no base64 !'>", 4800, (None, "")),

@@ -11,6 +11,7 @@ from rdstitch.synthetic.textures import ground
 SIZE = (400, 300)
 SCENE = ground((600, 500), seed=3, channels=1).region(0, 0, 600, 500)[..., 0].astype(np.float32)
 SCENE *= np.float32(255.0 / SCENE.max())
+LABELS = np.repeat((np.arange(SIZE[0]) >= 200).astype(np.int32)[None], SIZE[1], axis=0)
 
 
 def _tile(pixels: Float32Array, box: Box) -> SeamTile:
@@ -66,8 +67,7 @@ def test_an_object_that_is_cut_in_half_is_a_break() -> None:
     scene: Float32Array = np.full((SIZE[1], SIZE[0]), 120.0, dtype=np.float32)
     first, second = scene.copy(), scene.copy()
     second[100:200, 150:250] = np.where(np.indices((100, 100)).sum(axis=0) % 40 < 20, np.float32(40), np.float32(220))
-    labels = np.repeat((np.arange(SIZE[0]) >= 200).astype(np.int32)[None], SIZE[1], axis=0)
-    quality = measure_seams([_tile(image, (0, 0, *SIZE)) for image in (first, second)], labels, 1.0, 1.0)
+    quality = measure_seams([_tile(image, (0, 0, *SIZE)) for image in (first, second)], LABELS, 1.0, 1.0)
     assert quality.seen
     assert all(90.0 < y < 210.0 for _, y in quality.places[quality.broken])
 
@@ -83,9 +83,8 @@ def test_what_is_left_of_a_crop_is_counted_from_its_corner() -> None:
 
 def test_nothing_is_said_of_images_without_texture_or_without_neighbours() -> None:
     flat: Float32Array = np.zeros((SIZE[1], SIZE[0]), dtype=np.float32)
-    labels = np.repeat((np.arange(SIZE[0]) >= 200).astype(np.int32)[None], SIZE[1], axis=0)
-    assert not len(measure_seams([_tile(flat, (0, 0, *SIZE))] * 2, labels, 1.0, 1.0).places)
-    assert not measure_seams([_tile(flat, (0, 0, *SIZE)), None], labels, 1.0, 1.0).seen
+    assert not len(measure_seams([_tile(flat, (0, 0, *SIZE))] * 2, LABELS, 1.0, 1.0).places)
+    assert not measure_seams([_tile(flat, (0, 0, *SIZE)), None], LABELS, 1.0, 1.0).seen
 
 
 def test_the_share_of_overlaps_that_look_alike_and_the_pair_that_does_so_the_least() -> None:
@@ -118,7 +117,6 @@ def test_grass_in_the_wind_is_no_break() -> None:
     rng = np.random.default_rng(4)
     blades = [cv2.GaussianBlur(rng.normal(size=SIZE[::-1]), (0, 0), 2.0, sigmaY=0.6) for _ in range(2)]
     first, second = ((120.0 + 7.0 * one / one.std()).astype(np.float32) for one in blades)
-    labels = np.repeat((np.arange(SIZE[0]) >= 200).astype(np.int32)[None], SIZE[1], axis=0)
-    quality = measure_seams([_tile(image, (0, 0, *SIZE)) for image in (first, second)], labels, 1.0, 1.0)
+    quality = measure_seams([_tile(image, (0, 0, *SIZE)) for image in (first, second)], LABELS, 1.0, 1.0)
     assert len(quality.places) > 25
     assert quality.broken.sum() <= 1

@@ -6,30 +6,29 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rdstitch.compositing import CompositeOptions, compose, plan_canvas
+from examples.worlds.compositing_scenes import as_image, grey, inner, place_images, render
+from rdstitch.compositing import Composite, CompositeOptions, compose, plan_canvas
 from rdstitch.compositing.warp import locate, plan_warp
 from rdstitch.geometry.camera import Camera
-from tests.compositing_scenes import as_image, grey, inner, place_images, render
 
 PLAIN = CompositeOptions(exposure="none", seam="none", blend="none")
 
 
-def test_identity_gives_the_image_back() -> None:
+def _alone(
+    frame: NDArray[Any], distortion: float = 0.0, *, alpha: NDArray[np.uint8] | None = None, **canvas: float
+) -> Composite:
+    """One image in its own frame."""
+    lens = Camera((frame.shape[1], frame.shape[0]), distortion=distortion)
+    planned = plan_canvas([lens], np.eye(3)[None], **canvas)  # type: ignore[arg-type]
+    return compose(place_images([lambda: as_image(frame, alpha)], [lens], np.eye(3)[None]), planned, PLAIN)
+
+
+def test_identity_gives_the_image_back_and_a_quarter_turn_the_image_turned() -> None:
     frame = np.random.default_rng(0).integers(0, 256, (150, 200, 3), dtype=np.uint8)
-    lens = Camera((200, 150))
-    result = compose(
-        place_images([lambda: as_image(frame)], [lens], np.eye(3)[None]), plan_canvas([lens], np.eye(3)[None]), PLAIN
-    )
+    result = _alone(frame)
     np.testing.assert_array_equal(result.pixels, frame)
     assert (result.alpha == 255).all()
-
-
-def test_quarter_turn_gives_the_image_turned() -> None:
-    frame = np.random.default_rng(0).integers(0, 256, (150, 200), dtype=np.uint8)
-    lens = Camera((200, 150))
-    canvas = plan_canvas([lens], np.eye(3)[None], rotate=90)
-    result = compose(place_images([lambda: as_image(frame)], [lens], np.eye(3)[None]), canvas, PLAIN)
-    np.testing.assert_array_equal(result.pixels, np.rot90(frame, -1))
+    np.testing.assert_array_equal(_alone(frame[..., 0], rotate=90).pixels, np.rot90(frame[..., 0], -1))
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.125])
@@ -84,11 +83,8 @@ def test_shrinking_does_not_alias() -> None:
     """A pattern finer than the output can show becomes its mean."""
     v, u = np.mgrid[:600, :800]
     stripes = np.where((u + v) % 3 == 0, 255, 0).astype(np.uint8)
-    lens = Camera((800, 600))
     for scale in (0.5, 0.27, 0.1):
-        canvas = plan_canvas([lens], np.eye(3)[None], scale=scale)
-        result = compose(place_images([lambda: as_image(stripes)], [lens], np.eye(3)[None]), canvas, PLAIN)
-        middle = result.pixels[5:-5, 5:-5].astype(float)
+        middle = _alone(stripes, scale=scale).pixels[5:-5, 5:-5].astype(float)
         assert middle.mean() == pytest.approx(85, abs=1.0)
         assert middle.std() < 12
 
@@ -106,9 +102,7 @@ def test_shrunk_image_stays_in_place() -> None:
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_any_samples(shape: tuple[int, ...], dtype: type) -> None:
     frame: NDArray[Any] = (np.random.default_rng(0).random(shape) * 200).astype(dtype)
-    lens = Camera((120, 90), distortion=-0.1)
-    canvas = plan_canvas([lens], np.eye(3)[None])
-    result = compose(place_images([lambda: as_image(frame)], [lens], np.eye(3)[None]), canvas, PLAIN)
+    result = _alone(frame, -0.1)
     assert result.pixels.dtype == dtype
     assert result.pixels.shape[2:] == shape[2:]
     lit = result.pixels[result.alpha > 0]
@@ -120,10 +114,6 @@ def test_transparent_parts_leave_no_trace() -> None:
     alpha = np.full((120, 160), 255, np.uint8)
     frame[40:80, 50:100] = 0
     alpha[40:80, 50:100] = 0
-    lens = Camera((160, 120), distortion=-0.2)
-    canvas = plan_canvas([lens], np.eye(3)[None])
-    result = compose(place_images([lambda: as_image(frame, alpha)], [lens], np.eye(3)[None]), canvas, PLAIN)
+    result = _alone(frame, -0.2, alpha=alpha)
     assert (result.pixels[result.alpha > 0] == 200).all()
-    hole = plan_warp(lens, np.eye(3), canvas, 0)
-    middle = hole.source_points(np.array([result.alpha.shape[1] / 2]), np.array([result.alpha.shape[0] / 2]))
-    assert result.alpha[result.alpha.shape[0] // 2, result.alpha.shape[1] // 2] == 0, middle
+    assert result.alpha[result.alpha.shape[0] // 2, result.alpha.shape[1] // 2] == 0

@@ -20,9 +20,7 @@ _SCRIPTS = sorted(
 
 
 @pytest.mark.parametrize("name", _SCRIPTS)
-def test_every_example_has_help_and_a_line_in_the_list(
-    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_examples_are_listed(name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", [name, "--help"])
     for module in (name, f"{name}.__main__"):  # another test may have imported it
         monkeypatch.delitem(sys.modules, module, raising=False)

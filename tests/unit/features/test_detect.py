@@ -180,20 +180,14 @@ def raising(*_arguments: object, **_options: object) -> None:
 
 
 @pytest.mark.parametrize("remove", [lambda m: m.delattr(cv2, "ORB"), lambda m: m.setattr(cv2.ORB, "create", raising)])
-def test_a_detector_that_opencv_lacks_is_named(
-    monkeypatch: pytest.MonkeyPatch, remove: Callable[[pytest.MonkeyPatch], None]
-) -> None:
+def test_what_opencv_lacks(monkeypatch: pytest.MonkeyPatch, remove: Callable[[pytest.MonkeyPatch], None]) -> None:
     remove(monkeypatch)
     with pytest.raises(ArgumentError, match="'orb' are not in this OpenCV"):
         detect(np.zeros((50, 50), np.uint8), FeatureOptions(kind="orb"))
 
 
 def test_bad_arguments_are_refused(image: NDArray[np.uint8]) -> None:
-    for options in (
-        {"kind": "surfing"},
-        {"max_features": 0},
-        {"work_megapixels": -1.0},
-    ):
+    for options in ({"kind": "surfing"}, {"max_features": 0}, {"work_megapixels": -1.0}):
         with pytest.raises(ArgumentError):
             FeatureOptions(**options)
     with pytest.raises(ArgumentError, match="mask of shape"):
@@ -238,21 +232,15 @@ def test_spreading_fills_the_corners(image: NDArray[np.uint8]) -> None:
     assert share[True] > 1.5 * share[False]
 
 
-@pytest.mark.parametrize(("count", "share"), [(1, 4.0), (2, 4.0), (4, 2.0), (5, 1.6), (8, 1.0), (9, 1.0), (300, 1.0)])
-def test_few_images_share_what_eight_would_have(count: int, share: float) -> None:
-    features, megapixels = FeatureOptions().for_images(count).limits
-    assert features == round(2000 * min(share, 2.0))
-    assert abs(megapixels - 0.6 * share) < 1e-9
-
-
-def test_what_is_given_is_kept() -> None:
+def test_few_images_share_what_eight_would_have_and_what_is_given_is_kept() -> None:
+    for count, share in ((1, 4.0), (2, 4.0), (4, 2.0), (5, 1.6), (8, 1.0), (9, 1.0), (300, 1.0)):
+        features, megapixels = FeatureOptions().for_images(count).limits
+        assert features == round(2000 * min(share, 2.0))
+        assert megapixels == pytest.approx(0.6 * share)
     assert FeatureOptions(max_features=700).for_images(2).limits == (700, 2.4)
     assert FeatureOptions(work_megapixels=None).for_images(2).limits == (4000, None)
     assert FeatureOptions(work_megapixels=0.3).for_images(2).limits == (4000, 0.3)
-
-
-def test_numbers_stay_what_they_are() -> None:
-    """A run on seven of two images' options is that on two."""
+    # A run on seven of two images' options is that on two.
     two = FeatureOptions().for_images(2)
     assert two.for_images(7) == two
 
@@ -267,8 +255,8 @@ def grey() -> NDArray[np.uint8]:
     return np.asarray(np.clip(np.rint(texture.reshape(800, 1280) * 255), 0, 255), np.uint8)
 
 
-def test_fine_keypoints_are_the_same(grey: NDArray[np.uint8]) -> None:
-    """No keypoint is lost, or found twice, where tiles meet; and each is described as in the whole."""
+def test_keypoints_of_tiles_are_those_of_the_whole(grey: NDArray[np.uint8]) -> None:
+    """No fine one is lost, or found twice, where tiles meet; and each is described as in the whole."""
     whole, tiles = OpenCVDetection.find(grey, OPTIONS), SiftTilesDetection.find(grey, OPTIONS)
     fine, small = (np.flatnonzero(found.scale < 6.5) for found in (whole, tiles))
     assert len(fine) == len(small) > 3000
@@ -283,13 +271,10 @@ def test_fine_keypoints_are_the_same(grey: NDArray[np.uint8]) -> None:
     assert same.mean() > 0.7
     assert (np.abs(one.descriptors[same] - two.descriptors[partner[same]]).max(axis=1) <= 3).mean() > 0.99
 
-
-def test_coarse_keypoints_are_as_many_and_as_strong(grey: NDArray[np.uint8]) -> None:
-    whole, tiles = OpenCVDetection.find(grey, OPTIONS), SiftTilesDetection.find(grey, OPTIONS)
     for low, high in ((8.0, 16.0), (16.0, 64.0)):
-        one, two = (found.response[(found.scale >= low) & (found.scale < high)] for found in (whole, tiles))
-        assert len(two) == pytest.approx(len(one), rel=0.15)
-        assert np.median(two) == pytest.approx(np.median(one), rel=0.1)
+        wanted, given = (found.response[(found.scale >= low) & (found.scale < high)] for found in (whole, tiles))
+        assert len(given) == pytest.approx(len(wanted), rel=0.15)
+        assert np.median(given) == pytest.approx(np.median(wanted), rel=0.1)
 
 
 _SQUARES, _SUBPIXELS = 8, 6
@@ -322,17 +307,14 @@ def test_the_corners_of_a_board_are_found(tilt: float) -> None:
     assert len(found) < 2 * len(corners)
 
 
-def test_what_is_masked_has_none() -> None:
+def test_what_is_masked_or_shows_nothing_has_none() -> None:
+    assert find_crossings(prepare(View(np.full((60, 80), 90, dtype=np.uint8)), None)).shape == (0, 2)
     grey, corners = _oblique_board(0.0)
     mask = np.ones(grey.shape, dtype=np.bool_)
     mask[:, :200] = False
     found = find_crossings(prepare(View(grey, mask), None))
     assert len(found) >= np.sum(corners[:, 0] > 206)
     assert found[:, 0].min() > 200
-
-
-def test_an_image_of_nothing_has_none() -> None:
-    assert find_crossings(prepare(View(np.full((60, 80), 90, dtype=np.uint8)), None)).shape == (0, 2)
 
 
 @pytest.mark.parametrize(("kind", "bytes_each"), [("rootsift", (1, 2)), ("sift", (1,)), ("orb", (1,)), ("surf", (2,))])

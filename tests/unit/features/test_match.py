@@ -167,6 +167,8 @@ def test_bad_arguments_are_refused() -> None:
     one, two = pair_of("float", seed=1)
     with pytest.raises(ArgumentError, match="ratio"):
         match(one, two, 0.0)
+    with pytest.raises(ArgumentError, match="ratio"):
+        match_near(one, two, one.points, 5.0, np.array([[0, 0]]), ratio=1.5)
     with pytest.raises(ArgumentError, match="kinds"):
         match(one, replace(two, kind="rootsift"))
     with pytest.raises(ArgumentError, match="descriptors of shape"):
@@ -221,16 +223,9 @@ def test_a_rival_within_the_radius_counts_one_at_the_same_place_does_not() -> No
     assert len(match_near(features(looks, points), features(alike, near_it), points, 5.0, known)) == 0
     found = match_near(features(looks, points), features(alike, here), points, 5.0, known)
     assert found.indices.tolist() == [[0, 0]]
-
-
-def test_signs_must_be_equal_and_the_ratio_in_range() -> None:
-    points, looks = np.array([[10.0, 10.0]]), np.eye(1, 64)
+    # Signs must be equal.
     up, down = (features(looks, points, "surf", np.array([sign])) for sign in (1, -1))
-    known = np.array([[0, 0]])
-    assert len(match_near(up, up, points, 5.0, known)) == 1
-    assert len(match_near(up, down, points, 5.0, known)) == 0
-    with pytest.raises(ArgumentError, match="ratio"):
-        match_near(up, up, points, 5.0, known, ratio=1.5)
+    assert [len(match_near(up, other, points, 5.0, known)) for other in (up, down)] == [1, 0]
 
 
 SHIFT = np.array([560.0, 0.0])  # three tenths of the first image are in the second
@@ -252,13 +247,9 @@ def _some(found: Correspondences, count: int) -> Correspondences:
     return Correspondences(found.indices[kept], found.points1[kept], found.points2[kept], found.ratio[kept])
 
 
-def _joined(first: Correspondences, second: Correspondences) -> Correspondences:
-    return Correspondences(
-        np.concatenate([first.indices, second.indices]),
-        np.concatenate([first.points1, second.points1]),
-        np.concatenate([first.points2, second.points2]),
-        np.concatenate([first.ratio, second.ratio]),
-    )
+def _joined(*found: Correspondences) -> Correspondences:
+    names = ("indices", "points1", "points2", "ratio")
+    return Correspondences(*(np.concatenate([getattr(one, name) for one in found]) for name in names))
 
 
 def _chance(features1: Features, features2: Features, count: int) -> Correspondences:
@@ -268,16 +259,10 @@ def _chance(features1: Features, features2: Features, count: int) -> Corresponde
     return Correspondences.of(features1, features2, indices, np.full(count, 0.8))
 
 
-def test_what_overlaps_is_kept_and_most_of_the_rest_is_not(images: tuple[Features, Features]) -> None:
+def test_matches_in_the_overlap_are_those_of_the_whole_of_half_the_features(images: tuple[Features, Features]) -> None:
     everything = match(*images)
-    parts = overlapping(*images, _some(everything, 80))
-    for side, (part, features) in enumerate(zip(parts, images, strict=True)):
-        assert np.isin(everything.indices[:, side], part).all()
+    for part, features in zip(overlapping(*images, _some(everything, 80)), images, strict=True):
         assert len(part) < 0.6 * len(features)
-
-
-def test_matches_in_the_overlap_are_those_of_the_whole(images: tuple[Features, Features]) -> None:
-    everything = match(*images)
     found = match_overlap(match, *images, _some(everything, 80))
     for name in ("indices", "points1", "points2"):
         np.testing.assert_array_equal(np.sort(getattr(found, name), axis=0), np.sort(getattr(everything, name), axis=0))
@@ -285,15 +270,12 @@ def test_matches_in_the_overlap_are_those_of_the_whole(images: tuple[Features, F
     np.testing.assert_array_equal(found.points2, images[1].points[found.indices[:, 1]])
 
 
-def test_a_few_matches_by_chance_do_not_widen_it(images: tuple[Features, Features]) -> None:
+def test_a_few_matches_by_chance_do_not_widen_it_and_many_tell_nothing(images: tuple[Features, Features]) -> None:
     some = _some(match(*images), 80)
+    assert overlapping(*images, _joined(some, _chance(*images, 30))) is None
     alone, beside = overlapping(*images, some), overlapping(*images, _joined(some, _chance(*images, 6)))
     for clean, disturbed in zip(alone, beside, strict=True):
         assert len(np.setdiff1d(disturbed, clean)) < 0.1 * len(clean)
-
-
-def test_many_that_stand_alone_tell_nothing(images: tuple[Features, Features]) -> None:
-    assert overlapping(*images, _joined(_some(match(*images), 80), _chance(*images, 30))) is None
 
 
 def test_few_tell_nothing(images: tuple[Features, Features]) -> None:

@@ -125,11 +125,11 @@ def test_images_are_chosen_by_name(exclude: tuple[str, ...], include_only: tuple
     assert _names(exclude, include_only) == left
 
 
-@pytest.mark.parametrize("option", ["exclude", "include-only"])
-def test_a_name_that_is_none_is_refused(option: str) -> None:
-    wanted = (("c.jpg",), ()) if option == "exclude" else ((), ("c.jpg",))
-    with pytest.raises(ArgumentError, match=f"--{option} c.jpg: none of the 4 images"):
-        selected(FRAMES, *wanted)
+def test_a_name_that_is_none_is_refused() -> None:
+    with pytest.raises(ArgumentError, match=r"--exclude c.jpg: none of the 4 images"):
+        _names(("c.jpg",))
+    with pytest.raises(ArgumentError, match=r"--include-only c.jpg: none of the 4 images"):
+        _names((), ("c.jpg",))
 
 
 _NOISE = np.random.default_rng(0).integers(0, 65536, (60, 80), dtype=np.uint16)

@@ -32,9 +32,7 @@ def pattern(points: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("reduction", [1, 2])
-def test_images_of_a_lens_with_tangential_terms_become_those_of_its_coefficients(
-    tmp_path: Path, reduction: int
-) -> None:
+def test_images_with_tangential_terms_become_those_of_the_coefficients(tmp_path: Path, reduction: int) -> None:
     camera = load_camera(echoed(tmp_path, "plumb_bob", D))
     assert camera.lens_model is not None
     pixels = np.stack(np.meshgrid(np.arange(320.0), np.arange(240.0)), axis=-1)
@@ -53,9 +51,7 @@ def test_images_of_a_lens_with_tangential_terms_become_those_of_its_coefficients
 
 
 @pytest.mark.parametrize(("model", "d"), [("plumb_bob", D), ("equidistant", EQUIDISTANT)])
-def test_the_lens_goes_with_the_camera_through_sizes_turns_and_files(
-    tmp_path: Path, model: str, d: list[float]
-) -> None:
+def test_the_lens_goes_with_its_camera_everywhere(tmp_path: Path, model: str, d: list[float]) -> None:
     file = echoed(tmp_path, model, d)
     camera = load_camera(file)
     assert StitchOptions(camera=file).camera == StitchOptions(camera=str(file)).camera == camera  # type: ignore[arg-type]

@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
+from io import BytesIO, StringIO, TextIOWrapper
 from pathlib import Path
 
 import cv2
@@ -146,11 +147,11 @@ def test_an_image_is_decoded_once_for_all_stages(source: Source, read: list[int]
     np.testing.assert_array_equal(last, looks[2])
     shelved.read(8)
     assert read == [2, 2]
-
-
-def test_what_is_on_the_shelf_changes_no_px(source: Source) -> None:
+    # A larger size is read from the file, and what is on the shelf changes no px.
     shelved = replace(source, decoded_images=DecodedImageCache())
     shelved.read(2, keep=True)
+    assert shelved.read().pixels.shape == (SIZE[1], SIZE[0], 3)
+    assert read[2:] == [2, 1]
     for reduction in (1, 2, 4, 8):
         with_shelf, without = (s.read(reduction, keep=True).pixels for s in (shelved, source))
         np.testing.assert_array_equal(with_shelf, without)
@@ -167,13 +168,6 @@ def test_tags_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     image = source.read()
     assert image.metadata is source.metadata
     np.testing.assert_array_equal(image.pixels, expected.pixels)
-
-
-def test_a_larger_size_is_read_from_the_file(source: Source, read: list[int]) -> None:
-    shelved = replace(source, decoded_images=DecodedImageCache())
-    shelved.read(2, keep=True)
-    assert shelved.read().pixels.shape == (SIZE[1], SIZE[0], 3)
-    assert read == [2, 1]
 
 
 def test_masks_are_kept_apart(source: Source, tmp_path: Path) -> None:
@@ -218,19 +212,13 @@ def _names(frames: Iterator[Frame]) -> list[str]:
     return [frame.path.name for frame in frames]
 
 
-def test_what_is_in_a_folder_comes_in_natural_order_and_then_it_ends(tmp_path: Path) -> None:
-    for name in ("f10.png", "f9.png", ".hidden.png", "notes.txt"):
+def test_what_is_in_a_folder_comes_in_natural_order_but_for_what_rdstitch_wrote(tmp_path: Path) -> None:
+    for name in ("f10.png", "f9.png", ".hidden.png", "notes.txt", "out.png"):
         _arriving(tmp_path / name) if name.endswith("png") else (tmp_path / name).write_text("")
+    (tmp_path / "out.png.json").write_text('{"format": "rdstitch sidecar", "output": {"file": "out.png"}}')
     arrivals = Arrivals(tmp_path, frames_folder=_nowhere, idle=0.01)
     assert _names(iter(arrivals)) == ["f9.png", "f10.png"]
     assert arrivals.inputs == [str(tmp_path)]
-
-
-def test_a_file_that_rdstitch_wrote_is_none(tmp_path: Path) -> None:
-    _arriving(tmp_path / "out.png")
-    (tmp_path / "out.png.json").write_text('{"format": "rdstitch sidecar", "output": {"file": "out.png"}}')
-    _arriving(tmp_path / "frame.png")
-    assert _names(iter(Arrivals(tmp_path, frames_folder=_nowhere, idle=0.01))) == ["frame.png"]
 
 
 def test_names_that_do_not_come_are_waited_for_no_longer_than_that() -> None:
@@ -284,3 +272,10 @@ def test_what_cannot_be_followed_is_refused(tmp_path: Path) -> None:
         next(iter(Arrivals("tcp://127.0.0.1:9", frames_folder=_nowhere)))
     empty = io.StringIO("")
     assert list(Arrivals("-", frames_folder=_nowhere, names=empty)) == []
+
+
+@pytest.mark.parametrize("names", [b"a.jpg\nb\xff.jpg\r\n\nc.jpg", "a.jpg\nb\udcff.jpg\nc.jpg\n"])
+def test_names_need_not_be_utf8(names: bytes | str) -> None:
+    stream = StringIO(names) if isinstance(names, str) else TextIOWrapper(BytesIO(names), encoding="utf-8")
+    arrivals = Arrivals("-", frames_folder=Path, names=stream)
+    assert [os.fsencode(frame.path) for frame in arrivals] == [b"a.jpg", b"b\xff.jpg", b"c.jpg"]

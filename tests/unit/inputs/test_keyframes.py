@@ -47,13 +47,10 @@ def test_where_the_camera_turns_back_the_outermost_frame_is_taken() -> None:
     assert min(places[k] for k in found) <= -32.0 + 0.03 * _WIDTH
 
 
-def test_of_a_camera_at_rest_two_frames_are_taken() -> None:
+def test_of_a_camera_at_rest_two_frames_are_taken_few_share_more_and_all_that_cannot_be_followed_are_taken() -> None:
     assert keyframes(tracked(_film([100.0] * 30))) == [0, 29]
-
-
-def test_few_frames_share_more() -> None:
-    sparse = keyframes(tracked(_film(8.0 * k for k in range(40))))
-    assert len(sparse) >= 12
+    assert len(keyframes(tracked(_film(8.0 * k for k in range(40))))) >= 12
+    assert keyframes(tracked([np.zeros((_HEIGHT, _WIDTH), np.uint8)] * 6)) == list(range(6))
 
 
 def test_what_stays_in_the_image_is_no_ground() -> None:
@@ -73,17 +70,10 @@ def test_after_a_cut_a_new_track_begins() -> None:
     assert 5 in keyframes(places)
 
 
-def test_frames_that_cannot_be_followed_are_taken() -> None:
-    assert keyframes(tracked([np.zeros((_HEIGHT, _WIDTH), np.uint8)] * 6)) == list(range(6))
-
-
-def test_every_nth_frame_is_taken_unseen() -> None:
+def test_every_nth_frame_is_taken_unseen_and_what_was_passed_over_is_said() -> None:
     wanted = wanted_frames(3, lambda: pytest.fail("nothing is to be decoded"))
     assert [k for k in range(8) if k in wanted] == [0, 3, 6]
     assert wanted.messages(Path("a.mp4")) == []
-
-
-def test_what_was_passed_over_is_said() -> None:
     (message,) = Wanted(chosen=frozenset((0, 2)), total=5).messages(Path("a.mp4"))
     assert "2 of 5 frames" in str(message)
     assert message.severity == "note"

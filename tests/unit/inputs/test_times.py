@@ -24,9 +24,7 @@ def test_one_time_a_line_is_for_each_file_in_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("numbers", "counts"), [((0, 2, 4), (5, 6)), ((0, 1, 2), (3,)), ((0, 3, 4), (5, 9))])
-def test_those_of_a_video_are_for_all_of_its_frames(
-    tmp_path: Path, numbers: tuple[int, ...], counts: tuple[int, ...]
-) -> None:
+def test_of_a_video_they_are_for_all_frames(tmp_path: Path, numbers: tuple[int, ...], counts: tuple[int, ...]) -> None:
     frames = [Frame(Path(f"v_{k}.png"), k) for k in numbers]
     for count in counts:
         timed = with_times(frames, times(tmp_path, count))

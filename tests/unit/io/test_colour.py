@@ -88,20 +88,3 @@ def test_inks_without_a_profile_that_can_be_used(tmp_path: Path) -> None:
     assert "cannot be used" in broken.metadata.profile_lost
     tifffile.imwrite(tmp_path / "deep.tif", np.asarray(inks).astype(np.uint16) * 257, photometric="separated")
     np.testing.assert_array_equal(read_image(tmp_path / "deep.tif").pixels, PATCHES)
-
-
-def test_white_is_zero_at_any_depth(tmp_path: Path) -> None:
-    grey = PATCHES[..., 0]
-    for samples in (grey, grey.astype(np.uint16) * 257, grey > 100):
-        tifffile.imwrite(tmp_path / "white.tif", ~samples, photometric="miniswhite")
-        found = read_image(tmp_path / "white.tif").pixels
-        np.testing.assert_array_equal(found, np.uint8(255) * samples if samples.dtype == np.bool_ else samples)
-
-
-def test_rgb_of_16_bits_keeps_its_samples_and_its_profile(tmp_path: Path) -> None:
-    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    deep = PATCHES.astype(np.uint16) * 257
-    tifffile.imwrite(tmp_path / "deep.tif", deep, photometric="rgb", iccprofile=profile)
-    found = read_image(tmp_path / "deep.tif")
-    np.testing.assert_array_equal(found.pixels, deep)
-    assert found.metadata.icc_profile == profile

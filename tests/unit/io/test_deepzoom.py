@@ -79,11 +79,3 @@ def test_strips_do_not_matter(tmp_path: Path, channels: int) -> None:
     shown = read_deep_zoom(tmp_path / "strips.dzi", (300, 1100), 1100)
     inside = (alpha == 0) & (np.roll(alpha, 8, 0) == 0) & (np.roll(alpha, -8, 0) == 0)
     assert np.abs(shown[inside].astype(int) - 200).mean() < 4
-
-
-def test_profile_is_in_every_tile(tmp_path: Path) -> None:
-    profile = bytes(range(200))
-    write_image(tmp_path / "a.dzi", _smooth(300, 300), None, Metadata((300, 300), icc_profile=profile))
-    for tile in (tmp_path / "a_files").rglob("*.jpg"):
-        with Image.open(tile) as image:
-            assert image.info["icc_profile"] == profile

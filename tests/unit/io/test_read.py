@@ -29,14 +29,6 @@ def colours() -> Samples:
     return np.stack([u * 8, v * 11, (u * v) % 256], axis=-1).astype(np.uint8)
 
 
-def test_colour_is_in_rgb_order(tmp_path: Path, colours: Samples) -> None:
-    for suffix in ("png", "tif", "bmp"):
-        Image.fromarray(colours).save(tmp_path / f"a.{suffix}")
-        image = read_image(tmp_path / f"a.{suffix}")
-        np.testing.assert_array_equal(image.pixels, colours)
-        assert image.alpha is None
-
-
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_orientation_is_applied(tmp_path: Path, colours: Samples, orientation: int) -> None:
     exif = Image.Exif()
@@ -88,14 +80,6 @@ def test_not_a_number_becomes_transparent(tmp_path: Path) -> None:
     assert image.alpha is not None
     assert np.isfinite(image.pixels).all()
     np.testing.assert_array_equal(image.alpha == 0, ~np.isfinite(values))
-
-
-def test_alpha_is_apart(tmp_path: Path, colours: Samples) -> None:
-    alpha = np.where(colours[..., 0] > 100, 255, 0).astype(np.uint8)
-    Image.fromarray(np.dstack([colours, alpha])).save(tmp_path / "a.png")
-    image = read_image(tmp_path / "a.png")
-    np.testing.assert_array_equal(image.pixels, colours)
-    np.testing.assert_array_equal(image.alpha, alpha)
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "CMYK", "YCbCr", "LAB", "I", "F", "I;16"])

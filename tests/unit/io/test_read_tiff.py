@@ -91,9 +91,7 @@ def test_what_a_band_is(tmp_path: Path, photometric: str, extra: tuple[str, ...]
 
 @pytest.mark.parametrize("compression", [None, "zlib", "lzw", "jpeg"])
 @pytest.mark.parametrize("bigtiff", [False, True])
-def test_an_internal_mask_counts_whatever_the_compression(
-    tmp_path: Path, compression: str | None, bigtiff: bool
-) -> None:
+def test_an_internal_mask_counts_in_any_compression(tmp_path: Path, compression: str | None, bigtiff: bool) -> None:
     samples, shown = _bands(3, np.uint8), np.arange(W) > 7
     mask = np.broadcast_to(shown, (H, W))
     with tifffile.TiffWriter(tmp_path / "a.tif", bigtiff=bigtiff) as tiff:

@@ -94,9 +94,7 @@ def test_blocks_become_px(tmp_path: Path, pixels: NDArray[np.uint8], factor: int
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("factor", [2, 4, 6, 8])
-def test_jpeg_is_reduced_where_it_lies(
-    tmp_path: Path, pixels: NDArray[np.uint8], orientation: int, factor: int
-) -> None:
+def test_jpeg_is_reduced_in_place(tmp_path: Path, pixels: NDArray[np.uint8], orientation: int, factor: int) -> None:
     """The decoder's own reduction is no other image than the mean of blocks; half a px of shift would show."""
     exif = Image.Exif()
     exif[0x0112] = orientation

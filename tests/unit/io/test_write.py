@@ -35,9 +35,7 @@ def _image(height: int, width: int, channels: int, dtype: type, seed: int = 0) -
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("transparent", [False, True])
-def test_lossless_formats_lose_nothing(
-    tmp_path: Path, suffix: str, dtype: type, channels: int, transparent: bool
-) -> None:
+def test_lossless_formats(tmp_path: Path, suffix: str, dtype: type, channels: int, transparent: bool) -> None:
     pixels = _image(300, 257, channels, dtype)
     alpha = np.full((300, 257), 255, np.uint8)
     alpha[:70, 30:] = 0

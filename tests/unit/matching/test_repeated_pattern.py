@@ -1,4 +1,4 @@
-"""Grounds that mislead matching: rough ones, ones that stay with the camera, and repeated patterns."""
+"""What misleads matching: rough ground, one that stays with the camera, repeated patterns, the same pixels twice."""
 
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,7 @@ from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, re
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features, show_motion
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.synthetic import ImageTexture, Sequence, grid_poses, ground, sequence_over
+from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, sequence_over
 
 CAMERA = Camera((640, 480), -0.2)
 POINTS = np.random.default_rng(0).uniform((5.0, 5.0), (634.0, 474.0), (300, 2))
@@ -78,9 +78,7 @@ def _failed(image1: int, image2: int) -> PairRegistration:
 
 
 @pytest.mark.parametrize(("moved", "static"), [(0.0, True), (0.9, True), (1.1, False), (2.0, False), (40.0, False)])
-def test_a_pair_is_static_where_most_inliers_move_by_less_than_a_third_of_the_threshold(
-    moved: float, static: bool
-) -> None:
+def test_a_pair_is_static_where_most_inliers_move_less_than_a_third_of_it(moved: float, static: bool) -> None:
     assert is_static_pair(_still(np.full(40, moved)), THRESHOLD) is static
     # Most decide, not the mean and not all.
     assert is_static_pair(_still(np.append(np.full(31, moved), np.full(9, 90.0))), THRESHOLD) is static
@@ -232,3 +230,24 @@ def test_calibrate_matches_boards_so_and_mosaics_do_not(board: Sequence) -> None
         else:
             rdstitch.mosaic(board.frames()[:3], None, options, progress=progress)
     assert "matching a repeated pattern" in stages[True] - stages[False]
+
+
+OPTIONS = rdstitch.StitchOptions(workers=1, features=rdstitch.FeatureOptions(max_features=500))
+
+
+@pytest.mark.parametrize("place", [0, 1, 3])
+def test_a_copy_changes_nothing_and_lies_where_its_image_does(place: int) -> None:
+    lens = Camera((320, 240), distortion=-0.15, focal=300.0)
+    poses = grid_poses(lens, 3, 1, overlap=0.5, yaw=0.2, seed=3)
+    taken = sequence_over(lambda size: ground(size, seed=3), lens, poses, photometry=Photometry(noise=0.01), seed=3)
+    frames = taken.frames()
+    saved_again = np.clip(frames[1].astype(int) + np.random.default_rng(0).integers(-1, 2, frames[1].shape), 0, 255)
+    with_copy = [*frames]
+    with_copy.insert(place, saved_again.astype(frames[1].dtype))
+    alone, found = (rdstitch.mosaic(images, None, OPTIONS).registration for images in (frames, with_copy))
+    assert found.alignment.used.all()
+    original = 2 if place <= 1 else 1
+    np.testing.assert_array_equal(found.alignment.homographies[original], found.alignment.homographies[place])
+    assert found.alignment.distortion_std == pytest.approx(alone.alignment.distortion_std, rel=0.1)
+    assert abs(found.alignment.distortion - alone.alignment.distortion) < 0.3 * alone.alignment.distortion_std
+    assert [message.code for message in found.alignment.messages].count("copies") == 1

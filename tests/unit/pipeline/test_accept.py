@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
@@ -25,7 +26,6 @@ from rdstitch.pipeline.register import register
 from rdstitch.results.messages import Message, left_out
 from rdstitch.system.cache import NO_CACHE
 from rdstitch.verification.verdict import RefusedError
-from tests.alignment_scenes import grid, scene
 from tests.cli.running import flight
 from tests.registrations import registration
 from tests.sampled import sampled
@@ -145,9 +145,7 @@ def test_corners_come_back_and_outliers_go(registered: tuple[Aligner, list[PairR
     assert sum(pair.relation.inliers.sum() for pair in again.values()) < 0.8 * inliers.sum()
 
 
-def test_a_pair_that_does_not_fit_stays_as_it_is(
-    registered: tuple[Aligner, list[PairRegistration], list[Link]],
-) -> None:
+def test_a_pair_that_does_not_fit_stays(registered: tuple[Aligner, list[PairRegistration], list[Link]]) -> None:
     aligner, pairs, _ = registered
     alignment = aligner.align(pairs).alignment
     moved = replace(pairs[0].correspondences, points2=pairs[0].correspondences.points2 + 9.0)
@@ -157,9 +155,7 @@ def test_a_pair_that_does_not_fit_stays_as_it_is(
 
 
 @pytest.mark.parametrize("lens", sampled(["division", "auto"]))
-def test_only_a_rich_lens_calls_for_it_until_inliers_hardly_change(
-    registered: tuple[Aligner, list[PairRegistration], list[Link]], lens: str
-) -> None:
+def test_only_a_rich_lens_needs_it(registered: tuple[Aligner, list[PairRegistration], list[Link]], lens: str) -> None:
     aligner, pairs, _ = registered
     aligner = replace(aligner, options=AlignmentOptions(lens=lens))
     aligned = aligner.draft(pairs)
@@ -174,9 +170,7 @@ def test_only_a_rich_lens_calls_for_it_until_inliers_hardly_change(
     assert select_by_whole_lens(again, aligner.threshold) is None
 
 
-def test_a_draft_is_the_alignment_without_its_uncertainties(
-    registered: tuple[Aligner, list[PairRegistration], list[Link]],
-) -> None:
+def test_a_draft_lacks_uncertainties(registered: tuple[Aligner, list[PairRegistration], list[Link]]) -> None:
     aligner, pairs, _ = registered
     draft = aligner.draft(pairs)
     complete = aligner.completed(draft)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import rdstitch
 from examples.judging import registration_error
+from examples.worlds.compositing_scenes import render
 from rdstitch.arrays import FloatArray
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
@@ -21,7 +22,6 @@ from rdstitch.pipeline import register as stages
 from rdstitch.pipeline import settle_repeated_pattern
 from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, repeated, sequence_over
 from rdstitch.verification.unique_places import UniqueShift
-from tests.compositing_scenes import render
 
 _LENS = Camera((400, 300), distortion=-0.25, focal=380.0)
 _OPTIONS = rdstitch.StitchOptions(workers=1, features=FeatureOptions(max_features=800))

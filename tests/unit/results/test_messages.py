@@ -28,13 +28,9 @@ def test_images_left_out_for_one_reason_are_named_together() -> None:
         "1.jpg: is blurred",
     ]
 
-
-def test_the_folder_is_named_where_it_changes() -> None:
+    # The folder is named where it changes, and the temporary one of a video is not.
     (message,) = told_once([left_out(path, "no overlap") for path in ("a/1.jpg", "a/2.jpg", "b/1.jpg")])
     assert str(message) == "left out a/1.jpg, 2.jpg, b/1.jpg: no overlap [left-out]"
-
-
-def test_the_temporary_folder_of_a_video_is_not_named() -> None:
     assert str(left_out("/tmp/rdstitch-x1.part/drive_0003.jpg", "is blurred")).startswith("left out drive_0003.jpg: ")
 
 
@@ -56,13 +52,6 @@ def test_codes_end_the_line() -> None:
     assert str(Message("hazy", code="relief")) == "hazy [relief]"
     assert str(Message("hazy")) == "hazy"
     assert str(left_out("a.jpg", "is damaged")) == "left out a.jpg: is damaged [left-out]"
-
-
-def test_text_is_as_good_as_a_path() -> None:
-    named: Any = "folder/camera.json"
-    options = StitchOptions(cache=named, save_camera=named)
-    assert options.cache == options.save_camera == Path("folder/camera.json")
-    assert StitchOptions().cache is None
 
 
 @pytest.mark.parametrize(

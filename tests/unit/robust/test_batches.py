@@ -39,13 +39,10 @@ def test_a_pair_is_estimated_as_if_it_were_alone(options: EstimationOptions) -> 
         assert (alone.iterations, alone.reason, alone.model) == (found.iterations, found.reason, found.model)
 
 
-def test_one_pair_by_either_function() -> None:
+def test_one_pair_by_either_function_and_no_pairs() -> None:
     pair = _pairs(3)[1]
     one = estimate_radial_homography(pair.points1, pair.points2, pair.camera1.image_size, quality=pair.quality)
     assert one.homography.tobytes() == estimate_radial_homographies([pair], EstimationOptions())[0].homography.tobytes()
-
-
-def test_no_pairs() -> None:
     assert estimate_radial_homographies([], EstimationOptions()) == []
 
 

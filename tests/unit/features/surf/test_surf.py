@@ -121,7 +121,7 @@ def test_descriptors_follow_rotation_scale_and_contrast() -> None:
         assert np.median(difference) < 0.15 * np.median(between_different)
 
 
-@pytest.mark.parametrize("degrees", [15.0, 30.0, 45.0, 60.0, 90.0])
+@pytest.mark.parametrize("degrees", [15.0, 45.0, 90.0])
 def test_matches_survive_any_rotation(degrees: float) -> None:
     grey = texture(seed=8)
     other, motion = turned(grey, degrees)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from examples.worlds.alignment_scenes import Scene, grid, scene
 from rdstitch.geometry.camera import Camera
-from tests.alignment_scenes import Scene, grid, scene
 
 SIZE = (640, 480)
 FISHEYE = Camera(SIZE, -0.49, -0.055, (335.0, 226.0), distortion3=-0.008)
