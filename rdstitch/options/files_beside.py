@@ -1,6 +1,6 @@
 """What is written beside an image."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from rdstitch.choices import PosesFrame
@@ -42,7 +42,7 @@ class FilesBeside:
     )
     height: Height = None
     command: str = ""  # the command line, for the report
-    timer: StageTimer = field(default_factory=StageTimer)  # the ``progress`` of the recipe, for the report
+    timer: StageTimer | None = None  # the ``progress`` of the recipe, for the report; None: it has no times
 
     def __post_init__(self) -> None:
         check_options(self)

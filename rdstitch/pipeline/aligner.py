@@ -56,7 +56,9 @@ def impossible_estimates_fail() -> Iterator[None]:
     try:
         yield
     except np.linalg.LinAlgError as error:
-        raise RegistrationError(f"no reliable result: the images determine nothing ({error})") from error
+        raise RegistrationError(
+            "no reliable result: too few matches to determine the camera; take images that overlap more"
+        ) from error
     except ImpossibleCameraError as error:
         raise RegistrationError(
             f"no reliable result: the images agree best on a lens that cannot be ({error}); "

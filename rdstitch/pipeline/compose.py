@@ -168,8 +168,8 @@ def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
         images = tuple(paths[k] for k in seams.least_alike)
         text = (
             f"only {seams.alike:.0%} of what the images share looks alike, the least between "
-            f"{' and '.join(names_of(images))}: something that fills a part of them (a vehicle, a mount) may be what "
-            "was put together; a mask keeps it out"
+            f"{' and '.join(names_of(images))}: they may have been aligned by something that moves with the camera (a "
+            "vehicle, a mount); exclude it with a mask"
         )
         return [Message(text, images, code="rival-motion")]
     if not seams.breaks:

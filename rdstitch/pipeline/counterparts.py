@@ -51,9 +51,10 @@ def counterparts(
     for path in files_of(frames):
         check_readable(path)
     wanted = next(image.name for image in saved.images if image.to_plane is not None)
-    by = "has a name that is in it" if match == "name" else "fits by name, time or GPS position to one in it"
+    by = "name" if match == "name" else "name, time or GPS position"
     raise InputError(
-        f"{saved.path}: none of the given images {by}, such as {wanted}; --match order takes them in order"
+        f"{saved.path}: none of the given images corresponds by {by} to one of those registered, such as {wanted}; "
+        "--match order takes them in order"
     )
 
 
@@ -78,8 +79,8 @@ def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[P
             alike = [frame for frame in alike if _folders(frame)[-len(folders) :] == folders]
         if len(alike) > 1 or (alike and alike[0] in chosen):
             raise InputError(
-                f"{saved.path}: several images are called {name}; give as many images as it has, in its order, with "
-                "--match order"
+                f"{saved.path}: several images are called {name}; give all {len(saved.images)} images in the order of "
+                "the sidecar, with --match order"
             )
         chosen.append(alike[0] if alike else None)
     return chosen
@@ -104,8 +105,8 @@ def _by_varying_part(saved: SavedRegistration, frames: Sequence[Frame]) -> Chose
         for image, by_name, by_place in zip(saved.images, chosen, near or chosen, strict=True):
             if by_name is not None and by_place is not None and by_name is not by_place:
                 raise InputError(
-                    f"{by_name.path}: has the number of {image.name}, but {by_place.path.name} was taken when and "
-                    "where that was; --match order takes images in order"
+                    f"{by_name.path}: corresponds to {image.name} by its name, but by time or position "
+                    f"{by_place.path.name} does; --match order takes images in order"
                 )
     return chosen
 

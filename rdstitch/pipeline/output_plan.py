@@ -52,7 +52,8 @@ def _report(beside: FilesBeside, file: Path, outputs: Outputs, result: StitchRes
     # Imported late: most runs have none.
     from rdstitch.report import write_report
 
-    write_report(file, result, beside.timer.stages, beside.command, outputs=outputs)
+    stages = () if beside.timer is None else beside.timer.stages
+    write_report(file, result, stages, beside.command, outputs=outputs)
 
 
 def _hugin_project(file: Path, outputs: Outputs, result: StitchResult) -> None:

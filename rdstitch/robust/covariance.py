@@ -5,7 +5,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.robust.measurements import Measurements
 
-SINGULAR = 1e-13  # eigenvalue of the correlation matrix of the parameters
+_SINGULAR = 1e-13  # eigenvalue of the correlation matrix of the parameters
 _CELLS_PER_HALF_DIAGONAL = 5.0
 _CELLS_PER_SIDE = 64  # more than an image has, wherever its distortion centre is
 
@@ -27,7 +27,7 @@ def covariances(
     usable = np.flatnonzero((scale > 0.0).all(axis=1) & np.isfinite(information).all(axis=(1, 2)))
     scale = scale[usable]
     values, vectors = np.linalg.eigh(information[usable] / (scale[:, :, None] * scale[:, None]))
-    determined = values[:, 0] >= SINGULAR
+    determined = values[:, 0] >= _SINGULAR
     usable, values, vectors, scale = usable[determined], values[determined], vectors[determined], scale[determined]
     if not len(usable):
         return result

@@ -52,7 +52,7 @@ def calibrate(
     paths = resolve(inputs)
     beside = files_beside(reporter, given)
     wanted = stitch_options(reporter, given, save_camera=output)
-    registration = recipe(paths, wanted, every=every, progress=beside.timer, beside=beside)
+    registration = recipe(paths, wanted, every=every, progress=beside.timer or reporter, beside=beside)
     report_registration(registration, reporter, (lambda: camera_json(registration.camera)) if as_json else None)
     for line in (
         *describe_camera(registration.alignment, registration.camera),

@@ -108,7 +108,7 @@ def mosaic(
         if following:
             watched: dict[str, Any] = {"output": output, "every": every, "idle": idle, "refresh": refresh}
             paths = stack.enter_context(live.followed(inputs, stitch, reporter, **watched, beside=beside))
-        how: dict[str, Any] = {"every": every, "progress": beside.timer, "beside": beside}
+        how: dict[str, Any] = {"every": every, "progress": beside.timer or reporter, "beside": beside}
         others: Sequence[Recomposition] = ()
         if patterns:
             from rdstitch.pipeline.bands import mosaic_bands

@@ -37,7 +37,7 @@ def pano(
     paths = resolve(inputs)
     beside = files_beside(reporter, given)
     stitch = stitch_options(reporter, given)
-    result = recipe(paths, output, stitch, every=every, progress=beside.timer, beside=beside)
+    result = recipe(paths, output, stitch, every=every, progress=beside.timer or reporter, beside=beside)
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:
         reporter.made(result.summary)

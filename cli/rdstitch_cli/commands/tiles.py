@@ -69,12 +69,14 @@ def tiles(
     composite = replace(measured_samples(), **taken(CompositeOptions, given))
     chosen = TileOptions(**taken(TileOptions, given), composite=composite)
     if output is None:
-        tiled, registration = place_tiles(paths, positions_only, chosen, progress=beside.timer)
+        tiled, registration = place_tiles(paths, positions_only, chosen, progress=beside.timer or reporter)
         report_registration(registration, reporter)
         reporter.made(f"{positions_only}: {registration.summary}")
         _check_placed(tiled)
         return
-    result = recipe(paths, output, chosen, positions_file=positions_only, progress=beside.timer, beside=beside)
+    result = recipe(
+        paths, output, chosen, positions_file=positions_only, progress=beside.timer or reporter, beside=beside
+    )
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:
         reporter.made(result.summary)
