@@ -61,7 +61,11 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context | None, cmd_name: str) -> click.Command | None:
         """A command by its name."""
         if cmd_name in _COMMANDS and cmd_name not in self.commands:
+            # Nothing of what is imported will be let go of: no search for cycles need look at it.
+            gc.disable()
             of_module = {} if cmd_name == "help" else vars(import_module(f"rdstitch_cli.commands.{cmd_name}"))
+            gc.freeze()
+            gc.enable()
             self.add_command(of_module.get(cmd_name, help_command))
         return self.commands.get(cmd_name)
 

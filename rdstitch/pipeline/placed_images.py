@@ -32,10 +32,19 @@ _COMPARED, _COMPARED_SIDE = 8, 400
 """Images, and pixels of their longer side, that are compared to find what is static in them."""
 
 
-def align_registration_locally(registration: Registration, choice: LocalAlignmentMode) -> LocalAlignment:
+def straight_edges(source: Source) -> FloatArray:
+    """Ends (N, 2, 2) of the straight edges in an image, pixels."""
+    return line_segments(source.view(MEGAPIXELS))[0]
+
+
+def align_registration_locally(
+    registration: Registration,
+    choice: LocalAlignmentMode,
+    edges: Callable[[int], FloatArray] | None = None,
+) -> LocalAlignment:
     """Displacement fields of the images that are used, in their order, from the matches of all their pairs.
 
-    The registration is in pixels of the images.
+    The registration is in pixels of the images; ``edges`` are those of an image that fields should not bend.
     """
     if choice == "off":
         return no_local_alignment("switched off")
@@ -60,7 +69,7 @@ def align_registration_locally(registration: Registration, choice: LocalAlignmen
         choice,
         pairs=len(pairs),
         on_sphere=alignment.on_sphere,
-        edges=lambda image: line_segments(registration.sources[used[image]].view(MEGAPIXELS))[0],
+        edges=lambda image: edges(int(used[image])) if edges else straight_edges(registration.sources[used[image]]),
     )
 
 
