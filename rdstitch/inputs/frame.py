@@ -17,8 +17,6 @@ from rdstitch.io.metadata import Metadata, metadata_of
 from rdstitch.io.read import DecodedImage, as_image, from_pillow
 from rdstitch.system.file_access import canonical_name
 
-"""Order of the colour channels of arrays that come in and go out: OpenCV's, or everybody else's."""
-
 
 @dataclass(frozen=True, eq=False)
 class Frame:
