@@ -23,7 +23,7 @@ from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, SIMILARITY, THETA,
 from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors, Priors
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import RadialHomography, inverses, transfer
 from rdstitch.matching.match_graph import connected_components, spanning_tree
@@ -302,7 +302,7 @@ class Problem:
         """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
         known, links = self.camera_priors, len(self.observations)
         priors = known.priors(model, self.count, _TILT_SPREAD_START)
-        few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
+        few = evenly_spaced(links, _TRIAL_LINKS)
         sample, homographies = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
         trials = [
             independent_pairs(model, sample, homographies, shared, self.lens, self.free_lens, priors, known.attitudes)

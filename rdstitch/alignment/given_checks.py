@@ -17,7 +17,7 @@ from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA, PlanarModel
 from rdstitch.alignment.priors import CameraPriors
 from rdstitch.alignment.select import select_model
-from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, DELAYS, at_delay, smooth
 from rdstitch.results.messages import Message
@@ -156,7 +156,7 @@ class _ShownTilts:
         assert isinstance(model, PlanarModel)
         normal = adjuster.normal_equations(adjusted)
         tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
-        images = np.unique(np.linspace(0, problem.count - 1, _MAX_IMAGES).astype(np.intp))
+        images = evenly_spaced(problem.count, _MAX_IMAGES)
         focal = math.exp(adjusted.parameters.shared[-1])
         rows = np.arange(2 * len(images))
         by_pose = np.zeros((*normal.gradient_poses.shape, len(rows)))

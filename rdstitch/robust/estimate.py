@@ -133,7 +133,7 @@ def estimate_radial_homography(
     """
     camera1 = Camera(image_size, focal=focal, focal_source=None if focal is None else focal_source or "option")
     camera1 = (camera1 if center is None else replace(camera1, center=center)).with_focal()
-    options = EstimationOptions(solver, distortion, threshold, confidence, max_iterations, seed)
+    options = EstimationOptions(solver, threshold, confidence, max_iterations, seed, distortion)
     tilts = _tilts(tilt)
     p1, p2 = checked_matches(points1, points2)
     weights = None if quality is None else np.asarray(quality, dtype=np.float64)

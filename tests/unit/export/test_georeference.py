@@ -17,9 +17,9 @@ from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.georeference import Georeference, Located, georeference, world_file_paths
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs, NamedSystem
+from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import from_plane, to_plane
-from rdstitch.io import Layout, write_strips
-from rdstitch.io.metadata import GpsPosition, GroundControl
+from rdstitch.io import ImageSpec, write_strips
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import mosaic
@@ -415,7 +415,7 @@ def test_images_without_positions_leave_no_world_file(cached: StitchOptions, tmp
 
 def test_gdal_sees_what_was_meant(tmp_path: Path) -> None:
     place = Georeference(Crs(32734), 0.05 * np.exp(0.3j), complex(268_832.3, 6_246_117.8), 0.1)
-    layout = Layout((900, 600), 3, np.dtype(np.uint8))
+    layout = ImageSpec((900, 600), 3, np.dtype(np.uint8))
     write_strips(tmp_path / "a.tif", layout, [(np.full((600, 900, 3), 9, np.uint8), None)], place.tiff_tags())
     with rasterio.open(tmp_path / "a.tif") as opened:
         assert opened.crs.to_epsg() == place.crs.epsg
