@@ -57,7 +57,7 @@ def impossible_estimates_fail() -> Iterator[None]:
         yield
     except np.linalg.LinAlgError as error:
         raise RegistrationError(
-            "no reliable result: too few matches to determine the camera; take images that overlap more"
+            f"no reliable result: the matches are too few to fix the camera ({error}); take images that overlap more"
         ) from error
     except ImpossibleCameraError as error:
         raise RegistrationError(

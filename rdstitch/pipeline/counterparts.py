@@ -52,11 +52,8 @@ def counterparts(
     for path in files_of(frames):
         check_readable(path)
     wanted = next(image.name for image in saved.images if image.to_plane is not None)
-    by = "name" if match == "name" else "name, time or GPS position"
-    raise InputError(
-        f"{saved.path}: none of the given images corresponds by {by} to one of those registered, such as {wanted}; "
-        "--match order takes them in order"
-    )
+    by = "has the name of a registered image" if match == "name" else "fits a registered image by name, time or GPS"
+    raise InputError(f"{saved.path}: none of the given images {by} ({wanted}, …); --match order takes them in order")
 
 
 def _without_counterpart(chosen: Chosen, frames: Sequence[Frame]) -> list[Message]:
@@ -80,8 +77,8 @@ def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[P
             alike = [frame for frame in alike if _folders(frame)[-len(folders) :] == folders]
         if len(alike) > 1 or (alike and alike[0] in chosen):
             raise InputError(
-                f"{saved.path}: several images are called {name}; give all {len(saved.images)} images in the order of "
-                "the sidecar, with --match order"
+                f"{saved.path}: several images are called {name}; give as many images as were registered, in the same "
+                "order, with --match order"
             )
         chosen.append(alike[0] if alike else None)
     return chosen
@@ -106,8 +103,8 @@ def _by_varying_part(saved: SavedRegistration, frames: Sequence[Frame]) -> Chose
         for image, by_name, by_place in zip(saved.images, chosen, near or chosen, strict=True):
             if by_name is not None and by_place is not None and by_name is not by_place:
                 raise InputError(
-                    f"{by_name.path}: corresponds to {image.name} by its name, but by time or position "
-                    f"{by_place.path.name} does; --match order takes images in order"
+                    f"{by_name.path}: has the number of {image.name}, but {by_place.path.name} was taken at the "
+                    "time or place of that; --match order takes images in order"
                 )
     return chosen
 

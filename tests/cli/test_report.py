@@ -19,13 +19,12 @@ from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.io import preview
 from rdstitch.io.opening import MAX_IMAGE_GB
-from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline import accept
 from rdstitch.pipeline.recipes import calibrate, pano
-from rdstitch.report import page as report
+from rdstitch.report import mosaic as report
 from rdstitch.report import report_page, write_report
-from rdstitch.report.page import seam_dots
+from rdstitch.report.mosaic import seam_dots
 from rdstitch.report.pairs import matched
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
@@ -236,11 +235,6 @@ def test_tiles_in_a_folder_are_not_called_too_large_and_pairs_are_looked_through
     page = report_page(replace(pair, composite=None, output=tmp_path / "a.zarr", registration=registration))
     assert "a folder of tiles, which is not shown here" in page
     assert len(looked_through) < 20
-
-
-def test_a_report_of_the_library_has_no_times_that_nobody_took(frames: list[Path], tmp_path: Path) -> None:
-    pano(frames[:2], tmp_path / "a.png", OPTIONS, beside=FilesBeside(report=tmp_path / "a.html"))
-    assert "reading headers" not in (tmp_path / "a.html").read_text(encoding="utf-8")
 
 
 def test_the_dots_of_a_thousand_seams_are_as_many_as_can_be_told_apart_and_hide_no_break() -> None:

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from examples.solvers.five_point_qep import five_point_qep
-from examples.solvers.rotation_three_point import rotation_three_point
+from examples.paper.common.five_point_qep import five_point_qep
+from examples.paper.common.rotation_three_point import rotation_three_point
 from examples.worlds.instances import (
     Instances,
     PlanarInstances,
