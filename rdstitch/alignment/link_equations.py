@@ -28,7 +28,7 @@ from rdstitch.geometry.radial_homography import (
 from rdstitch.robust.loss import robust_weight
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinkEquations:
     """Weighted, linearized transfer errors of all correspondences, summed per link."""
 
@@ -97,7 +97,7 @@ def trial_errors(
     return errors.T
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinearizedErrors:
     """Whitened transfer errors of some links with their derivatives, all in pixels; 0 where there is no transfer."""
 
@@ -144,7 +144,7 @@ def squared_lengths(errors: FloatArray) -> FloatArray:
     return squared
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Transferred:
     """Correspondences of some links: whitenings (m, 2, 2), errors (2, m) in half diagonals, and whitened in pixels."""
 

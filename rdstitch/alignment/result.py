@@ -42,7 +42,7 @@ class LinkFit:
         return self.image1, self.image2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlanarPoses:
     """Where the camera was for each image, in a metric plane."""
 
@@ -97,7 +97,7 @@ class ShapeTest:
     cause: str  # what is most likely to be left out
 
 
-@dataclass(frozen=True, repr=False, kw_only=True)
+@dataclass(frozen=True, repr=False, kw_only=True, eq=False)
 class Alignment:
     """All images registered as one.
 

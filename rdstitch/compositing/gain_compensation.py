@@ -37,7 +37,7 @@ _CELLS, _MAX_CELLS = 16, 150_000
 _DARKEST, _BRIGHTEST = 0.02, 0.97
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cells:
     """Cells that two images show."""
 
@@ -227,7 +227,7 @@ def estimate_exposure(survey: Survey, images: Sequence[PlacedImage], method: Exp
     return replace(exposure, log_gain=exposure.log_gain + _common(light, log))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Differences:
     """What the first image of each cell is brighter by, log units, for one response of the camera."""
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
@@ -149,7 +149,7 @@ def _seen(residual: FloatArray) -> float:
 def _long_edges(edges: Callable[[int], FloatArray], cameras: Sequence[Camera]) -> dict[int, FloatArray]:
     """Those that a person sees to be straight, of some images."""
     count, found = len(cameras), {}
-    for k in np.unique(np.linspace(0, count - 1, min(count, _MAX_IMAGES)).astype(np.intp)).tolist():
+    for k in evenly_spaced(count, _MAX_IMAGES).tolist():
         ends = edges(k)
         found[k] = ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > _EDGE * 2.0 * cameras[k].scale]
     return found

@@ -16,7 +16,7 @@ _BINS = 50  # of the histogram, for the report alone
 _ROUNDS = 20  # of reweighting; three or four are needed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Consensus:
     """What the pairs agree on."""
 

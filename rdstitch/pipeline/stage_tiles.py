@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.result import LinkFit, ReliefTest, Unused
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.export.places_files import fiji_list, places_table
 from rdstitch.features import Correspondences
@@ -105,7 +105,7 @@ def tiles(
     run = Run(_stitch_options(options), output, beside, progress)
     with found_images(_as_tiles(inputs), output=output, topic=options.topic) as listed:
         registration, tiled = _registered(listed, run, options, positions_file)
-        with Outputs(options.overwrite) as outputs, run.options.executor(len(registration.sources)) as executor:
+        with Outputs(options.overwrite) as outputs, run.executor(len(registration.sources)) as executor:
             _write_beside(outputs, positions_file, options, registration, tiled)
             chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
             chosen = replace(chosen, layout=replace(chosen.layout, photographs=False))
@@ -292,7 +292,7 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
     assert field is not None
     raw = [replace(source, flat_field=None) for source in sources]
     pairs = tiled.links.tiles[tiled.adjustment.weights > 0.5]
-    chosen = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _COMPARED)).astype(np.intp))]
+    chosen = pairs[evenly_spaced(len(pairs), _COMPARED)]
     places = tiled.adjustment.places
     compared = ((raw[a].read().pixels, raw[b].read().pixels, places[b] - places[a]) for a, b in chosen.tolist())
     return agrees_with_overlaps(field, compared)

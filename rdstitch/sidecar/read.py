@@ -26,7 +26,7 @@ def json_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(SidecarRecord)}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SavedRegistration:
     """A registration as its sidecar has it."""
 

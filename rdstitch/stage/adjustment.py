@@ -29,7 +29,7 @@ _TAILS = 4.0  # degrees of freedom of the places about the stage's model: a few 
 _MIN_LINES = 4  # rows or columns whose errors show what rows or columns are off
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StageModel:
     """Errors of the stage."""
 
@@ -43,7 +43,7 @@ class StageModel:
     std: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Adjustment:
     """All places."""
 

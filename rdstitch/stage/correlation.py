@@ -39,7 +39,7 @@ def _count(length: int, side: int) -> int:
     return max(1, min(round(length / side * _BLOCKS), length // _LEAST_SIDE))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Overlap:
     """Two tiles and what they should have in common."""
 
@@ -89,7 +89,7 @@ class Overlap:
         return np.array(parts, dtype=np.intp)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surfaces:
     """Correlation of each block over all displacements within a radius."""
 
@@ -148,7 +148,7 @@ def _whiten(product: NDArray[np.complexfloating], noise1: FloatArray, noise2: Fl
     product /= np.abs(product) + (_NOISE_SHARE * np.sqrt(noise1 * noise2)).astype(np.float32) + np.float32(1e-12)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CoarseTile:
     """A tile as overlaps are looked for."""
 

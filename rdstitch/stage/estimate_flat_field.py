@@ -33,7 +33,7 @@ _TRUNCATED = 0.9113  # variance of a standard normal number within 2.5 of its me
 _BINS, _LEAST_BINS, _LEAST_IN_BIN = 24, 6, 16
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Illumination:
     """The flat field that tiles show, or why they do not."""
 

@@ -9,7 +9,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.stage.refinement import BlockMatches
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinkedPoints:
     """Matches of all pairs, block by block."""
 

@@ -58,7 +58,7 @@ _LENS_AGREES = 0.25  # of λ: by how much the two may differ beyond chance
 _WHOLE_PIXEL = 0.5  # pixels by which a lens must move corners: leaving whole pixels costs as much
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TileRegistration:
     """The places of all tiles, and the matches that show them."""
 
@@ -179,7 +179,7 @@ def _lens_is_there(grid: TileGrid, links: LinkedPoints, std: float, lens: float)
     return apart and a * b > 0.0 and all(abs(value) > _LENS_SHOWN * deviation for value, deviation in shown)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Candidates:
     """Where the second tile of a pair may be in the first."""
 

@@ -124,6 +124,12 @@ def shown(path: Path) -> str:
     return str(path).encode("utf-8", "backslashreplace").decode("utf-8").replace("\n", " ")
 
 
+def sidecar_of(output: str | Path) -> dict[str, Any]:
+    """What lies beside an output."""
+    record: dict[str, Any] = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    return record
+
+
 def check_sidecar(file: Path) -> None:
     """A sidecar, where there is one, must be what the schema says."""
     if file.is_file():

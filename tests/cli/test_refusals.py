@@ -19,7 +19,7 @@ from rdstitch.io import Metadata, read_image, read_metadata
 from rdstitch.pipeline import accept, recipes, register
 from rdstitch.verification.verdict import judge
 from tests.cli.faulty import UNREADABLE, UNUSABLE
-from tests.cli.running import CACHED, FAST, Run, finished, shown, start, state_of
+from tests.cli.running import CACHED, FAST, Run, finished, shown, sidecar_of, start, state_of
 from tests.sampled import sampled
 
 Content = str | bytes | Path | None
@@ -252,8 +252,7 @@ def test_images(rdstitch: Run, place: Path, kind: str, status: int) -> None:
 def test_a_mosaic_leaves_such_images_out_by_name(rdstitch: Run, place: Path, kind: str) -> None:
     bad = {**UNREADABLE, **UNUSABLE}[kind](place / "b.png", place)
     rdstitch("mosaic", place / "a.png", place / "b.png", bad, "-o", place / "out.jpg", *CACHED, told=shown(bad))
-    record = json.loads((place / "out.jpg.json").read_text(encoding="utf-8"))
-    assert [image["used"] for image in record["images"]] == [True, True, False]
+    assert [image["used"] for image in sidecar_of(place / "out.jpg")["images"]] == [True, True, False]
 
 
 def test_samples_of_two_kinds(rdstitch: Run, here: Path) -> None:

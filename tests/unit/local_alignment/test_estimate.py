@@ -43,17 +43,13 @@ def test_it_passes_through_its_nodes_and_is_smooth_between() -> None:
     assert np.abs(np.diff(bend, axis=0)).max() < 0.05 * np.abs(bend).max()
 
 
-def test_far_outside_it_stays_as_it_is() -> None:
+def test_of_another_size_it_moves_the_same_content_and_far_outside_it_stays_as_it_is() -> None:
     field = DisplacementField.of(SIZE, VALUES)
+    nodes = node_points(SIZE, SHAPE)
+    double = field.resized((1280, 960))(nodes * (1279 / 639, 959 / 479))
+    np.testing.assert_allclose(double, 2.0 * field(nodes), atol=1e-9)
     np.testing.assert_array_equal(field(np.array([[-500.0, 100.0]])), field(np.array([[-900.0, 100.0]])))
     assert np.isfinite(field(np.array([[1e9, 1e9], [np.nan, 3.0]]))).all()
-
-
-def test_of_another_size_it_moves_the_same_content() -> None:
-    field = DisplacementField.of(SIZE, VALUES)
-    double = field.resized((1280, 960))
-    nodes = node_points(SIZE, SHAPE)
-    np.testing.assert_allclose(double(nodes * (1279 / 639, 959 / 479)), 2.0 * field(nodes), atol=1e-9)
 
 
 def test_what_changes_evenly_does_so_up_to_the_border() -> None:
@@ -323,6 +319,9 @@ def test_what_a_turn_off_the_spot_moves_apart_comes_together() -> None:
     assert np.median(before) > 3.0
     assert np.median(after) < 0.15 * np.median(before)
     assert np.percentile(after, 95) < 0.3 * np.percentile(before, 95)
+    # A turn on the spot is left alone.
+    found, matrices, _ = turn(0.0)
+    assert align_locally(found, CAMERAS[:4], matrices, on_sphere=True).fields == ()
 
 
 def _expected(local: LocalAlignment, image: int, points: FloatArray) -> FloatArray:
@@ -331,11 +330,6 @@ def _expected(local: LocalAlignment, image: int, points: FloatArray) -> FloatArr
     for _ in range(20):
         expected = points - local.fields[image](expected)
     return expected
-
-
-def test_a_turn_on_the_spot_is_left_alone() -> None:
-    found, matrices, _ = turn(0.0)
-    assert align_locally(found, CAMERAS[:4], matrices, on_sphere=True).fields == ()
 
 
 def test_registered_turns_are_aligned_locally() -> None:
