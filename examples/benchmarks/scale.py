@@ -29,7 +29,7 @@ from rdstitch.io import DecodedImage, Metadata
 from rdstitch.io.write import write_image
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.pipeline.aligner import Aligner, close_loops
+from rdstitch.pipeline.aligner import Aligner, draft_with_loops
 from rdstitch.pipeline.placed_images import align_registration_locally
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.registration import Registration
@@ -69,15 +69,17 @@ def write_frames(sequence: Sequence, order: list[int], folder: Path) -> None:
 
 def measure(folder: Path, sequence: Sequence, order: list[int], *, register_only: bool, drawn: bool) -> dict[str, Any]:
     """Stitch a folder of rendered frames in this process; what that cost, and how near it came to the truth."""
-    count, matches = len(sequence), DrawnMatches(sequence)
-    pairs = matches.first() if drawn else []
-    stages, peaks, before = StageTimes(), StagePeaks(), processor_time()
-    forget_peak_memory()
+    drafts = iter(("draft",))
 
     def note(stage: str, done: int, total: int) -> None:
         stages(stage, done, total)
         peaks(stage, done, total)
 
+    count = len(sequence)
+    matches = DrawnMatches(sequence, progress=lambda *_: note(next(drafts, "closing loops"), 1, 1))
+    pairs = matches.first() if drawn else []
+    stages, peaks, before = StageTimes(), StagePeaks(), processor_time()
+    forget_peak_memory()
     options = rdstitch.StitchOptions(workers=1, overwrite=True, force=True)
     if drawn:
         registration = aligned_by_drawn(matches, pairs, options, note)
@@ -117,9 +119,7 @@ def aligned_by_drawn(
     sources = read_sources(frames, skip_bad=False)[0]
     options = options.for_images(count)
     aligner = Aligner.of(sources, options, Cache())
-    aligned = aligner.draft(pairs)
-    note("draft", 1, 1)
-    aligned = close_loops(aligner, cast(Pairing, matches), aligned, matches.pairs)
+    aligned = draft_with_loops(aligner, cast(Pairing, matches), pairs, matches.pairs)
     note("closing loops", 1, 1)
     aligned = aligner.completed(aligned)
     note("aligning", 1, 1)

@@ -125,11 +125,11 @@ def _chosen(task: GivenImages) -> AdjustedImages:
         held = homography_apart(few, relations_at(few, read, given), given, none, known)
     depth = may_be_depth and _is_depth(few, apart, held)
     observable &= not depth
-    chosen = choose_lens(few, apart if observable else held, options.lenses if observable else (), known)
-    apart = chosen.apart
+    chosen, apart = choose_lens(few, apart if observable else held, options.lenses if observable else (), known)
     free_lens, lens, relations = chosen.free if observable else none, apart.parameters.lens, apart.homographies
 
     wrong, confirmed = cycle_consistency(apart, few, len(cameras))
+    del apart, held  # with the derivatives of two images for each link
     trust = _trust(few, confirmed)
     reference = -1 if options.reference is None else options.reference
     whole = Problem(few, relations, trust, len(cameras), reference, lens, free_lens, known, min_gain=FEW_GAIN)
