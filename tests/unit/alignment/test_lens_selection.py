@@ -18,7 +18,7 @@ from rdstitch.alignment.lens_selection import LensChoice, free_parameters
 from rdstitch.alignment.observations import Observations
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
-from tests.alignment_stubs import adjusted, independent_errors, observations
+from tests.alignment_stubs import independent_errors, observations
 from tests.sampled import sampled
 
 OFF_CENTRE = Camera(SIZE, -0.25, 0.0, (339.0, 229.0))
