@@ -10,6 +10,11 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
+def evenly_spaced(count: int, most: int) -> IntArray:
+    """So many of ``count`` indices at most, evenly from the first to the last."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.intp))
+
+
 class Rows:
     """Base of dataclasses of arrays, or of other such dataclasses, that have the first axis in common."""
 

@@ -3,7 +3,7 @@
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import wraps
@@ -69,10 +69,10 @@ def flags(**options: tuple[Any, Any]) -> list[click.Option]:
     return [_flag(option, default) for option, default in found if option is not None]
 
 
-def taken(kind: Any, given: dict[str, Any]) -> dict[str, Any]:
-    """Take the options of a class out of those that a command was given."""
-    names = [name for name, option in declared(kind).items() if option.option.command_line and name in given]
-    return {name: given.pop(name) for name in names}
+def values_of(kind: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a class among those that a command was given."""
+    options = ((name, option.option) for name, option in declared(kind).items())
+    return {name: given[name] for name, option in options if option.command_line and name in given}
 
 
 def is_given(name: str) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-# Options in their order, those of the first page with a star.
+# The layout of the pages: groups and options in their order, those of the first page with a star.
 _PAGE = """
 Options that matter first: *output *overwrite *images *preview *reference *camera *focal *mask *scale *report format
     frame *height *view *quiet
@@ -28,6 +28,7 @@ _PLACES = {
     for group, _, names in (line.partition(": ") for line in _PAGE.strip().replace("\n    ", " ").splitlines())
     for rank, name in enumerate(names.split())
 }
+_LAST = ("Control", len(_PLACES), False)  # where an option is shown that the page does not name
 
 EXIT_STATUSES = """\b
 Exit status:
@@ -75,7 +76,7 @@ class GroupedCommand(click.Command):
         for parameter in self.get_params(context):
             record = parameter.get_help_record(context)
             if record is not None and isinstance(parameter, click.Option):
-                group, rank, first = _PLACES[max(parameter.opts, key=len)]
+                group, rank, first = _PLACES.get(max(parameter.opts, key=len), _LAST)
                 if first or not brief:
                     rows[group][rank] = record
                 else:

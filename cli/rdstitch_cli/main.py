@@ -61,7 +61,11 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context | None, cmd_name: str) -> click.Command | None:
         """A command by its name."""
         if cmd_name in _COMMANDS and cmd_name not in self.commands:
+            # Nothing of what is imported will be let go of: no search for cycles need look at it.
+            gc.disable()
             of_module = {} if cmd_name == "help" else vars(import_module(f"rdstitch_cli.commands.{cmd_name}"))
+            gc.freeze()
+            gc.enable()
             self.add_command(of_module.get(cmd_name, help_command))
         return self.commands.get(cmd_name)
 
@@ -99,11 +103,10 @@ class Commands(click.Group):
     epilog=f"{_EXAMPLES}\n\n{EXIT_STATUSES}",
 )
 @click.version_option(None, "-V", "--version", package_name="rdstitch", prog_name="rdstitch")
-@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
-@click.pass_context
-def cli(context: click.Context, debug: bool) -> None:
+# Looked for by :func:`run`, since it holds for the parsing of commands too.
+@click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error.")
+def cli() -> None:
     """Stitch images of a flat scene, and find the lens distortion from the images themselves."""
-    context.obj = debug
 
 
 def main() -> None:
@@ -144,28 +147,28 @@ def run(arguments: list[str]) -> int:
     try:
         return _invoke(arguments)
     except (KeyboardInterrupt, click.exceptions.Abort):
-        return _complain(_interrupted(arguments), _INTERRUPTED, debug)
-    except _AskedToEndError as asked:
-        return _complain(_interrupted(arguments), 128 + asked.number, debug)
+        return _print_error(_interrupted(arguments), _INTERRUPTED, debug)
+    except _TerminatedError as asked:
+        return _print_error(_interrupted(arguments), 128 + asked.number, debug)
     except click.ClickException as error:
         context = getattr(error, "ctx", None)
         hint = "" if context is None else f"; see '{context.command_path} --help'"
-        return _complain(error.format_message().rstrip(".") + hint, error.exit_code, debug)
+        return _print_error(error.format_message().rstrip(".") + hint, error.exit_code, debug)
     except RdstitchError as error:
         hint = f"; see 'rdstitch help {error.code}'" if error.code else ""
-        return _complain(f"{error}{hint}", error.exit_status, debug)
+        return _print_error(f"{error}{hint}", error.exit_status, debug)
     except MemoryError:
-        return _complain(_OUT_OF_MEMORY, 7, debug)
+        return _print_error(_OUT_OF_MEMORY, 7, debug)
     except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback for users
         if isinstance(error, OSError) and error.errno in _NO_SPACE:
-            return _complain(f"{error.filename or 'standard output'}: cannot be written: {error.strerror}", 6, debug)
+            return _print_error(f"{error.filename or 'standard output'}: cannot be written: {error.strerror}", 6, debug)
         if getattr(error, "code", None) == _OPENCV_NO_MEMORY and type(error).__module__ == "cv2":
-            return _complain(_OUT_OF_MEMORY, 7, debug)
-        if isinstance(error, FileNotFoundError) and _is_nowhere():
-            return _complain("the current folder does not exist any more; change to another one", 3, debug)
+            return _print_error(_OUT_OF_MEMORY, 7, debug)
+        if isinstance(error, FileNotFoundError) and _cwd_is_deleted():
+            return _print_error("the current folder does not exist any more; change to another one", 3, debug)
         text = str(error) or type(error).__name__
         hint = "" if debug else "; run again as 'rdstitch --debug ...' and report the traceback"
-        return _complain(f"unexpected failure ({type(error).__name__}): {text}{hint}", _UNEXPECTED, debug)
+        return _print_error(f"unexpected failure ({type(error).__name__}): {text}{hint}", _UNEXPECTED, debug)
 
 
 def _invoke(arguments: list[str]) -> int:
@@ -185,24 +188,24 @@ def _invoke(arguments: list[str]) -> int:
         if done.exit_code:
             return done.exit_code
     except BrokenPipeError:
-        return _nobody_listens()
+        return _on_broken_pipe()
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        return _nobody_listens()
+        return _on_broken_pipe()
     except OSError as error:
-        _nobody_listens()
+        _on_broken_pipe()
         raise OutputError(f"standard output: cannot be written: {error.strerror}") from error
     return 0
 
 
-def _nobody_listens() -> int:
+def _on_broken_pipe() -> int:
     """The reader of standard output is gone; nothing may be written to it at exit either."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return _BROKEN_PIPE
 
 
-def _is_nowhere() -> bool:
+def _cwd_is_deleted() -> bool:
     """Check whether the current folder has been deleted, so that relative names lead nowhere."""
     try:
         Path.cwd()
@@ -211,7 +214,7 @@ def _is_nowhere() -> bool:
     return False
 
 
-class _AskedToEndError(BaseException):
+class _TerminatedError(BaseException):
     """The system asked this process to end; what is half-written is cleared away on the way out."""
 
     def __init__(self, number: int) -> None:
@@ -220,7 +223,7 @@ class _AskedToEndError(BaseException):
 
 
 def _end(number: int, frame: object) -> Never:
-    raise _AskedToEndError(number)
+    raise _TerminatedError(number)
 
 
 def _interrupted(arguments: list[str]) -> str:
@@ -228,7 +231,7 @@ def _interrupted(arguments: list[str]) -> str:
     return "interrupted" + "; the same command goes on from the cache" * cached
 
 
-def _complain(text: str, status: int, debug: bool) -> int:
+def _print_error(text: str, status: int, debug: bool) -> int:
     # The status tells it to those who cannot be told otherwise.
     with suppress(OSError):
         if debug and sys.exc_info()[0] is not None:

@@ -3,7 +3,7 @@
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,7 +18,7 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import bytes_in_words, seconds_in_words
 from rdstitch.system.progress import StageTimer
 from rdstitch_cli.config import CONFIG_FILE
-from rdstitch_cli.flags import flags, flags_of, is_given, taken
+from rdstitch_cli.flags import flags, flags_of, is_given, values_of
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
@@ -94,17 +94,22 @@ def resolve(inputs: tuple[Path, ...]) -> list[Path]:
     return named
 
 
-def stitch_options(reporter: Reporter, given: dict[str, Any], **more: Any) -> StitchOptions:
+def stitch_options(reporter: Reporter, given: Mapping[str, Any], **more: Any) -> StitchOptions:
     """The library's options from a command's flags."""
-    camera = given.pop("camera")
-    _check_written([camera])
-    if given.pop("preview", False):
+    _check_written([given["camera"]])
+    if given.get("preview"):
         quick = {"max_size": 1200, "seam": "voronoi", "max_features": 1500, "work_megapixels": 0.5}
-        given |= {name: value for name, value in quick.items() if not is_given(name)}
-    features = FeatureOptions(**taken(FeatureOptions, given))
-    composite = CompositeOptions(**taken(CompositeOptions, given))
-    more |= {"camera": read_lens(camera, reporter), "features": features, "composite": composite}
-    return StitchOptions(**taken(StitchOptions, given), **more)
+        given = {**given, **{name: value for name, value in quick.items() if not is_given(name)}}
+    more |= {
+        "camera": read_lens(given["camera"], reporter),
+        "features": FeatureOptions(**values_of(FeatureOptions, given)),
+        "composite": CompositeOptions(**values_of(CompositeOptions, given)),
+    }
+    return StitchOptions(**{**values_of(StitchOptions, given), **more})
+
+
+_WRITTEN = ("output", "save_camera", "plot", "report", "poses", "hugin_project", "layers", "map_server")
+"""Options that name what is written."""
 
 
 def _check_written(read: Iterable[Path | None]) -> None:
@@ -113,15 +118,14 @@ def _check_written(read: Iterable[Path | None]) -> None:
 
     context = click.get_current_context()
     files = [file for file in (*read, context.meta.get(CONFIG_FILE)) if file is not None]
-    for name in ("output", "save_camera", "plot", "report", "poses", "hugin_project"):
-        if context.params.get(name) is not None:
-            check_not_read([context.params[name]], files)
+    written = [context.params[name] for name in _WRITTEN if context.params.get(name) is not None]
+    check_not_read(written, files)
 
 
-def files_beside(reporter: Reporter, given: dict[str, Any]) -> FilesBeside:
-    """Take the options of what is written beside a result out of a command's flags."""
+def files_beside(reporter: Reporter, given: Mapping[str, Any]) -> FilesBeside:
+    """What is written beside a result, from a command's flags."""
     return FilesBeside(
-        **taken(FilesBeside, given), command=shlex.join(["rdstitch", *sys.argv[1:]]), timer=StageTimer(reporter)
+        **values_of(FilesBeside, given), command=shlex.join(["rdstitch", *sys.argv[1:]]), timer=StageTimer(reporter)
     )
 
 

@@ -17,24 +17,15 @@ from scipy.optimize import least_squares
 
 import rdstitch
 from examples.benchmarks.driver import processor_time, run
+from examples.worlds.paths import drive_poses
+from examples.worlds.turns import panorama_rotations, turning_sequence
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import RdstitchError
 from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.geometry.division_model import distort
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.synthetic import (
-    FisheyeLens,
-    Photometry,
-    Sequence,
-    drive_poses,
-    grid_poses,
-    ground,
-    hills,
-    panorama_rotations,
-    sequence_over,
-    turning_sequence,
-)
+from rdstitch.synthetic import FisheyeLens, Photometry, Sequence, grid_poses, ground, hills, sequence_over
 from rdstitch.synthetic.lenses import Lens, focal_length
 
 SIZE = (320, 240)

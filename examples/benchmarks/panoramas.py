@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from examples.benchmarks.driver import run
+from examples.worlds.turns import TurningSequence, panorama_rotations, turning_sequence
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import pano
-from rdstitch.synthetic import Photometry, TurningSequence, panorama_rotations, turning_sequence
+from rdstitch.synthetic import Photometry
 
 Pixels = NDArray[np.uint8]
 SIZE, FOCAL = (640, 480), 554.0

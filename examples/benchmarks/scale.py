@@ -21,6 +21,7 @@ import rdstitch
 from examples.benchmarks.drawn_matches import DrawnMatches
 from examples.benchmarks.driver import StagePeaks, StageTimes, apart, costliest, processor_time, run
 from examples.judging import registration_error
+from examples.worlds.paths import survey_poses
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
@@ -33,7 +34,7 @@ from rdstitch.pipeline.aligner import Aligner, draft_with_loops
 from rdstitch.pipeline.placed_images import align_registration_locally
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.registration import Registration
-from rdstitch.synthetic import Photometry, Sequence, blank, ground, sequence_over, survey_poses
+from rdstitch.synthetic import Photometry, Sequence, blank, ground, sequence_over
 from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import forget_peak_memory
 from rdstitch.system.progress import Progress

@@ -30,9 +30,10 @@ from examples.worlds.stage_grid import Specimen, StageGrid
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import RegistrationError
 from rdstitch.inputs.source import read_sources
+from rdstitch.options.tile_options import TileOptions
 from rdstitch.pipeline.read_inputs import with_flat_field
 from rdstitch.pipeline.stage_tiles import place_tiles
-from rdstitch.stage import TileGrid, TileOptions, register_tiles
+from rdstitch.stage import SearchPlan, TileGrid, register_tiles
 
 _PEERS = r"""
 import json, sys, time, warnings
@@ -115,7 +116,7 @@ def measure(name: str, stage: StageGrid, folder: Path, peer: str | None) -> None
     # Read once before: what is timed is registration.
     planes = [pixels if pixels.ndim == 2 else pixels.mean(axis=2) for pixels in (s.read().pixels for s in sources)]
     start = time.process_time()
-    found = register_tiles(TileGrid(stage.nominal, (stage.tile, stage.tile)), planes.__getitem__)
+    found = register_tiles(SearchPlan.of(TileGrid(stage.nominal, (stage.tile, stage.tile))), planes.__getitem__)
     seconds = time.process_time() - start
     megapixels = len(stage) * stage.tile**2 / 1e6
     fitted, own = found.adjustment, errors(stage, found.adjustment.places, found.groups)

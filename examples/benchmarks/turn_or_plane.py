@@ -12,19 +12,12 @@ import numpy as np
 
 from examples.benchmarks.driver import run
 from examples.worlds.trust_sets import SOLVABLE, trust_set
+from examples.worlds.turns import panorama_rotations, turning_sequence
 from rdstitch.errors import RdstitchError
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.synthetic import (
-    Photometry,
-    Sequence,
-    grid_poses,
-    ground,
-    panorama_rotations,
-    sequence_over,
-    turning_sequence,
-)
+from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 
 BOTH = "a plane seen from one place would look the same"
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from examples.judging.comparison import grey_and_filled, matches
 from examples.judging.fitting import quantile
 from examples.judging.patches import patch_displacements
+from examples.worlds.turns import TurningSequence
 from rdstitch.arrays import FloatArray
-from rdstitch.synthetic import TurningSequence
 from rdstitch.synthetic.textures import LinearPixels
 
 _ROUNDS = 3

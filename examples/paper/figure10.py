@@ -16,13 +16,14 @@ from examples.judging import fit_similarity, registration_error
 from examples.judging.fitting import apply
 from examples.paper.common.report import Effort, Report, Settings, Table
 from examples.paper.common.stitched import register_files
+from examples.worlds.paths import survey_poses
 from rdstitch.arrays import FloatArray
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import project
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.registration import Registration
-from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
+from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over
 
 _CENTRE = np.array([0.0, 0.0, 1.0])
 

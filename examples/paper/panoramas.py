@@ -9,8 +9,9 @@ from examples.judging import compare_with_sphere
 from examples.paper.common.report import Effort, Pixels, Report, Settings
 from examples.paper.common.stitchers import installed_panorama_stitchers
 from examples.paper.end_to_end import SEARCH, Measured, compare
+from examples.worlds.turns import TurningSequence, panorama_rotations, turning_sequence
 from rdstitch.geometry.camera import Camera
-from rdstitch.synthetic import Photometry, TurningSequence, panorama_rotations, turning_sequence
+from rdstitch.synthetic import Photometry
 
 
 @dataclass(frozen=True)

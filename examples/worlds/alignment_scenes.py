@@ -6,7 +6,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, TILTING, YAW, X, Y
+from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, SIMILARITY, THETA, TILTING, YAW, X, Y
+from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
@@ -138,3 +140,16 @@ def jittered(poses: FloatArray, height: float, tilt: float, rng: np.random.Gener
 
 def aligned(given: Scene, **options: object) -> Alignment:
     return align(given.cameras, given.links, AlignmentOptions(**options))  # type: ignore[arg-type]
+
+
+def fitted(given: Scene) -> tuple[Problem, Fit]:
+    """A scene as a problem, and the similarities that fit it."""
+    observations = Observations.from_links(given.links, given.cameras)
+    count = len(given.cameras)
+    known = AlignmentOptions().camera_priors(given.cameras)
+    homographies = np.stack([link.relation.homography for link in given.links])
+    free = np.arange(5) == 0
+    trust = np.ones(len(given.links))
+    lens = np.array([given.distortion, 0.0, 0.0, 0.0, 0.0])
+    problem = Problem(observations, homographies, trust, count, 0, lens, free, known)
+    return problem, problem.fit(SIMILARITY)

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from examples.worlds.paths import drive_poses
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.geometry.camera import Camera
-from rdstitch.synthetic import Photometry, Sequence, drive_poses, ground, sequence_over
+from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over
 
 DISTORTION = -0.25
 

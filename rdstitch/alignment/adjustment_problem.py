@@ -23,7 +23,7 @@ from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, SIMILARITY, THETA,
 from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors, Priors
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import RadialHomography, inverses, transfer
 from rdstitch.matching.match_graph import connected_components, spanning_tree
@@ -105,7 +105,7 @@ _MISFIT = 1.5
 """Times the errors of links on their own from which on those of a model are its own."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """One model adjusted to a problem."""
 
@@ -117,7 +117,7 @@ class Fit:
     overdispersion: float = 1.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Problem:
     """Connected images to be aligned."""
 
@@ -125,12 +125,18 @@ class Problem:
     homographies: FloatArray  # (L, 3, 3): of the links, at the ``lens``
     trust: FloatArray  # (L,): how much each link can be relied on to start with
     count: int  # N
-    reference: int  # the image that fixes the gauge; -1 for none in particular, before part
+    fixed: int | None  # the image that fixes the gauge; None: part chooses one
     lens: FloatArray  # (5,): where to start
     free_lens: BoolArray  # (5,)
     camera_priors: CameraPriors
     overdispersion: float = 1.0  # overdispersion, min_gain: see BundleAdjuster
     min_gain: float = MIN_GAIN
+
+    @property
+    def reference(self) -> int:
+        """The image that fixes the gauge, of a part."""
+        assert self.fixed is not None, "only a part of a problem has a reference"
+        return self.fixed
 
     def part(self, kept: BoolArray, images: IntArray | None = None) -> tuple["Problem", IntArray]:
         """The problem of some links (L,) between these images, or the largest group that they connect; and the images.
@@ -140,10 +146,11 @@ class Problem:
         o = self.observations
         if images is None:
             images = np.array(connected_components(self.count, o.image1[kept], o.image2[kept])[0], dtype=np.intp)
-        number = np.full(self.count + 1, -1, dtype=np.intp)
+        number = np.full(self.count, -1, dtype=np.intp)
         number[images] = np.arange(len(images))
         links = np.flatnonzero(kept & (number[o.image1] >= 0) & (number[o.image2] >= 0))
-        observations, reference = o.subset(links, number), int(number[self.reference])
+        observations = o.subset(links, number)
+        reference = -1 if self.fixed is None else int(number[self.fixed])
         if reference < 0:
             reference = spanning_tree(len(images), observations.image1, observations.image2, self.trust[links]).root
         part = replace(
@@ -152,7 +159,7 @@ class Problem:
             homographies=self.homographies[links],
             trust=self.trust[links],
             count=len(images),
-            reference=reference,
+            fixed=reference,
             camera_priors=self.camera_priors.of(images),
         )
         return part, images
@@ -295,14 +302,14 @@ class Problem:
         """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
         known, links = self.camera_priors, len(self.observations)
         priors = known.priors(model, self.count, _TILT_SPREAD_START)
-        few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
+        few = evenly_spaced(links, _TRIAL_LINKS)
         sample, homographies = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
         trials = [
             independent_pairs(model, sample, homographies, shared, self.lens, self.free_lens, priors, known.attitudes)
             for shared in model.shared_starts(known.log_focal, known.tilt, tilt_known=known.tilt_known)
         ]
         squared = [adjuster.squared(start) for adjuster, start in trials]
-        width = ALIGNMENT_WIDTH * min(map(sigma_of, squared))
+        width = ALIGNMENT_WIDTH * min(float(np.median(sample.scale2)), *map(sigma_of, squared))
         adjuster, start = trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
         return replace(adjuster, min_gain=ROUGH_GAIN), start
 

@@ -131,11 +131,10 @@ def _chosen(task: GivenImages) -> AdjustedImages:
     wrong, confirmed = cycle_consistency(apart, few, len(cameras))
     del apart, held  # with the derivatives of two images for each link
     trust = _trust(few, confirmed)
-    reference = -1 if options.reference is None else options.reference
-    whole = Problem(few, relations, trust, len(cameras), reference, lens, free_lens, known, min_gain=FEW_GAIN)
+    whole = Problem(few, relations, trust, len(cameras), options.reference, lens, free_lens, known, min_gain=FEW_GAIN)
     problem, images = whole.part(~wrong)
     if options.reference is None:
-        whole = replace(whole, reference=int(images[_full_size_reference(problem, [cameras[k] for k in images])]))
+        whole = replace(whole, fixed=int(images[_full_size_reference(problem, [cameras[k] for k in images])]))
         problem, _ = whole.part(~wrong, images)
     # Data weigh against priors as they will in the final adjustment.
     shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
@@ -208,14 +207,15 @@ def _checked_focal(told: AdjustedImages, given: AlignmentOptions) -> AdjustedIma
     task = told.given
     cameras = [replace(camera, focal=None, focal_std=None, focal_source=None).with_focal() for camera in task.cameras]
     # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
-    options = task.options if task.options.attitudes is not None else replace(task.options, tilt=None)
+    only_tilt = task.options.attitudes is None and task.options.tilt is not None
+    options = replace(task.options, tilt=None) if only_tilt else task.options
     without = GivenImages(cameras, task.links, options)
     try:
         shown = _adjusted(_chosen(without))
         doubt = check_focal(task.cameras[shown.images[0]], shown.choice.fit, shown.covariance)
         if doubt is None:
             return told
-        if options != given:  # what seemed to be wrong may have been so with the wrong focal length only
+        if options is not given:  # what seemed to be wrong may have been so with the wrong focal length only
             shown = _adjusted(_chosen(replace(without, options=given)))
     except (RegistrationError, ImpossibleCameraError, np.linalg.LinAlgError):
         return told  # by themselves the images determine nothing

@@ -17,7 +17,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AlignmentOptions:
     """What the caller decides, and what is given of the camera."""
 

@@ -56,7 +56,7 @@ class GivenImages:
     options: AlignmentOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AdjustedImages:
     """What the adjustment found, and what it was made from."""
 
@@ -98,9 +98,9 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
     errors = whitened_errors(observations, adjusted.homographies, lens)
     squared = squared_lengths(errors)
     sigma = sigma_of(squared[observations.scale_inliers_mask])
-    inliers = squared <= (ALIGNMENT_WIDTH * sigma) ** 2
+    inliers = squared < (ALIGNMENT_WIDTH * sigma) ** 2
     # No lens or plane is exact enough for matches that are off by less to disagree.
-    agreeing = squared <= (ALIGNMENT_WIDTH * math.hypot(sigma, EXACTNESS)) ** 2
+    agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(sigma, EXACTNESS)) ** 2
     relief = judge_relief(coherence(observations, errors, inliers), fit.model.name, len(observations))
     considered = lens_covariance
     if adjustment.lens_covariance is not None and adjustment.observable and problem.free_lens[0]:

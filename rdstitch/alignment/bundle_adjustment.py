@@ -42,7 +42,7 @@ WIDEST_START = 0.05
 """Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is down-weighted."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Parameters:
     """The unknowns of the adjustment."""
 
@@ -65,7 +65,7 @@ class Parameters:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FreeParameters:
     """Which parameters are estimated, of the poses (N, D) and of the lens (5,)."""
 
@@ -116,7 +116,7 @@ class BundleAdjustmentResult:
         return self.adjuster.covariance(self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _State:
     """Parameters with the linearization at them."""
 
@@ -126,7 +126,7 @@ class _State:
     equations: LinkEquations
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Descent:
     """Where a descent has led."""
 
@@ -179,7 +179,8 @@ class BundleAdjuster:
             squared, total, used = squared_lengths(errors), total + descent.iterations, used + descent.iterations
             sigma, previous = self._sigma(squared), sigma
             wide = max(wide / 3.0, ALIGNMENT_WIDTH * sigma)
-            converged = last and descent.converged and abs(sigma - previous) <= 0.02 * previous
+            settled = abs(sigma - previous) <= 0.02 * previous and np.isfinite(self.scatter(squared))
+            converged = bool(last and descent.converged and settled)
             if converged or used >= self.max_iterations:
                 revised = revise(adjuster, parameters, sigma, errors) if revise else adjuster
                 if revised is adjuster:
@@ -216,7 +217,9 @@ class BundleAdjuster:
                 return _Descent(parameters, errors, damping, used, False)
             # The decrease of the quadratic model, less what the damping adds to it.
             predicted = -(np.vdot(normal.gradient_poses, step_poses) + normal.gradient_shared @ step_shared)
-            if not np.isfinite(predicted) or predicted <= self.min_gain * max(cost, 1e-12):
+            if not np.isfinite(predicted):
+                return _Descent(parameters, errors, damping, used, False)
+            if predicted <= self.min_gain * max(cost, 1e-12):
                 if failures or damping <= _FIRST_DAMPING:
                     return _Descent(parameters, errors, damping, used, True)
                 damping = _FIRST_DAMPING  # steps that an earlier damping makes short show no minimum
@@ -231,7 +234,7 @@ class BundleAdjuster:
             if after < cost:
                 parameters, errors, moved = trial, trial_error, True
             elif damping > MAX_DAMPING:
-                return _Descent(parameters, errors, damping, used, True)
+                return _Descent(parameters, errors, damping, used, False)
         return _Descent(parameters, errors, damping, used, False)
 
     def linearized(self, parameters: Parameters, width: float) -> _State:
@@ -262,8 +265,13 @@ class BundleAdjuster:
         most = 1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95))
         return min(most, WIDEST_START * float(np.median(self.observations.scale2)))
 
-    def _sigma(self, squared: FloatArray) -> float:
+    def scatter(self, squared: FloatArray) -> float:
+        """Standard deviation of an error's coordinate, pixels; inf where most cannot be transferred."""
         return sigma_of(squared[self.observations.scale_inliers_mask])
+
+    def _sigma(self, squared: FloatArray) -> float:
+        """The same, or half a diagonal, from which a descent may find back."""
+        return min(self.scatter(squared), float(np.median(self.observations.scale2)))
 
     def weight(self, sigma: float) -> float:
         """Of squared errors of this scatter: one over their variance, as far as they are independent."""
@@ -327,11 +335,8 @@ class BundleAdjuster:
 
 
 def sigma_of(squared: FloatArray) -> float:
-    """Standard deviation of an error's coordinate, pixels, from the median of the squared lengths (M,)."""
-    if not len(squared):
-        return _MIN_SIGMA
-    median = float(np.sqrt(np.median(squared)))
-    return max(median / RAYLEIGH_MEDIAN, _MIN_SIGMA) if np.isfinite(median) else 1e3
+    """Standard deviation of an error's coordinate, pixels, from the median of the squared lengths (M,), or inf."""
+    return max(float(np.sqrt(np.median(squared))) / RAYLEIGH_MEDIAN, _MIN_SIGMA) if len(squared) else _MIN_SIGMA
 
 
 def inverse_information(information: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA, PlanarModel
 from rdstitch.alignment.priors import CameraPriors
 from rdstitch.alignment.select import select_model
-from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, DELAYS, at_delay, smooth
 from rdstitch.results.messages import Message
@@ -39,7 +39,7 @@ _STRAINED = 2.0
 
 _WITH_TILTS = ["tilting"]
 
-_LATE = 3.0
+LATE = 3.0
 """Standard deviations from which on a delay is one."""
 
 _FREE_MOUNT = 1.0
@@ -76,9 +76,7 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
     shown = _ShownTilts.of(bare, fit, free_mount=options.tilt is None)
     if known.delayed_attitudes is not None and (late := shown.delay(known.delayed_attitudes + known.tilt)) is not None:
         attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
-        text = "the times of the attitudes are {:.0f} ± {:.0f} ms late, which is allowed for"
-        note = Message(text.format(*1e3 * np.array(late)), severity="note", code="attitudes-late")
-        return replace(options, attitudes=attitudes, delayed_attitudes=None), note
+        return replace(options, attitudes=attitudes, delayed_attitudes=None), attitudes_late(*late)
     stated = options.attitudes_std if options.attitudes is not None else 0.0
     scores = [shown.likelihood(given @ change.T) for change in _SIGNED_ORDERS]
     none = shown.likelihood(np.zeros_like(given))
@@ -120,8 +118,19 @@ def check_focal(given: Camera, fit: Fit, covariance: FloatArray | None) -> Messa
     odds = math.log(focal / given.focal) ** 2 / (2.0 * (std**2 + given.focal_log_std**2))
     if odds < _LOG_ODDS:
         return None
-    text = f"the images contradict the given focal length of {given.focal:.1f} pixels, which is not used: "
-    return Message(f"{text}they show {focal:.1f} ± {std * focal:.1f}", code="focal-contradicted")
+    return focal_contradicted(given.focal, focal, std)
+
+
+def focal_contradicted(given: float, shown: float, log_std: float) -> Message:
+    """What the user should know where images show another focal length than was given, pixels."""
+    text = f"the images contradict the given focal length of {given:.1f} pixels, which is not used: "
+    return Message(f"{text}they show {shown:.1f} ± {log_std * shown:.1f}", code="focal-contradicted")
+
+
+def attitudes_late(delay: float, std: float) -> Message:
+    """What the user should know of attitudes whose times are so many seconds late."""
+    text = f"the times of the attitudes are {1e3 * delay:.0f} ± {1e3 * std:.0f} ms late, which is allowed for"
+    return Message(text, severity="note", code="attitudes-late")
 
 
 def _named(change: FloatArray) -> str:
@@ -131,7 +140,7 @@ def _named(change: FloatArray) -> str:
     return " and ".join(changes)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _ShownTilts:
     """What the images show of their tilts."""
 
@@ -147,7 +156,7 @@ class _ShownTilts:
         assert isinstance(model, PlanarModel)
         normal = adjuster.normal_equations(adjusted)
         tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
-        images = np.unique(np.linspace(0, problem.count - 1, _MAX_IMAGES).astype(np.intp))
+        images = evenly_spaced(problem.count, _MAX_IMAGES)
         focal = math.exp(adjusted.parameters.shared[-1])
         rows = np.arange(2 * len(images))
         by_pose = np.zeros((*normal.gradient_poses.shape, len(rows)))
@@ -186,4 +195,4 @@ class _ShownTilts:
         below, top, above = scores[best - 1 : best + 2].tolist()
         bend = 2.0 * top - below - above
         delay, std = float(DELAYS[best]) + step * (above - below) / (2.0 * bend), step / math.sqrt(bend)
-        return (delay, std) if abs(delay) > _LATE * std else None
+        return (delay, std) if abs(delay) > LATE * std else None

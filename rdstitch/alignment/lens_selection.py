@@ -46,7 +46,7 @@ _ENOUGH_LINKS = 2000
 lenses takes memory and time for each of them."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LensChoice:
     """The lens chosen."""
 

@@ -21,7 +21,7 @@ Fields = Callable[[LinearizedErrors], FloatArray]
 """Changes (m, 2, C) of the errors of some links, pixels."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinearResponse:
     """An adjustment, linearized at its solution."""
 

@@ -28,7 +28,7 @@ from rdstitch.geometry.radial_homography import (
 from rdstitch.robust.loss import robust_weight
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinkEquations:
     """Weighted, linearized transfer errors of all correspondences, summed per link."""
 
@@ -47,7 +47,7 @@ def split_lens(lens: FloatArray) -> tuple[float, tuple[float, ...], FloatArray]:
 def folds(lens: FloatArray, reach: float = 1.0) -> bool:
     """Whether a lens with more than λ would show a place twice, out to a radius in half diagonals."""
     distortion, higher, center = split_lens(lens)
-    return bool(higher) and not is_one_to_one(reach + float(np.linalg.norm(center)), (distortion, *higher))
+    return bool(higher) and not is_one_to_one(reach + float(np.linalg.norm(center)), distortion, higher)
 
 
 @np.errstate(all="ignore")  # a long step may give homographies that are not finite
@@ -97,7 +97,7 @@ def trial_errors(
     return errors.T
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinearizedErrors:
     """Whitened transfer errors of some links with their derivatives, all in pixels; 0 where there is no transfer."""
 
@@ -144,7 +144,7 @@ def squared_lengths(errors: FloatArray) -> FloatArray:
     return squared
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Transferred:
     """Correspondences of some links: whitenings (m, 2, 2), errors (2, m) in half diagonals, and whitened in pixels."""
 

@@ -18,7 +18,7 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjuster
 from rdstitch.alignment.motion_models import PlanarModel, X, Y
 from rdstitch.alignment.plane_marks import PlaneMarks
 from rdstitch.alignment.priors import CameraPriors
-from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.posterior import EXACTNESS
 from rdstitch.robust.similarity_fit import OUTLYING, SimilarityFit, fit_similarity
@@ -233,7 +233,7 @@ def _leverage(problem: Problem, fit: Fit, sides: Sequence[_Side]) -> dict[int | 
     for side in sides:
         image, derivative, precision = side.sightings(adjuster, fit)
         item, names = side.named()
-        chosen = np.unique(np.linspace(0, len(names) - 1, min(len(names), _MANY)).astype(np.intp))
+        chosen = evenly_spaced(len(names), _MANY)
         gradients = np.zeros((count, size, len(chosen), 2))
         of_shared = np.zeros((len(normal.gradient_shared), len(chosen), 2))
         counts, sums = np.bincount(item, minlength=len(names)), np.bincount(item, precision, len(names))

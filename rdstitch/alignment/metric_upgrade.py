@@ -30,7 +30,7 @@ _OUTLYING = 0.3
 """Error of the two conditions, relative, beyond which all errors count alike."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MetricPoses:
     """Poses (N, 6) of one camera, as the planar models have them, the shared tilt (2,), radians, and log f."""
 

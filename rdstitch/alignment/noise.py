@@ -153,7 +153,7 @@ def judge_relief(left: Coherence, model: str, links: int) -> ReliefTest:
 def evidence_of(observations: Observations, errors: FloatArray) -> Evidence:
     """What hypotheses on all links are compared by; the errors (M, 2), pixels, are those of links on their own."""
     squared = squared_lengths(errors)
-    inliers = squared <= (ALIGNMENT_WIDTH * sigma_of(squared[observations.scale_inliers_mask])) ** 2
+    inliers = squared < (ALIGNMENT_WIDTH * sigma_of(squared[observations.scale_inliers_mask])) ** 2
     shared = min(max(coherence(observations, errors, inliers).correlation, 0.0), 0.9)
     power = float(squared[inliers].mean()) / 2.0 if inliers.any() else 0.0
     images, links = len(np.unique([observations.image1, observations.image2])), max(len(observations), 1)
@@ -173,7 +173,7 @@ def independent_errors(observations: Observations, homographies: FloatArray, len
     """
     errors = whitened_errors(observations, homographies, lens)
     squared = squared_lengths(errors)
-    inliers = squared <= (ALIGNMENT_WIDTH * sigma_of(squared[observations.scale_inliers_mask])) ** 2
+    inliers = squared < (ALIGNMENT_WIDTH * sigma_of(squared[observations.scale_inliers_mask])) ** 2
     overdispersion = shared_variance(observations, errors, inliers)
     counted = inliers & ~misfitting_links(squared, observations)[observations.link]
     return overdispersion, max(2.0 * float(counted.sum()) / overdispersion, 2.0)

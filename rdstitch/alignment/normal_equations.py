@@ -27,7 +27,7 @@ _DAMPINGS = (0.0, 1e-12, 1e-8, 1e-4)
 """Relative to the diagonal, from none up: the least of them makes poses solvable that nothing holds."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SparseNormalEquations:
     """``[A B; B' C] step = -gradient`` for D parameters of each of N poses and S shared ones, in that order.
 

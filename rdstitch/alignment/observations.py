@@ -20,7 +20,7 @@ _STATIC = 1.0
 """Pixels that the displacements of most correspondences of a link stay below where the camera stood still."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Observations:
     """Correspondences of L links, one after the other."""
 

@@ -16,7 +16,7 @@ from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.robust.posterior import LENS, TILT, Prior, exact, focal_prior
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Priors:
     """Priors on all that is adjusted."""
 
@@ -33,7 +33,7 @@ class Priors:
         return cls((Prior(),) * len(model.shared_names), (Prior(),) * len(LENS_PARAMETERS), poses, poses)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CameraPriors:
     """Priors of the camera."""
 

@@ -42,7 +42,7 @@ class LinkFit:
         return self.image1, self.image2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlanarPoses:
     """Where the camera was for each image, in a metric plane."""
 
@@ -97,7 +97,7 @@ class ShapeTest:
     cause: str  # what is most likely to be left out
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True, eq=False)
 class Alignment:
     """All images registered as one.
 
@@ -166,20 +166,20 @@ class Alignment:
     reference: int
     model: str
     model_reason: str
-    poses: PlanarPoses | None
-    tilt: tuple[float, float] | None
-    tilt_spread: float
-    focal: float | None
-    focal_std: float | None
     distortion: float
     distortion_std: float
-    lens: str
-    lens_reason: str
-    parameters: tuple[str, ...]
-    covariance: FloatArray
     rms: float
     links: tuple[LinkFit, ...]
     relief: ReliefTest
+    lens: str = "division"
+    lens_reason: str = "one parameter"
+    poses: PlanarPoses | None = None
+    tilt: tuple[float, float] | None = None
+    tilt_spread: float = 0.0
+    focal: float | None = None
+    focal_std: float | None = None
+    parameters: tuple[str, ...] = ()
+    covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     shape: ShapeTest | None = None
     leverage: Mapping[int | str, float] = field(default_factory=dict)
     lever_std: float = 0.0

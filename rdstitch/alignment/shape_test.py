@@ -58,7 +58,7 @@ _PATTERNS = 8
 """Random ways in which images are tried to be cropped: as many for few images as for many."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Effect:
     """One thing that is not modelled."""
 
@@ -234,7 +234,7 @@ def beside_usual_focal(problem: Problem, fit: Fit) -> float:
     return log_focal - problem.camera_priors.log_focal
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Prediction:
     """What effects would change: gain in squared standard deviations, in all and by effect; pixels (N,); the cause."""
 
@@ -245,7 +245,7 @@ class _Prediction:
     cause: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Answers:
     """How an adjustment answers E effects of unit size, and its S shared parameters as they are without these."""
 

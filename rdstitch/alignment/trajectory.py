@@ -18,7 +18,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Trajectory:
     """Poses of the frames of a sequence, in order.
 

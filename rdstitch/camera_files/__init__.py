@@ -1,21 +1,6 @@
 """Camera files: rdstitch's own and those of others, to whose lens models the lens is fitted; each states the residual.
 
-================  =====================================  =================================
-format            otherwise chosen by the name
-================  =====================================  =================================
-``rdstitch``      ``*.json``                             rdstitch's own
-``opencv``        ``*.yml``, ``*.yaml``                  OpenCV's FileStorage as YAML
-``opencv-json``   ``opencv.json``, ``*.opencv.json``     the same as JSON
-``fisheye``       ``fisheye.yml``, ``*.fisheye.yml``     the same as YAML, for ``cv2.fisheye``
-``ros``           ``camera_info.yaml``                   ROS
-``kalibr``        ``camchain.yaml``                      Kalibr
-``colmap``        ``cameras.txt``                        COLMAP
-``opendronemap``  ``cameras.json``                       OpenDroneMap
-``hugin``         ``*.pto``                              Hugin
-``lensfun``       ``*.xml``                              lensfun
-================  =====================================  =================================
-
-What is read is known by its content.
+What is read is known by its content, what is written by its name or by ``camera_format``: see docs/formats.md.
 """
 
 import re
@@ -23,14 +8,15 @@ from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from rdstitch.camera_files import formats
 from rdstitch.camera_files.lens_models import CameraFile, LensFit
+from rdstitch.camera_files.own_format import CameraRecord, camera_json
 from rdstitch.camera_files.polynomials import hugin_project, is_hugin, lensfun_xml, read_hugin, read_lensfun
 from rdstitch.choices import CameraFormat
 from rdstitch.errors import ArgumentError, InputError, OutputError
-from rdstitch.geometry.camera import Camera, CameraRecord
+from rdstitch.geometry.camera import Camera
 from rdstitch.system.file_access import read_text
 from rdstitch.system.outputs import json_bytes, text_bytes, write_bytes_atomic
 from rdstitch.system.records import convert, parse_json, parse_yaml
@@ -131,7 +117,7 @@ def _only(cameras: Sequence[Value]) -> Value:
 
 
 def _own(content: Any, file: str, field: str = "") -> CameraFile:
-    """Give what rdstitch wrote, alone or into the file of others."""
+    """What rdstitch wrote, alone or into the file of others."""
     return CameraFile(convert(content, CameraRecord, file, field).camera(), "rdstitch")
 
 
@@ -155,8 +141,9 @@ def save_camera(camera: Camera, path: str | Path, camera_format: CameraFormat = 
 
 
 def camera_file_text(camera: Camera, path: str | Path, camera_format: CameraFormat = "auto") -> str:
-    """Give what :func:`save_camera` writes."""
-    return _WRITERS[format_of(path, camera_format)](camera)
+    """What :func:`save_camera` writes."""
+    wanted = format_of(path, camera_format)
+    return next(each.text(camera) for each in _FORMATS if each.name == wanted)
 
 
 def format_of(path: str | Path, camera_format: CameraFormat = "auto") -> CameraFormat:
@@ -166,10 +153,10 @@ def format_of(path: str | Path, camera_format: CameraFormat = "auto") -> CameraF
     file = Path(path)
     name = file.name.lower().removesuffix(".yml")
     name += ".yaml" if name != file.name.lower() else ""
-    for pattern, named in _NAMES.items():
-        if fnmatchcase(name, pattern):
-            return named
-    known = ", ".join(_WRITERS)
+    for each in _FORMATS:
+        if any(fnmatchcase(name, pattern) for pattern in each.names):
+            return each.name
+    known = ", ".join(each.name for each in _FORMATS)
     raise OutputError(
         f"{file}: not the name of a camera file; use one that ends with {' '.join(CAMERA_SUFFIXES)}, or give "
         f"--camera-format ({known})"
@@ -182,31 +169,24 @@ def export_note(camera: Camera, path: str | Path, camera_format: CameraFormat = 
     return tuple(f"{path}: its lens model is at most {float(value):.3f} pixels from the lens" for value in largest[-1:])
 
 
-_WRITERS: dict[CameraFormat, Callable[[Camera], str]] = {
-    "rdstitch": lambda camera: json_bytes(camera.as_dict()).decode(),
-    "opencv": formats.opencv_text,
-    "opencv-json": partial(formats.opencv_text, yaml=False),
-    "fisheye": partial(formats.opencv_text, fisheye=True),
-    "ros": formats.camera_info_yaml,
-    "kalibr": formats.camera_chain_yaml,
-    "colmap": formats.colmap_text,
-    "opendronemap": formats.opendronemap_json,
-    "hugin": hugin_project,
-    "lensfun": lensfun_xml,
-}
+class _Format(NamedTuple):
+    """A format that is written."""
 
-_NAMES: dict[str, CameraFormat] = {
-    "cameras.json": "opendronemap",
-    "opencv.json": "opencv-json",
-    "*.opencv.json": "opencv-json",
-    "?*.json": "rdstitch",
-    "camera_info.yaml": "ros",
-    "camchain.yaml": "kalibr",
-    "fisheye.yaml": "fisheye",
-    "*.fisheye.yaml": "fisheye",
-    "?*.yaml": "opencv",
-    "cameras.txt": "colmap",
-    "?*.pto": "hugin",
-    "?*.xml": "lensfun",
-}
-"""By the name of the file, the first that fits; ``.yml`` is ``.yaml``."""
+    name: CameraFormat
+    names: tuple[str, ...]  # patterns of file names; ``.yml`` is ``.yaml``
+    text: Callable[[Camera], str]
+
+
+# The first whose pattern fits is what a name says.
+_FORMATS = (
+    _Format("opendronemap", ("cameras.json",), formats.opendronemap_json),
+    _Format("opencv-json", ("opencv.json", "*.opencv.json"), partial(formats.opencv_text, yaml=False)),
+    _Format("rdstitch", ("?*.json",), lambda camera: json_bytes(camera_json(camera)).decode()),
+    _Format("ros", ("camera_info.yaml",), formats.camera_info_yaml),
+    _Format("kalibr", ("camchain.yaml",), formats.camera_chain_yaml),
+    _Format("fisheye", ("fisheye.yaml", "*.fisheye.yaml"), partial(formats.opencv_text, fisheye=True)),
+    _Format("opencv", ("?*.yaml",), formats.opencv_text),
+    _Format("colmap", ("cameras.txt",), formats.colmap_text),
+    _Format("hugin", ("?*.pto",), hugin_project),
+    _Format("lensfun", ("?*.xml",), lensfun_xml),
+)

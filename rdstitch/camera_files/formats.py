@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, Struct
 
 from rdstitch.camera_files.lens_models import CameraFile, LensFit, fitted_camera, nearest_model
+from rdstitch.camera_files.own_format import camera_json
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensKind, LensModel
@@ -343,7 +344,7 @@ def comments(camera: Camera, fit: LensFit, model: str) -> str:
 
 def _own(camera: Camera, fit: LensFit) -> dict[str, Any]:
     """Give the camera, and the residual of the model that was fitted to it; what is not known is left out."""
-    known = {key: value for key, value in camera.as_dict().items() if value is not None}
+    known = {key: value for key, value in camera_json(camera).items() if value is not None}
     return {**known, "fit_rms_px": fit.rms, "fit_largest_px": fit.largest}
 
 

@@ -45,12 +45,12 @@ def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
     return solution
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LensSamples:
     """Radii of points all over what is drawn of an image, N of them."""
 
-    straight: FloatArray  # straight, bent: (N,): from the distortion centre, undistorted and measured, focal lengths
-    bent: FloatArray
+    undistorted: FloatArray  # undistorted, distorted: (N,): from the distortion centre, focal lengths
+    distorted: FloatArray
     focal: float  # pixels; guessed where the camera has none
 
     @classmethod
@@ -66,7 +66,7 @@ class LensSamples:
 
     def fit(self, start: FloatArray, terms: FloatArray) -> tuple[FloatArray, LensFit]:
         """Find coefficients (K,) for which ``start + terms k`` are the measured radii; ``terms`` of shape (N, K)."""
-        coefficients = _least_squares(terms, self.bent - start)
+        coefficients = _least_squares(terms, self.distorted - start)
         return coefficients, self._compare(start + terms @ coefficients)
 
     def fit_rational(self) -> tuple[FloatArray, LensFit]:
@@ -76,22 +76,22 @@ class LensSamples:
         error is kept.
         """
         # Radii up to 1, whatever the unit: high powers of large ones are otherwise all that counts.
-        size = float(self.straight.max())
-        powers = (self.straight[:, None] / size) ** np.array([2, 4, 6])
-        terms = np.hstack([self.straight[:, None] * powers, -self.bent[:, None] * powers])
-        denominator, fits = np.ones_like(self.bent), [(np.zeros(6), self._compare(self.straight))]
+        size = float(self.undistorted.max())
+        powers = (self.undistorted[:, None] / size) ** np.array([2, 4, 6])
+        terms = np.hstack([self.undistorted[:, None] * powers, -self.distorted[:, None] * powers])
+        denominator, fits = np.ones_like(self.distorted), [(np.zeros(6), self._compare(self.undistorted))]
         for _ in range(_RATIONAL_STEPS):
-            k = _least_squares(terms / denominator[:, None], (self.bent - self.straight) / denominator)
+            k = _least_squares(terms / denominator[:, None], (self.distorted - self.undistorted) / denominator)
             denominator = 1.0 + powers @ k[3:]
             if not (denominator > 1e-3).all():
                 break
-            fits.append((k, self._compare(self.straight * (1.0 + powers @ k[:3]) / denominator)))
+            fits.append((k, self._compare(self.undistorted * (1.0 + powers @ k[:3]) / denominator)))
         coefficients, fit = min(fits, key=lambda one: one[1].largest)
         return coefficients / np.tile(size ** np.array([2.0, 4.0, 6.0]), 2), fit
 
     def _compare(self, bent: FloatArray) -> LensFit:
         """Compare a model's measured radii (N,) with these."""
-        error = np.abs(bent - self.bent) * self.focal
+        error = np.abs(bent - self.distorted) * self.focal
         return LensFit(float(np.sqrt(np.mean(error**2))), float(error.max()))
 
 
@@ -110,7 +110,7 @@ def nearest_model(camera: Camera, *models: str, close: float = CLOSE) -> tuple[L
     samples, fits = LensSamples.of(camera), []
     for model in models:
         powers, places = _MODELS[model]
-        start = np.arctan(samples.straight) if model == "fisheye" else samples.straight
+        start = np.arctan(samples.undistorted) if model == "fisheye" else samples.undistorted
         numbers, error = samples.fit(start, start[:, None] ** np.array(powers)) if powers else samples.fit_rational()
         coefficients = tuple(0.0 if place is None else float(numbers[place]) for place in places)
         kind: LensKind = "fisheye" if model == "fisheye" else "brown"

@@ -145,7 +145,7 @@ def fitted_polynomial(camera: Camera, unit: float, powers: tuple[int, ...]) -> P
     """The polynomial of a camera by least squares; a fisheye's where that is nearer and the other one is not close."""
     samples = LensSamples.of(camera)
     size, lenses = samples.focal / unit, []
-    for fisheye, straight in ((False, samples.straight), (True, np.arctan(samples.straight))):
+    for fisheye, straight in ((False, samples.undistorted), (True, np.arctan(samples.undistorted))):
         values, fit = samples.fit(straight, (straight[:, None] * size) ** np.array(powers) / size)
         lenses.append(Polynomial(powers, tuple(values.tolist()), samples.focal, fisheye, fit))
     return lenses[0] if lenses[0].fit.largest <= CLOSE else min(lenses, key=lambda lens: lens.fit.largest)

@@ -43,7 +43,7 @@ def rounded(values: Float32Array, constant: np.float32) -> Float32Array:
     return values
 
 
-@dataclass
+@dataclass(eq=False)
 class MultibandBlender:
     """Sums of weighted Laplacian bands on one box."""
 

@@ -31,7 +31,7 @@ _POINTS_PER_SIDE = 64  # as the canvas samples outlines: undistorted, straight s
 _ROWS = 64  # rows of a mask that are computed at a time, so that they stay in the processor's cache
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NearPart:
     """The part of an image that is drawn."""
 
@@ -142,7 +142,7 @@ _MAX_ENLARGEMENT = 400.0  # pixels of the canvas for each of the images, where -
 _LEVEL = 1e-9  # rounding of what a turn within the plane leaves as it is
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Canvas:
     """The output image's geometry."""
 

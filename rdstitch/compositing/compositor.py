@@ -16,7 +16,7 @@ from rdstitch.compositing.preparation import Decisions, prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.tiles import BlockRunner
-from rdstitch.io.encoding import Layout
+from rdstitch.io.encoding import ImageSpec
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, check_memory, write_strips
@@ -26,7 +26,7 @@ from rdstitch.system.outputs import Fingerprint, Outputs
 from rdstitch.system.progress import ShareProgress, unheard
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Composite:
     """The stitched image."""
 
@@ -98,7 +98,7 @@ def compose_to_file(
     """
     with prepare_composite(images, canvas, options, elsewhere, decisions) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
-        layout = Layout(
+        layout = ImageSpec(
             size,
             renderer.channels,
             renderer.dtype,

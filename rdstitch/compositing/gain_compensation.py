@@ -27,6 +27,7 @@ from rdstitch.compositing.photometric import KNEE, Exposure, bilinear_weights, f
 from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.survey import Survey, SurveyTile
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.conjugate_gradients import conjugate_gradients
 from rdstitch.options.composite_options import ExposureMethod
 from rdstitch.system.late_imports import sparse
 
@@ -36,7 +37,7 @@ _CELLS, _MAX_CELLS = 16, 150_000
 _DARKEST, _BRIGHTEST = 0.02, 0.97
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cells:
     """Cells that two images show."""
 
@@ -190,7 +191,7 @@ _MIN_RELATIVE_GAIN = 0.05
 _BRIGHTEST_SHARE, _MAX_WHITE = 0.999, KNEE + (1.0 - KNEE) / math.sqrt(0.75)
 _MEDIAN_SAMPLES = 10_000  # of all images together
 # Residual, as a share of the right side, and decimals that are kept: both far below a grey level.
-_TOLERANCE, _MAX_STEPS, _DECIMALS = 1e-4, 3000, 5
+_TOLERANCE, _DECIMALS = 1e-4, 5
 
 _Prior = tuple["sparse.csr_array", FloatArray, int]
 """Precision (K, K), its product with what is expected (K, C), and how many unknowns an image has."""
@@ -226,7 +227,7 @@ def estimate_exposure(survey: Survey, images: Sequence[PlacedImage], method: Exp
     return replace(exposure, log_gain=exposure.log_gain + _common(light, log))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Differences:
     """What the first image of each cell is brighter by, log units, for one response of the camera."""
 
@@ -411,8 +412,6 @@ def _solve(
     """Weighted least squares with a prior, by conjugate gradients, in memory that grows with the number of images.
 
     They are preconditioned by the inverse of the part of each image.
-
-    The columns are solved side by side: a product with the matrix is most of a step, and one serves them all.
     """
     precision, expected, block = prior
     weighted = design.copy()
@@ -426,20 +425,11 @@ def _solve(
     blocks = np.zeros((len(right) // block, block, block))
     blocks[row // block, row % block, column % block] = entries.data[own]
     inverse = np.linalg.inv(blocks)
-    x, left = start, right - normal @ start
-    enough = _TOLERANCE**2 * (right**2).sum(axis=0)
-    direction, previous, ones = np.zeros_like(x), np.ones(x.shape[1]), np.ones(len(x))
-    for _ in range(_MAX_STEPS):
-        going = ones @ left**2 > enough
-        if not going.any():
-            break
-        better = (inverse @ left.reshape(-1, block, x.shape[1])).reshape(x.shape)
-        now = ones @ (left * better)
-        direction = better + now / previous * direction
-        along = normal @ direction
-        step = np.where(going, now, 0.0) / np.where(going, ones @ (direction * along), 1.0)
-        x, left, previous = x + step * direction, left - step * along, np.where(going, now, 1.0)
-    return x
+
+    def precondition(left: FloatArray) -> FloatArray:
+        return (inverse @ left.reshape(-1, block, left.shape[1])).reshape(left.shape)
+
+    return conjugate_gradients(normal, right, start, precondition, _TOLERANCE)
 
 
 def _samples(exposure: Exposure, survey: Survey, cameras: Sequence[Camera]) -> tuple[FloatArray, FloatArray]:

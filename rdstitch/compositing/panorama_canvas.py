@@ -25,7 +25,7 @@ _CYLINDER_HEIGHT = math.radians(70.0)
 _UNIT, _UNITS_PER_TURN = 32, 256
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SeenDirections:
     """What images show of the directions around their centre."""
 

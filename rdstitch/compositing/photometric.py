@@ -31,7 +31,7 @@ _ROWS = 128  # that are corrected at a time
 DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Exposure:
     """What every image's samples are multiplied by: ``v' = q (v + b) - b``."""
 

@@ -31,7 +31,7 @@ from rdstitch.system.progress import ShareProgress, unheard
 _READERS = 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Prepared:
     """A composite that is decided on, and not yet computed."""
 

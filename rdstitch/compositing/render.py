@@ -18,7 +18,7 @@ from rdstitch.compositing.warp import Geometry, Warp, border_weight, locate, sam
 from rdstitch.options.composite_options import CompositeOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layer:
     """One image's weight on a part of the canvas."""
 

@@ -34,7 +34,7 @@ _MAX_CUT = 15_000
 _MOVED = 3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SeamMap:
     """Owner of each pixel of the reduced canvas."""
 

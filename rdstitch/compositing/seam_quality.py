@@ -39,7 +39,7 @@ _MAX_LENGTH = 0.045  # of a break that a person does not see, diagonals of an im
 _SURELY_ALIKE = 0.9  # correlation of windows that need not be moved
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SeamTile:
     """One image where seams are looked at."""
 
@@ -58,7 +58,7 @@ class SeamBreak:
     size: float  # by how much its content is shifted, pixels of the output; NaN where it does not match at all
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SeamQuality:
     """The seams of an output, place by place."""
 

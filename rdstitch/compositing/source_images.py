@@ -131,7 +131,7 @@ _PIXELS_PER_OUTPUT_PIXEL = 1.9
 _MAX_PREVIEW = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LoadedImage:
     """An image ready to be resampled."""
 

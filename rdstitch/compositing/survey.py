@@ -23,7 +23,7 @@ _MAX_TOTAL = 16_000_000  # pixels of one image and of all on the reduced canvas;
 _MAX_SEEN = 24_000_000  # pixels of all images where their seams are looked at
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SurveyTile:
     """One image on the reduced canvas."""
 

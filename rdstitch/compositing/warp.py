@@ -90,7 +90,7 @@ def _enclosing(box: Box, step: int) -> tuple[tuple[int, int], tuple[int, int]]:
     return across, down
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surface:
     """A canvas that is no plane."""
 
@@ -106,7 +106,7 @@ class Surface:
         return self.projection.directions(across, down)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Warp:
     """How the canvas is filled from one image."""
 

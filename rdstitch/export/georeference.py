@@ -8,23 +8,26 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.export.map_fit import MapFit, Views, fit_map, views_of
+from rdstitch.export.map_fit import MapFit, Measured, Views, fit_map, views_of
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import WGS84, Crs, middle
+from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.io.tiff import ExtraTag
 
 MIN_POSITIONS = 3
 # Positions must agree with the images to this share of their own spread: else it is no view from above, or the GPS
 # says less than nothing.
 _MAX_ERROR = 0.25
-GPS, CONTROL = "GPS positions", "ground control points"
+PositionKind = Literal["GPS positions", "ground control points"]
+GPS: PositionKind = "GPS positions"
+CONTROL: PositionKind = "ground control points"
 MODEL_SCALE, MODEL_TIEPOINT, MODEL_TRANSFORMATION, GEO_KEYS = 33550, 33922, 34264, 34735
 _SHORT, _DOUBLE = 3, 12
 
@@ -53,7 +56,7 @@ class Georeference:
     origin: complex  # easting + i northing of the centre of the top-left pixel, m
     # root mean square distance of the positions used from where all others and the images put them, m
     rms: float
-    source: str = GPS  # what the positions are
+    source: PositionKind = GPS  # what the positions are
     residuals: tuple[Residual, ...] = ()  # of every position
     # standard deviation of one coordinate of a place on the ground, in the mean over the positions, m
     std: float | None = None
@@ -201,7 +204,7 @@ def has_place(positions: Sequence[GpsPosition | None]) -> bool:
     return len(known) >= MIN_POSITIONS
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Located:
     """Registered images, and what is known of where they are."""
 
@@ -240,12 +243,8 @@ def _by_positions(located: Located, epsg: int | None, force: bool) -> tuple[Geor
     std = np.array([(np.nan, np.nan) if place.std is None else place.std for place in places])
     names = [name for name, is_known in zip(located.names, known.tolist(), strict=True) if is_known]
     leverage = [located.leverage.get(k, 0.0) for k in np.flatnonzero(known).tolist()]
-    degrees = [(p.latitude, p.longitude) for p in places]
-    return _placed(located, views, degrees, _altitudes(places), std, leverage, names, epsg, force, GPS)
-
-
-def _altitudes(places: Sequence[GpsPosition]) -> FloatArray:
-    return np.array([np.nan if place.altitude is None else place.altitude for place in places])
+    altitude = np.array([np.nan if place.altitude is None else place.altitude for place in places])
+    return _placed(located, views, _MeasuredPlaces(GPS, names, places, altitude, std, leverage), epsg, force)
 
 
 def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georeference | None, str]:
@@ -265,11 +264,10 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
     seen = views_of(located.cameras, located.to_output, located.nadirs)
     views = replace(Views.of_ground(np.array([pixel for _, pixel in control])), pixel=seen.pixel)
     std = np.array([[np.nan if point.std is None else point.std] * 2 for point, _ in control])
-    degrees = [(point.place.latitude, point.place.longitude) for point, _ in control]
-    names = [point.name for point, _ in control]
+    names, places = [point.name for point, _ in control], [point.place for point, _ in control]
     leverage = [located.leverage.get(name, 0.0) for name in names]
-    none = np.full(len(names), np.nan)
-    place, reason = _placed(located, views, degrees, none, std, leverage, names, epsg, force, CONTROL)
+    measured = _MeasuredPlaces(CONTROL, names, places, np.full(len(names), np.nan), std, leverage)
+    place, reason = _placed(located, views, measured, epsg, force)
     if place is None or not checks:
         return place, reason
     latitude, longitude = np.array([(p.place.latitude, p.place.longitude) for p, _ in checks]).T
@@ -281,28 +279,32 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
     return replace(place, checks=tuple(residuals)), reason
 
 
+@dataclass(frozen=True, eq=False)
+class _MeasuredPlaces:
+    """What places the output: positions of N images, or control points."""
+
+    source: PositionKind
+    names: Sequence[str]
+    places: Sequence[GpsPosition]
+    altitude: FloatArray  # altitude, std, leverage: as :class:`rdstitch.export.map_fit.Measured` has them
+    std: FloatArray
+    leverage: Sequence[float]
+
+
 def _placed(
-    located: Located,
-    views: Views,
-    degrees: Sequence[tuple[float, float]],
-    altitude: FloatArray,
-    accuracy: FloatArray,
-    leverage: Sequence[float],
-    names: Sequence[str],
-    epsg: int | None,
-    force: bool,
-    source: str,
+    located: Located, views: Views, measured: _MeasuredPlaces, epsg: int | None, force: bool
 ) -> tuple[Georeference | None, str]:
     """Place the output by some positions."""
-    latitude, longitude = np.array(degrees).T
+    latitude, longitude = np.array([(place.latitude, place.longitude) for place in measured.places]).T
     crs = Crs.nearest(latitude, longitude) if epsg is None else Crs(epsg)
     map_scale = crs.map_scale(*middle(latitude, longitude))
     places = crs.project(latitude, longitude) @ np.array([1, 1j])
     usable: BoolArray = np.isfinite(places) & views.usable
+    source, names = measured.source, measured.names
     if usable.sum() < MIN_POSITIONS:
         return None, f"{crs.name} does not reach the {source}"
-    own = np.array(leverage)[usable]
-    fit = fit_map(views.of(usable), places[usable], altitude[usable], accuracy[usable], map_scale, own)
+    on_map = Measured(places, measured.altitude, measured.std, np.array(measured.leverage), map_scale)
+    fit = fit_map(views.of(usable), on_map.of(usable))
     used = np.zeros(len(names), dtype=bool)
     used[usable] = fit.used
     off = np.full(len(names), complex(np.inf))

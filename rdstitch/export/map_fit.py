@@ -147,27 +147,40 @@ class MapFit:
     slope_squared: float = 0.0  # of the ground, over its variance
 
 
-def fit_map(
-    views: Views,
-    places: ComplexArray,
-    altitude: FloatArray,
-    std: FloatArray,
-    map_scale: float = 1.0,
-    leverage: FloatArray | float = 0.0,
-) -> MapFit:
-    """Fit places (N,) of cameras or points, easting + i northing, and altitudes (N,), m; NaN where these are not known.
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Places of cameras or points on the map."""
 
-    ``std`` (N, 2) are standard deviations of one horizontal coordinate and of the altitude, NaN where not known; where
-    residuals are larger, these count. ``map_scale`` is metres of the map per metre on the ground, ``leverage`` (N,) how
-    far places have put themselves where the views are already, 0 to 1.
-    """
-    leverage = np.broadcast_to(leverage, len(places))
-    declared = bool(np.isfinite(std).any())
-    std = np.where(np.isfinite(std), std, POSITION_STD if declared else 1.0)
-    level = _fitted(views, places, altitude, std, map_scale, declared, leverage, 0.0)
-    if level is None or not _has_altitudes(views, altitude).any():
-        return level or _no_fit(len(places))
-    sloping = _fitted(views, places, altitude, std, map_scale, declared, leverage, SLOPE_STD)
+    places: ComplexArray  # (N,): easting + i northing, m
+    altitude: FloatArray  # (N,): m; NaN where not known
+    # (N, 2): standard deviations of one horizontal coordinate and of the altitude, NaN where not known; where residuals
+    # are larger, these count
+    std: FloatArray
+    leverage: FloatArray  # (N,): how far they have put themselves where the views are already, 0 to 1
+    map_scale: float = 1.0  # metres of the map per metre on the ground
+
+    def of(self, wanted: BoolArray) -> "Measured":
+        """Some of them."""
+        places, altitude = self.places[wanted], self.altitude[wanted]
+        return Measured(places, altitude, self.std[wanted], self.leverage[wanted], self.map_scale)
+
+    @property
+    def has_std(self) -> bool:
+        """Whether the accuracy of any is known."""
+        return bool(np.isfinite(self.std).any())
+
+    @property
+    def full_std(self) -> FloatArray:
+        """Standard deviations of all (N, 2); what is not known is what receivers have, or 1 m if none is known."""
+        return np.where(np.isfinite(self.std), self.std, POSITION_STD if self.has_std else 1.0)
+
+
+def fit_map(views: Views, measured: Measured) -> MapFit:
+    """Fit measured places; the ground is level unless they clearly show that it slopes."""
+    level = _fitted(views, measured, 0.0)
+    if level is None or not _has_altitudes(views, measured.altitude).any():
+        return level or _no_fit(len(measured.places))
+    sloping = _fitted(views, measured, SLOPE_STD)
     return sloping if sloping is not None and sloping.slope_squared > _SHOWN**2 else level
 
 
@@ -175,17 +188,9 @@ def _no_fit(count: int) -> MapFit:
     return MapFit(0.0, 0.0, np.full(count, complex(np.inf)), np.zeros(count, dtype=bool), None)
 
 
-def _fitted(
-    views: Views,
-    places: ComplexArray,
-    altitude: FloatArray,
-    std: FloatArray,
-    map_scale: float,
-    declared: bool,
-    leverage: FloatArray,
-    slope_std: float,
-) -> MapFit | None:
+def _fitted(views: Views, measured: Measured, slope_std: float) -> MapFit | None:
     """The fit of ground that slopes by so many radians."""
+    places, declared, std = measured.places, measured.has_std, measured.full_std
     start = fit_similarity(views.foot, places, POSITION_STD)
     scale, middle, center = start.scale, complex(views.foot.mean()), complex(places.mean())
     if not (abs(scale) > 0.0 and math.isfinite(abs(scale))):
@@ -195,7 +200,7 @@ def _fitted(
         2, 1.0 if declared else max(float(np.median(start.residuals)), _SMALLEST * views.pixel * abs(scale))
     )
     for _ in range(_ROUNDS):
-        system = _system(views, places - center, altitude, scale, map_scale, slope_std)
+        system = _system(views, places - center, measured.altitude, scale, measured.map_scale, slope_std)
         precision = np.repeat(weights / (std * noise) ** 2, (2, 1), axis=1)  # of east, north, altitude (N, 3)
         weighted = system.rows * precision[..., None]
         normal = np.einsum("nij,nik->jk", weighted, system.rows) + np.diag(system.prior)
@@ -212,7 +217,8 @@ def _fitted(
         weights = 1.0 / (1.0 + (away / width) ** 2) ** 2
         used = away <= width
         own = np.stack([hat[:, 0, 0] + hat[:, 1, 1], hat[:, 2, 2]], axis=1).sum(axis=0)
-        taken = (1.0 - leverage) / np.maximum(1.0 - (hat[:, 0, 0] + hat[:, 1, 1]) / 2.0, 1.0 - leverage)
+        free = 1.0 - measured.leverage
+        taken = free / np.maximum(1.0 - (hat[:, 0, 0] + hat[:, 1, 1]) / 2.0, free)
         squares = (weights * away**2 / np.stack([taken, np.ones_like(taken)], axis=1)).sum(axis=0)
         counts = (weights * (2.0, 1.0)).sum(axis=0)
         noise = np.maximum(np.sqrt(squares / np.maximum(counts - own, 0.25 * counts)), least)

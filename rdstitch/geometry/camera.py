@@ -10,13 +10,11 @@ coefficients.
 """
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Self
 
 import numpy as np
-from msgspec import Meta, Struct
-from msgspec import field as record_field
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
@@ -31,14 +29,8 @@ from rdstitch.geometry.division_model import (
     undistort,
 )
 from rdstitch.geometry.exif_orientation import SIDEWAYS, turned_size, turning_matrix
-from rdstitch.geometry.lens_model import LensKind, LensModel
+from rdstitch.geometry.lens_model import LensModel
 from rdstitch.geometry.planar_motion import turned_tilt
-from rdstitch.system.file_access import read_text
-from rdstitch.system.outputs import check_output, json_bytes, write_bytes_atomic
-from rdstitch.system.records import NonNegative, Pair, Size, Triple, convert, parse_json
-
-FILE_VERSION = 2
-"""Of camera files; version 1 had λ and μ only, as ``lambda`` and ``lambda2``."""
 
 LENS_PARAMETERS = ("distortion", "distortion2", "distortion3", "center_x", "center_y")
 """The parameters of a lens: λ, μ, ν, and the distortion centre, in the half-diagonal frame."""
@@ -167,7 +159,7 @@ class Camera:
             if self.image_circle is not None and not self.image_circle > 0.0:
                 raise ImpossibleCameraError(f"an image circle has a radius above 0 pixels, not {self.image_circle:g}")
             corner = self._corner_radius
-            if not (math.isfinite(corner * corner) and not folds(corner, self.coefficients)):
+            if not (math.isfinite(corner * corner) and not folds(corner, self.distortion, self.higher)):
                 raise ImpossibleCameraError(f"distortion {named} folds the image")
             if horizon_radius(self.distortion, self.higher) < _NEAREST_HORIZON:
                 raise ImpossibleCameraError(f"distortion {named} leaves next to nothing of the image before the camera")
@@ -221,7 +213,7 @@ class Camera:
     @property
     def sees_beyond_horizon(self) -> bool:
         """Whether a part of the image shows what is at 90 degrees to the axis and more."""
-        return not is_one_to_one(self._corner_radius, self.coefficients)
+        return not is_one_to_one(self._corner_radius, self.distortion, self.higher)
 
     @property
     def _corner_radius(self) -> float:
@@ -346,31 +338,6 @@ class Camera:
         turned = replace(self, image_size=size, center=(x, y), lens_covariance=covariance, tilt=tilt, tilt_std=std)
         return replace(turned, lens_model=None if self.lens_model is None else self.lens_model.turned(matrix, (x, y)))
 
-    def as_dict(self) -> dict[str, Any]:
-        """Everything known of the camera as plain values, the content of a camera file."""
-        (nearest, rms, largest), covariance = self.one_parameter_fit(), self.lens_covariance
-        return {
-            "format": "rdstitch camera",
-            "version": FILE_VERSION,
-            "image_size": list(self.image_size),
-            "center_px": list(self.center),
-            "image_circle_px": self.image_circle,
-            "lambda": nearest,
-            "lambda_std": None if self.distortion_std == math.inf else self.distortion_std,
-            "lambda_fit_rms_px": rms,
-            "lambda_fit_largest_px": largest,
-            "coefficients": list(self.coefficients),
-            "lens_model": None if self.lens_model is None else asdict(self.lens_model),
-            "lens_covariance": None if covariance is None else [list(row) for row in covariance],
-            "lambda_px": self.distortion_px,
-            "lambda_focal": self.distortion_focal,
-            "focal_px": self.focal,
-            "focal_std_px": self.focal_std,
-            "focal_source": self.focal_source,
-            "tilt_deg": None if self.tilt is None else [math.degrees(angle) for angle in self.tilt],
-            "tilt_std_deg": None if self.tilt_std is None else [math.degrees(angle) for angle in self.tilt_std],
-        }
-
     def save(self, path: str | Path) -> None:
         """Write a camera file of rdstitch, ``.json``; :func:`rdstitch.save_camera` writes the formats of others too.
 
@@ -379,8 +346,9 @@ class Camera:
         OutputError
             When the name ends otherwise, or the file cannot be written.
         """
-        check_output(path, overwrite=True, suffixes=(".json",))
-        write_bytes_atomic(path, json_bytes(self.as_dict()))
+        from rdstitch.camera_files.own_format import save_own
+
+        save_own(self, path)
 
     @staticmethod
     def load(path: str | Path) -> "Camera":
@@ -391,89 +359,6 @@ class Camera:
         InputError
             When the file cannot be read or is no camera file of rdstitch.
         """
-        return convert(parse_json(read_text(path), str(path)), CameraRecord, str(path)).camera()
+        from rdstitch.camera_files.own_format import load_own
 
-
-FocalSource = Literal["option", "file", "exif", "estimate", "guess"]
-_Row = tuple[float, float, float, float, float]
-
-
-class LensModelRecord(Struct, kw_only=True):
-    """A lens of another program's calibration, see :class:`rdstitch.geometry.lens_model.LensModel`."""
-
-    focal: Pair
-    center: Pair
-    coefficients: Annotated[list[float], Meta(max_length=8)]
-    kind: LensKind
-
-    def model(self) -> LensModel:
-        """Give it as the library has it."""
-        return LensModel(self.focal, self.center, tuple(self.coefficients), self.kind)
-
-
-class LensRecord(Struct, kw_only=True):
-    """What of a camera depends on the size of the image, and λ with it."""
-
-    center_px: Pair | None = None
-    image_circle_px: float | None = None
-    lambda_: float | None = record_field(name="lambda", default=None)
-    # Version 1 had λ and μ only.
-    lambda2: float = 0.0
-    coefficients: Triple | None = None
-    lens_model: LensModelRecord | None = None
-    focal_px: float | None = None
-    focal_source: FocalSource | None = None
-
-    def lens(self, size: tuple[int, int]) -> Camera:
-        """Give the lens on an image of a size; not how far it is determined."""
-        if self.center_px is None or (self.coefficients is None and self.lambda_ is None):
-            raise ValueError(f"{'center_px' if self.center_px is None else 'lambda'} is missing")
-        distortion, second, third = self.coefficients or (self.lambda_ or 0.0, self.lambda2, 0.0)
-        return Camera(
-            image_size=size,
-            distortion=distortion,
-            distortion2=second,
-            distortion3=third,
-            center=self.center_px,
-            focal=self.focal_px,
-            focal_source=self.focal_source,
-            image_circle=self.image_circle_px,
-            lens_model=None if self.lens_model is None else self.lens_model.model(),
-        )
-
-
-class CameraRecord(LensRecord, kw_only=True):
-    """A camera file of rdstitch."""
-
-    format: Literal["rdstitch camera"]
-    version: Annotated[int, Meta(ge=1, le=FILE_VERSION)]
-    image_size: Size
-    lambda_std: NonNegative | None = None
-    lambda_fit_rms_px: NonNegative = 0.0
-    lambda_fit_largest_px: NonNegative = 0.0
-    lens_covariance: tuple[_Row, _Row, _Row, _Row, _Row] | None = None
-    lambda_px: float | None = None
-    lambda_focal: float | None = None
-    focal_std_px: NonNegative | None = None
-    tilt_deg: Pair | None = None
-    tilt_std_deg: Pair | None = None
-
-    def __post_init__(self) -> None:
-        self.camera()
-
-    def camera(self) -> Camera:
-        """Give the camera that it describes."""
-        lens = self.lens(self.image_size)
-        return replace(
-            lens,
-            focal_source=None if lens.focal is None else "file",
-            distortion_std=self.lambda_std,
-            lens_covariance=self.lens_covariance,
-            focal_std=self.focal_std_px,
-            tilt=_radians(self.tilt_deg),
-            tilt_std=_radians(self.tilt_std_deg),
-        )
-
-
-def _radians(angles: Pair | None) -> Pair | None:
-    return None if angles is None else (math.radians(angles[0]), math.radians(angles[1]))
+        return load_own(path)

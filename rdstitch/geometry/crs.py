@@ -1,4 +1,4 @@
-"""Coordinate reference systems: UTM and UPS on WGS 84, and through rasterio (PROJ) every other projected one."""
+"""Coordinate reference systems: UTM and UPS on WGS 84, and through pyproj (PROJ) every other projected one."""
 
 import math
 import re
@@ -119,14 +119,8 @@ class Crs:
         """Easting and northing (N, 2), m, of places (N,) on WGS 84, degrees."""
         if self._zone:
             return utm(latitude, longitude, self._zone)
-        rasterio = _rasterio(f"EPSG:{self.epsg}")
-        east, north = rasterio.warp.transform(
-            rasterio.crs.CRS.from_epsg(WGS84),
-            rasterio.crs.CRS.from_epsg(self.epsg),
-            np.asarray(longitude, dtype=np.float64),
-            np.asarray(latitude, dtype=np.float64),
-        )
-        return np.stack([east, north], axis=-1)
+        longitude, latitude = (np.asarray(angles, dtype=np.float64) for angles in (longitude, latitude))
+        return _transformed(f"EPSG:{WGS84}", f"EPSG:{self.epsg}", longitude, latitude)
 
     def geographic(self, places: ArrayLike) -> FloatArray:
         """Latitude and longitude (N, 2) on WGS 84, degrees, of eastings and northings (N, 2), m."""
@@ -134,10 +128,7 @@ class Crs:
         if self._zone:
             with np.errstate(over="ignore", invalid="ignore"):  # of what is no place of the zone
                 return _from_utm(east, north, self._zone)
-        rasterio = _rasterio(f"EPSG:{self.epsg}")
-        systems = (rasterio.crs.CRS.from_epsg(code) for code in (self.epsg, WGS84))
-        longitude, latitude = rasterio.warp.transform(*systems, east, north)
-        return np.stack([latitude, longitude], axis=-1)
+        return _transformed(f"EPSG:{self.epsg}", f"EPSG:{WGS84}", east, north)[:, ::-1]
 
     def well_known_text(self) -> str:
         """The definition, as a ``.prj`` file has it."""
@@ -151,7 +142,8 @@ class Crs:
                 f'PARAMETER["Latitude_Of_Origin",{pole}],UNIT["Meter",1.0]]'
             )
         if not zone:
-            return str(_rasterio(f"EPSG:{self.epsg}").crs.CRS.from_epsg(self.epsg).to_wkt(version="WKT1_ESRI"))
+            system = f"EPSG:{self.epsg}"
+            return str(_pyproj(system).CRS.from_user_input(system).to_wkt("WKT1_ESRI"))
         return (
             f'PROJCS["WGS_1984_UTM_Zone_{zone}{"S" if south else "N"}",{_GEOGCS},'
             f'PROJECTION["Transverse_Mercator"],PARAMETER["False_Easting",{_FALSE_EASTING}],'
@@ -189,14 +181,12 @@ class NamedSystem:
             return points[:, ::-1]
         if self.epsg is not None and (crs := Crs.in_metres(self.epsg)) is not None:
             return crs.geographic(points)
-        rasterio = _rasterio(self.text)
-        with rasterio.Env():  # else GDAL prints
-            try:
-                system = rasterio.crs.CRS.from_user_input(self.text)
-                longitude, latitude = rasterio.warp.transform(system, rasterio.crs.CRS.from_epsg(WGS84), *points.T)
-            except (rasterio.errors.CRSError, rasterio.errors.RasterioError) as error:
-                raise ArgumentError(f"{self.text}: PROJ does not know this coordinate system ({error})") from error
-        return np.stack([latitude, longitude], axis=-1)
+        pyproj = _pyproj(self.text)
+        try:
+            return _transformed(self.text, f"EPSG:{WGS84}", *points.T)[:, ::-1]
+        except pyproj.exceptions.ProjError as error:
+            reason = str(error).partition(":")[0]
+            raise ArgumentError(f"{self.text}: PROJ does not know this coordinate system ({reason})") from error
 
 
 _PLAIN_TERMS = {"datum": ("WGS84",), "ellps": ("WGS84",), "units": ("m",), "no_defs": ("",), "type": ("crs",)}
@@ -275,26 +265,31 @@ def _central_meridian(zone: int) -> float:
     return 0.0 if zone == _POLAR else 6.0 * zone - 183.0
 
 
-def _rasterio(system: str) -> ModuleType:
-    """The module, with what is needed of it."""
+def _pyproj(system: str) -> ModuleType:
+    """The module, which is needed for a system."""
     try:
-        module = import_module("rasterio")
-        import_module("rasterio.warp")
+        return import_module("pyproj")
     except ImportError as error:
         raise ArgumentError(
-            f"{system} needs rasterio (pip install rasterio); UTM on WGS 84, EPSG:32601 to 32660 and "
-            "32701 to 32760, does not"
+            f"{system} needs pyproj (pip install pyproj); UTM on WGS 84, EPSG:32601 to 32660 and 32701 to 32760, "
+            "does not"
         ) from error
-    return module
+
+
+def _transformed(source: str, target: str, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Coordinates (N, 2) in one system of those (N,) in another, x or longitude first; inf where there are none."""
+    transformer = _pyproj(source if target == f"EPSG:{WGS84}" else target).Transformer.from_crs(
+        source, target, always_xy=True
+    )
+    return np.stack(transformer.transform(x, y), axis=-1)
 
 
 def _check_projected(epsg: int) -> None:
     """Refuse what is not a projected system in metres."""
-    rasterio = _rasterio(f"EPSG:{epsg}")
+    pyproj = _pyproj(f"EPSG:{epsg}")
     try:
-        with rasterio.Env():  # else GDAL prints
-            crs = rasterio.crs.CRS.from_epsg(epsg)
-    except rasterio.errors.CRSError as error:
+        crs = pyproj.CRS.from_epsg(epsg)
+    except pyproj.exceptions.CRSError as error:
         raise ArgumentError(f"EPSG:{epsg} is not known; give the code of a projected coordinate system") from error
-    if not crs.is_projected or crs.linear_units != "metre":
+    if not crs.is_projected or {axis.unit_name for axis in crs.axis_info} != {"metre"}:
         raise NotMetricError(f"EPSG:{epsg} is not a projected coordinate system in metres; choose one that is")

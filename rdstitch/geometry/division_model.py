@@ -258,12 +258,11 @@ def _guarded_radius(radius: FloatArray, distortion: float, higher: tuple[float, 
     return measured
 
 
-def is_one_to_one(radius: float, coefficients: Sequence[float]) -> bool:
-    """Check whether the model of λ, μ, … holds out to a radius."""
-    return valid_radius(float(coefficients[0]), tuple(float(value) for value in coefficients[1:])) > radius
+def is_one_to_one(radius: float, distortion: float, higher: Sequence[float] = ()) -> bool:
+    """Check whether the model holds out to a radius."""
+    return valid_radius(float(distortion), tuple(map(float, higher))) > radius
 
 
-def folds(radius: float, coefficients: Sequence[float]) -> bool:
+def folds(radius: float, distortion: float, higher: Sequence[float] = ()) -> bool:
     """Check whether the undistorted radius stops growing within a radius, among rays that are before the camera."""
-    distortion, higher = float(coefficients[0]), tuple(float(value) for value in coefficients[1:])
-    return _fold_radius(distortion, higher) <= min(radius, horizon_radius(distortion, higher))
+    return _fold_radius(distortion, tuple(higher)) <= min(radius, horizon_radius(distortion, tuple(higher)))

@@ -103,7 +103,7 @@ def transfer(
     return distort(project(lifted @ np.swapaxes(h, -2, -1)), lam, higher)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TransferJacobian:
     """N transferred points and their derivatives, all in normalized coordinates, the points last in memory."""
 
@@ -217,7 +217,7 @@ def whiten(whitening: FloatArray, values: FloatArray) -> FloatArray:
     return result
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class RadialHomography:
     """The relation of two images of a plane: homography, λ, and how far both can be trusted.
 

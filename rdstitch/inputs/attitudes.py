@@ -72,7 +72,7 @@ def _of_table(source: Source, file: str | Path) -> Source:
     return replace(source, attitude=tilts[len(DELAYS) // 2], attitude_by_delay=np.array(tilts))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _AttitudeTable:
     """Attitudes (ψ, θ), radians, by the names of images, or by time as an IMU measures them at its own rate."""
 

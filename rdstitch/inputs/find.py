@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from itertools import count
 from pathlib import Path
@@ -31,7 +31,7 @@ from rdstitch.system.file_access import (
 from rdstitch.system.outputs import TemporaryFolder
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
-IMAGE_SUFFIXES = frozenset(
+READABLE_SUFFIXES = frozenset(
     [".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".tga", ".jp2", ".ppm", ".pgm", ".pnm", ".gif"]
 )
 """What counts as an image in a folder; a file that is named is tried whatever it is called."""
@@ -84,11 +84,15 @@ def found_images(
         yield find_images(arguments, exclude=exclude, frames_folder=frames_folder, every=every, topic=topic)
 
 
+def _no_frames() -> Path:
+    raise InputError("videos and ROS bags are not accepted here; use 'rdstitch mosaic' or extract their frames")
+
+
 def find_images(
     arguments: Iterable[Named],
     *,
     exclude: Iterable[str | Path] = (),
-    frames_folder: Callable[[], Path] | None = None,
+    frames_folder: Callable[[], Path] = _no_frames,
     every: int | None = None,
     topic: str | None = None,
 ) -> FoundImages:
@@ -102,30 +106,31 @@ def find_images(
     that of the images in bags; without one, the only one.
     """
     unwanted = {_entry(Path(path)) for path in exclude}
+    named = _expanded(arguments)
+    notes, stills = list(named.notes), [item for item in named.items if isinstance(item, _Image)]
     frames: list[Frame] = []
     outputs: list[Path] = []
-    notes: list[Message] = []
-    containers: list[Path] = []
-    found = list(_expand(arguments, frames_folder, notes, containers))
-    stills = [(item, named) for item, named in found if not isinstance(item, _Clip)]
-    if every is None and stills:
-        notes += [item.among(len(stills)) for item, _ in found if isinstance(item, _Clip)]
-        found = list(stills)
-    for frame, named in (
-        (frame, named)
-        for item, named in found
-        for frame in ([item] if isinstance(item, Frame) else item.extract(every, topic, notes))
-    ):
-        is_output = frame.image is None and not is_url(frame.path) and is_rdstitch_output(frame.path)
-        if _entry(frame.path) in unwanted and is_output:
+    for item in named.items:
+        if isinstance(item, _Image):
+            images = [item]
+        elif every is None and stills:
+            notes.append(item.unused_among(len(stills)))
             continue
-        if is_output and not named:
-            outputs.append(frame.path)
         else:
-            frames.append(frame)
+            extracted, said = item.extract(frames_folder(), every, topic)
+            images, notes = [_Image(frame) for frame in extracted], [*notes, *said]
+        for image in images:
+            path = image.frame.path
+            is_output = image.frame.image is None and not is_url(path) and is_rdstitch_output(path)
+            if is_output and _entry(path) in unwanted:
+                continue
+            if is_output and not image.named:
+                outputs.append(path)
+            else:
+                frames.append(image.frame)
     if outputs and not frames:
         raise InputError(f"{outputs[0].parent}: there are no images but those that rdstitch wrote")
-    return FoundImages(_labelled(frames), outputs, tuple(containers), tuple(notes))
+    return FoundImages(_labelled(frames), outputs, tuple(named.containers), tuple(notes))
 
 
 def _labelled(frames: Sequence[Frame]) -> list[Frame]:
@@ -157,51 +162,12 @@ def natural_key(path: Path) -> list[tuple[int, str | int]]:
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", str(path)) if part]
 
 
-def _expand(
-    arguments: Iterable[Named],
-    frames_folder: Callable[[], Path] | None,
-    notes: list[Message],
-    containers: list[Path],
-    lists: tuple[Path, ...] = (),
-) -> "Iterator[tuple[Frame | _Clip, bool]]":
-    """Every frame or video, and whether it was named one by one; ``notes`` and ``containers`` are added.
+@dataclass(frozen=True)
+class _Image:
+    """An image among the arguments."""
 
-    ``lists`` are those that the arguments come from.
-    """
-    for argument in arguments:
-        if isinstance(argument, Frame):
-            yield argument, True
-            continue
-        path, text = Path(argument), str(argument)
-        if is_url(path):
-            yield from _at_url(text)
-        elif not _exists(path):
-            if text.startswith("@"):
-                file = Path(text[1:])
-                if file in lists:
-                    raise InputError(f"{file}: the list of images names itself")
-                containers.append(file)
-                # Another program may write the list while we read it: @<(find ...) in a shell.
-                names = names_in(read_text(file, regular=False))
-                yield from _expand(names, frames_folder, notes, containers, (*lists, file))
-            elif glob.has_magic(text):
-                yield from ((Frame(found), False) for found in _matching(text))
-            else:
-                yield Frame(path), True
-        elif is_bag(path):
-            if frames_folder is None:
-                raise InputError(f"{path}: a ROS bag is not accepted here; use 'rdstitch mosaic'")
-            containers += path.iterdir() if path.is_dir() else [path]
-            yield _Clip(path, frames_folder), True
-        elif path.is_dir():
-            yield from ((Frame(found), False) for found in _in_folder(path, notes))
-        elif path.suffix.lower() in VIDEO_SUFFIXES:
-            if frames_folder is None:
-                raise InputError(f"{path}: a video is not accepted here; use 'rdstitch mosaic' or extract its frames")
-            containers.append(path)
-            yield _Clip(path, frames_folder), True
-        else:
-            yield Frame(path), True
+    frame: Frame
+    named: bool = True  # one by one, not by its folder or a pattern
 
 
 @dataclass(frozen=True)
@@ -209,23 +175,21 @@ class _Clip:
     """A video or bag among the arguments, whose frames are not extracted yet."""
 
     path: Path
-    folder: Callable[[], Path]
 
-    def extract(self, every: int | None, topic: str | None, notes: list[Message]) -> list[Frame]:
-        """Write the frames that are wanted; what was passed over is added to the notes."""
+    def extract(self, folder: Path, every: int | None, topic: str | None) -> tuple[list[Frame], list[Message]]:
+        """Write the frames that are wanted to a folder; and what was passed over."""
         # Of its own: another one may have the same name, in another folder.
         place = _entry(self.path)
-        folder = self.folder() / hashlib.sha256(os.fsencode(place)).hexdigest()[:8] / place.parent.name
+        folder = folder / hashlib.sha256(os.fsencode(place)).hexdigest()[:8] / place.parent.name
         folder.mkdir(parents=True, exist_ok=True)
         if is_bag(self.path):
             images, wanted = extract_images(self.path, folder, every, topic)
-            notes += wanted.messages(self.path)
-            return images
+            return images, wanted.messages(self.path)
         wanted = wanted_frames(every, partial(grey_frames, self.path))
-        notes += wanted.messages(self.path)
-        return [Frame(*frame) for frame in extract_frames(self.path, folder, wanted.__contains__)]
+        written = extract_frames(self.path, folder, wanted.__contains__)
+        return [Frame(*frame) for frame in written], wanted.messages(self.path)
 
-    def among(self, images: int) -> Message:
+    def unused_among(self, images: int) -> Message:
         """Why it is not used beside images."""
         remedy = "give it alone, or --every N to use every N-th of its frames too"
         if images < 2:
@@ -233,23 +197,66 @@ class _Clip:
         return Message(f"is a video among images, and was not used; {remedy}", (str(self.path),))
 
 
-def _at_url(url: str) -> Iterator[tuple[Frame, bool]]:
+@dataclass(frozen=True)
+class _Named:
+    """What arguments stand for, as :class:`FoundImages` has it, before videos are looked into."""
+
+    items: Sequence[_Image | _Clip]
+    containers: Sequence[Path] = ()
+    notes: Sequence[Message] = ()
+
+    @classmethod
+    def several(cls, frames: Iterable[Path], notes: Sequence[Message] = ()) -> "_Named":
+        """Images that were not named one by one."""
+        return cls([_Image(Frame(path), named=False) for path in frames], (), notes)
+
+
+def _expanded(arguments: Iterable[Named], lists: tuple[Path, ...] = ()) -> _Named:
+    """All that arguments stand for; ``lists`` are those that they come from."""
+    parts = [_named_by(argument, lists) for argument in arguments]
+    return _Named(*([each for part in parts for each in getattr(part, f.name)] for f in fields(_Named)))
+
+
+def _named_by(argument: Named, lists: tuple[Path, ...]) -> _Named:
+    if isinstance(argument, Frame):
+        return _Named([_Image(argument)])
+    path, text = Path(argument), str(argument)
+    if is_url(path):
+        return _at_url(text)
+    if not _exists(path):
+        if text.startswith("@"):
+            file = Path(text[1:])
+            if file in lists:
+                raise InputError(f"{file}: the list of images names itself")
+            # Another program may write the list while we read it: @<(find ...) in a shell.
+            inner = _expanded(names_in(read_text(file, regular=False)), (*lists, file))
+            return replace(inner, containers=[file, *inner.containers])
+        return _Named.several(_matching(text)) if glob.has_magic(text) else _Named([_Image(Frame(path))])
+    if is_bag(path):
+        return _Named([_Clip(path)], [*path.iterdir()] if path.is_dir() else [path])
+    if path.is_dir():
+        return _Named.several(*_in_folder(path))
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return _Named([_Clip(path)], [path])
+    return _Named([_Image(Frame(path))])
+
+
+def _at_url(url: str) -> _Named:
     """The image, or the images of the folder or pattern, that a URL names."""
     path = Path(url)
     pattern = glob.has_magic(path.name)
-    if not pattern and path.suffix.lower() in IMAGE_SUFFIXES:
-        yield Frame(path), True
-        return
+    if not pattern and path.suffix.lower() in READABLE_SUFFIXES:
+        return _Named([_Image(Frame(path))])
     if path.suffix.lower() in VIDEO_SUFFIXES:
         raise InputError(f"{path}: only images are read from other machines; download the video first")
     try:
         found = sorted(map(Path, remote_names(url)), key=natural_key)
     except OSError as error:
         raise InputError(f"{path}: {error}") from error
-    found = [name for name in found if name.suffix.lower() in IMAGE_SUFFIXES | HEIF_SUFFIXES]
+    found = [name for name in found if name.suffix.lower() in READABLE_SUFFIXES | HEIF_SUFFIXES]
     if not found:
         raise InputError(f"{path}: there are no images at this address")
-    yield from ((Frame(name), False) for name in found)
+    return _Named.several(found)
 
 
 def _exists(path: Path) -> bool:
@@ -272,7 +279,7 @@ def images_in(folder: Path) -> list[Path]:
         entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
-    images = [path for path in entries if path.suffix.lower() in IMAGE_SUFFIXES]
+    images = [path for path in entries if path.suffix.lower() in READABLE_SUFFIXES]
     # Many cameras write a raw file beside each image, and phones that export JPEG leave the HEIC there.
     stems = {path.stem for path in images}
     images += [
@@ -281,16 +288,14 @@ def images_in(folder: Path) -> list[Path]:
     return sorted(images, key=natural_key)
 
 
-def _in_folder(folder: Path, notes: list[Message]) -> list[Path]:
-    """The same; a folder without images is an error, and what else is in it a note."""
+def _in_folder(folder: Path) -> tuple[list[Path], list[Message]]:
+    """The images of a folder, of which there must be one at least; and a note on what else is in it."""
     images = images_in(folder)
     others = sorted({path for path in folder.iterdir() if not path.name.startswith(".")} - set(images), key=natural_key)
     if not images:
         raise InputError(f"{folder}: there are no images in this folder{_elsewhere(others)}")
-    if others:
-        text = f"{folder}: not taken for images: {shortened([path.name for path in others])}"
-        notes.append(Message(text, severity="detail"))
-    return images
+    text = f"{folder}: not taken for images: {shortened([path.name for path in others])}"
+    return images, [Message(text, severity="detail")] if others else []
 
 
 def _has_images(folder: Path) -> bool:

@@ -17,8 +17,6 @@ from rdstitch.io.metadata import Metadata, metadata_of
 from rdstitch.io.read import DecodedImage, as_image, from_pillow
 from rdstitch.system.file_access import canonical_name
 
-"""Order of the colour channels of arrays that come in and go out: OpenCV's, or everybody else's."""
-
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -70,7 +68,7 @@ def as_inputs(images: Images, channel_order: ChannelOrder = "bgr") -> list[Named
     return [_as_input(item, index, channel_order) for index, item in enumerate(listed)]
 
 
-def in_order(samples: NDArray[Any], channel_order: ChannelOrder) -> NDArray[Any]:
+def to_channel_order(samples: NDArray[Any], channel_order: ChannelOrder) -> NDArray[Any]:
     """Samples (H, W), (H, W, C) in RGB order in the order wanted, or the other way round."""
     if channel_order == "rgb" or samples.ndim == 2 or samples.shape[2] != 3:
         return samples
@@ -112,6 +110,8 @@ def array_as_image(name: str, array: NDArray[Any], channel_order: ChannelOrder) 
     samples = array if alpha is None else array[..., :-1]
     if array.ndim == 3 and channels <= 2:
         samples = samples[..., 0]
-    samples = in_order(np.array(samples, dtype=np.float32 if array.dtype.kind == "f" else array.dtype), channel_order)
+    samples = to_channel_order(
+        np.array(samples, dtype=np.float32 if array.dtype.kind == "f" else array.dtype), channel_order
+    )
     metadata = Metadata((array.shape[1], array.shape[0]), bit_depth=8 * array.dtype.itemsize, channels=channels)
     return as_image(Path(name), samples, None if alpha is None else alpha.copy(), metadata)

@@ -30,7 +30,7 @@ _WORN = 0.5  # share of the corners, or of the side that they have come, after w
 _GRID = 16  # points a side by which areas are measured
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FramePlaces:
     """Where the frames of a video lie."""
 

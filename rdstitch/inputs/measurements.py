@@ -6,8 +6,8 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.crs import Crs
+from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.source import Source
-from rdstitch.io.metadata import GpsPosition
 
 
 def positions_of(sources: Sequence[Source]) -> FloatArray:

@@ -51,7 +51,7 @@ def motion_between(start: BodyPose, end: BodyPose) -> BodyMotion:
     return BodyMotion(moved, turn, *known)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Odometry:
     """Poses of a body by time."""
 

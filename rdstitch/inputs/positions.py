@@ -22,10 +22,10 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.crs import WGS84, Crs, NamedSystem
+from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import Row, by_image, csv_rows, json_rows, listed_rows
 from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points
-from rdstitch.io.metadata import GpsPosition, GroundControl
 from rdstitch.system.file_access import canonical_text, read_text
 
 _COLUMNS = {

@@ -6,7 +6,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.inputs.find import IMAGE_SUFFIXES
+from rdstitch.inputs.find import READABLE_SUFFIXES
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
 from rdstitch.io.mask import mask_frame
@@ -75,7 +75,7 @@ def mask_of(source: Source, folder: str | Path) -> Path | None:
 def _by_stem(folder: Path) -> Mapping[str, Path]:
     """The masks in a folder, by their names before the suffix."""
     try:
-        files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+        files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in READABLE_SUFFIXES)
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
     masks: dict[str, Path] = {}

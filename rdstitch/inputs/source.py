@@ -14,6 +14,7 @@ from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
 from rdstitch.features.prepared_image import View, halving
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse, turned_size
+from rdstitch.geometry.places import GroundControl
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.frame import Frame, Named
@@ -21,7 +22,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.io.flat_field import FlatField
 from rdstitch.io.lens_correction import corrected
 from rdstitch.io.mask import read_mask
-from rdstitch.io.metadata import GroundControl, Metadata, read_metadata
+from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import DecodedImage, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
 from rdstitch.options.feature_options import WORK_MEGAPIXELS

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.errors import InputError
+from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import timestamps_of
-from rdstitch.io.metadata import GpsPosition
 from rdstitch.system.records import parse_xml
 
 _NUMBER = r"(?<![\d.])-?\d+(?:\.\d+)?(?![\d.])"

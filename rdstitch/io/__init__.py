@@ -1,8 +1,9 @@
 """Files in and out: images with their metadata, sidecars, and nothing half-written."""
 
+from rdstitch.geometry.places import GpsPosition
 from rdstitch.io.attitude import Attitude
-from rdstitch.io.encoding import Layout
-from rdstitch.io.metadata import GpsPosition, Metadata, read_metadata
+from rdstitch.io.encoding import ImageSpec
+from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import DecodedImage, read_image
 from rdstitch.io.write import check_format, check_size, write_image, write_strips
 
@@ -10,7 +11,7 @@ __all__ = [
     "Attitude",
     "DecodedImage",
     "GpsPosition",
-    "Layout",
+    "ImageSpec",
     "Metadata",
     "check_format",
     "check_size",

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.arrays import FloatArray
+from rdstitch.io.samples import ROWS_AT_A_TIME
 
 if TYPE_CHECKING:
     from PIL import ImageCms
 
-_ROWS_AT_A_TIME = 128
 _WHITE = np.array([0.9642, 1.0, 0.8249])  # of D50, to which CIELAB in TIFF and in profiles refers
 # From XYZ of D50, adapted to D65 after Bradford, to linear sRGB (IEC 61966-2-1).
 _XYZ_TO_RGB = np.array(
@@ -31,8 +31,8 @@ def srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> NDArray[Any]:
     In TIFF's own CIELAB a* and b* are signed; else they are offset by half of their range, as profiles have them.
     """
     rgb = np.empty_like(lab)
-    for top in range(0, len(lab), _ROWS_AT_A_TIME):
-        rows = slice(top, top + _ROWS_AT_A_TIME)
+    for top in range(0, len(lab), ROWS_AT_A_TIME):
+        rows = slice(top, top + ROWS_AT_A_TIME)
         rgb[rows] = _srgb_of_lab(lab[rows], signed=signed)
     return rgb
 

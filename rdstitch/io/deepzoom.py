@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.io.encoding import Layout, Strip, as_eight_bit, jpeg_pieces, pyramid, pyramid_sizes, with_alpha
+from rdstitch.io.encoding import ImageSpec, Strip, as_eight_bit, jpeg_pieces, pyramid, pyramid_sizes, with_alpha
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image
 from rdstitch.system.outputs import tiles_folder
@@ -29,15 +29,15 @@ _DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
-def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Iterable[Strip]) -> None:
+def write_deep_zoom(description: Path, folder: Path, spec: ImageSpec, strips: Iterable[Strip]) -> None:
     """Write the description and the tiles of an image; transparency becomes the background, 16 bits become 8."""
-    width, height = layout.size
+    width, height = spec.size
     # The profile belongs to the pixels, and so into every tile; EXIF does not.
-    kept = layout.metadata.icc_profile if len(layout.metadata.icc_profile) <= MAX_TILE_PROFILE else b""
-    profile = Metadata(layout.size, icc_profile=kept)
-    eight = replace(layout, dtype=np.dtype(np.uint8), transparent=True, metadata=profile)
+    kept = spec.metadata.icc_profile if len(spec.metadata.icc_profile) <= MAX_TILE_PROFILE else b""
+    profile = Metadata(spec.size, icc_profile=kept)
+    eight = replace(spec, dtype=np.dtype(np.uint8), transparent=True, metadata=profile)
     joined = (with_alpha(as_eight_bit(samples), alpha) for samples, alpha in strips)
-    sizes = pyramid_sizes(layout.size, 1)
+    sizes = pyramid_sizes(spec.size, 1)
     for number, (size, level) in enumerate(pyramid(sizes, joined, folder.parent, transparent=True), start=1):
         (place := folder / str(len(sizes) - number)).mkdir()
         for row, rows in enumerate(_tile_rows(level, size[1])):

@@ -47,7 +47,7 @@ _PNG_LEVEL = 1
 
 
 @dataclass(frozen=True)
-class Layout:
+class ImageSpec:
     """The form of an image that comes in strips."""
 
     size: tuple[int, int]  # width and height, pixels
@@ -72,13 +72,13 @@ class Layout:
         return self.channels + self.transparent
 
 
-def check_strips(layout: Layout, strips: Iterable[Strip]) -> Iterator[Strip]:
-    """The strips, when they are what the layout says."""
-    width, height = layout.size
+def check_strips(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[Strip]:
+    """The strips, when they are what the spec says."""
+    width, height = spec.size
     rows = 0
     for samples, alpha in strips:
-        if samples.shape[1:] != (width, layout.channels) or samples.dtype != layout.dtype:
-            raise ArgumentError(f"a strip of {samples.dtype} {samples.shape} does not fit into {layout.size}")
+        if samples.shape[1:] != (width, spec.channels) or samples.dtype != spec.dtype:
+            raise ArgumentError(f"a strip of {samples.dtype} {samples.shape} does not fit into {spec.size}")
         if alpha is not None and (alpha.shape != samples.shape[:2] or alpha.dtype != np.uint8):
             raise ArgumentError(f"alpha must be uint8 of shape {samples.shape[:2]}, not {alpha.dtype} {alpha.shape}")
         if rows % STRIP_ROWS:
@@ -156,13 +156,13 @@ def _reread(spill: IO[bytes], size: tuple[int, int], kind: NDArray[Any]) -> Iter
     spill.close()
 
 
-def jpeg_pieces(layout: Layout, strips: Iterable[Strip]) -> Iterator[bytes | memoryview]:
+def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes | memoryview]:
     """The pieces of a JPEG file, one strip in memory at a time; transparency becomes the background."""
     first = True
     for samples, alpha in strips:
-        head, scan = _header_and_scan(_jpeg(layout, samples, alpha))
+        head, scan = _header_and_scan(_jpeg(spec, samples, alpha))
         if first:
-            yield from _embedded(_with_height(head, layout.size[1]), layout.metadata)
+            yield from _embedded(_with_height(head, spec.size[1]), spec.metadata)
         else:
             yield _RESTART_7
         yield scan
@@ -170,25 +170,25 @@ def jpeg_pieces(layout: Layout, strips: Iterable[Strip]) -> Iterator[bytes | mem
     yield _END_OF_IMAGE
 
 
-def _jpeg(layout: Layout, samples: NDArray[np.generic], alpha: NDArray[np.uint8] | None) -> bytes:
+def _jpeg(spec: ImageSpec, samples: NDArray[np.generic], alpha: NDArray[np.uint8] | None) -> bytes:
     """One strip as a JPEG file of its own, with a restart marker after each row of blocks."""
     eight = as_eight_bit(samples)
-    if layout.channels == 1:
+    if spec.channels == 1:
         block, image = _BLOCK_GREY, eight[..., 0].copy()
     else:
         block, image = _BLOCK_COLOUR, np.asarray(cv2.cvtColor(eight, cv2.COLOR_RGB2BGR))
     if alpha is not None and not alpha.all():
         image = np.asarray(cv2.bitwise_and(image, image, mask=alpha), dtype=np.uint8)
-        if layout.background:
-            image[alpha == 0] = layout.background
+        if spec.background:
+            image[alpha == 0] = spec.background
     options = [
-        *(cv2.IMWRITE_JPEG_QUALITY, layout.quality),
-        *(cv2.IMWRITE_JPEG_RST_INTERVAL, -(-layout.size[0] // block)),
+        *(cv2.IMWRITE_JPEG_QUALITY, spec.quality),
+        *(cv2.IMWRITE_JPEG_RST_INTERVAL, -(-spec.size[0] // block)),
         *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420),
     ]
     done, data = cv2.imencode(".jpg", image, options)
     if not done:
-        raise LimitError(f"{layout.size[0]} x {layout.size[1]} pixels cannot be encoded as JPEG; write a .tif")
+        raise LimitError(f"{spec.size[0]} x {spec.size[1]} pixels cannot be encoded as JPEG; write a .tif")
     return np.asarray(data, dtype=np.uint8).tobytes()
 
 
@@ -210,15 +210,15 @@ def _with_height(head: bytes, height: int) -> bytes:
     return head[: position + 5] + struct.pack(">H", height) + head[position + 7 :]
 
 
-def png_pieces(layout: Layout, strips: Iterable[Strip]) -> Iterator[bytes]:
+def png_pieces(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes]:
     """The pieces of a PNG file, one strip in memory at a time."""
-    kind = _COLOUR_TYPES[layout.channels, layout.transparent]
+    kind = _COLOUR_TYPES[spec.channels, spec.transparent]
     yield PNG_MAGIC
-    yield png_chunk(b"IHDR", struct.pack(">IIBBBBB", *layout.size, 8 * layout.dtype.itemsize, kind, 0, 0, 0))
-    yield from _metadata_chunks(layout.metadata)
-    packer, pixel = zlib.compressobj(_PNG_LEVEL), layout.samples_per_pixel * layout.dtype.itemsize
+    yield png_chunk(b"IHDR", struct.pack(">IIBBBBB", *spec.size, 8 * spec.dtype.itemsize, kind, 0, 0, 0))
+    yield from _metadata_chunks(spec.metadata)
+    packer, pixel = zlib.compressobj(_PNG_LEVEL), spec.samples_per_pixel * spec.dtype.itemsize
     for samples, alpha in strips:
-        shown = with_alpha(samples, alpha) if layout.transparent else samples
+        shown = with_alpha(samples, alpha) if spec.transparent else samples
         ordered = np.ascontiguousarray(shown.astype(shown.dtype.newbyteorder(">"), copy=False))
         rows = ordered.view(np.uint8).reshape(len(shown), -1)
         filtered = np.empty((len(rows), 1 + rows.shape[1]), dtype=np.uint8)

@@ -9,8 +9,7 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import inverse, turned, turned_size
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
-
-_OPAQUE = 255
+from rdstitch.io.samples import OPAQUE
 
 
 def mask_frame(
@@ -45,11 +44,11 @@ def read_mask(path: str | Path, size: tuple[int, int], frame: int | None = None)
     brightest = light.max()
     counts = light >= (brightest / 2 if brightest > 0 else 1)
     if mask.alpha is not None:
-        counts &= mask.alpha >= (_OPAQUE + 1) // 2
+        counts &= mask.alpha >= (OPAQUE + 1) // 2
     if frame is not None:
         counts = turned(turned(counts, inverse(mask.metadata.orientation)), frame)
     height, width = counts.shape
     rows = (np.arange(size[1]) + 0.5) * (height / size[1])
     columns = (np.arange(size[0]) + 0.5) * (width / size[0])
     resized = counts[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
-    return np.where(resized, np.uint8(_OPAQUE), np.uint8(0))
+    return np.where(resized, np.uint8(OPAQUE), np.uint8(0))

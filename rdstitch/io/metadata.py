@@ -8,15 +8,16 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Self
-from xml.etree import ElementTree
 
 import numpy as np
 from PIL import ExifTags, Image
 
 from rdstitch.geometry.camera import is_focal_length
 from rdstitch.geometry.exif_orientation import turned_size, turning_matrix
+from rdstitch.geometry.places import GpsPosition
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
 from rdstitch.io.colour import ink_transform
+from rdstitch.io.ome import read_ome
 from rdstitch.io.opening import (
     TIFF_MAGIC,
     check_decoded_size,
@@ -52,43 +53,12 @@ _OF_WHOM = {
     int(getattr(ExifTags.Base, name))
     for name in ("Make", "Model", "Artist", "Copyright", "DateTime", "Software", "ImageDescription", "Orientation")
 }
-# What units of length count.
-MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _XMP, _PROFILE, _RESOLUTION, _RESOLUTION_UNIT = 700, 34675, (282, 283), 296
 _INCHES = {2: 1.0, 3: 2.54}  # what pixels per unit are multiplied by
 # How far, as a logarithm, twice the distance of a calibrated middle from the border may be from the width; and how many
 # times as long one tag's focal length may be as another's: crops for video, and what "35 mm equivalent" is taken for.
 _BESIDE, _CONTRADICTION = 0.05, 1.25
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
-
-
-@dataclass(frozen=True)
-class GpsPosition:
-    """Where the camera was: WGS 84 latitude and longitude, degrees; altitude, m above sea, or None.
-
-    ``std``: standard deviations of one horizontal coordinate and of the altitude, m, where the receiver says them.
-    """
-
-    latitude: float
-    longitude: float
-    altitude: float | None = None
-    std: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True)
-class GroundControl:
-    """A point whose place is known: its name, the place, and the pixel of an image that shows it.
-
-    ``epsg`` is the code of the coordinate system that the place was given in, ``std`` the standard deviation of one of
-    its coordinates, m, where known; a ``check`` point is compared with the map, and takes no part in it.
-    """
-
-    name: str
-    place: GpsPosition
-    epsg: int
-    pixel: tuple[float, float]
-    std: float | None = None
-    check: bool = False
 
 
 @dataclass(frozen=True)
@@ -391,40 +361,3 @@ def _who_and_when(exif: Image.Exif) -> None:
         del photo[tag]
     for tag in set(exif) - _OF_WHOM - {int(ExifTags.IFD.Exif)}:
         del exif[tag]
-
-
-@dataclass(frozen=True)
-class OmeImage:
-    """What OME-XML says of the only or first image of a file."""
-
-    channels: int  # pages that are channels of one plane; 1 where there are several planes or times
-    pixel_size: float | None  # micrometres
-
-
-def read_ome(text: str | None) -> OmeImage | None:
-    """Give what the OME-XML of a file says; None where it is none."""
-    root = ome_tree(text)
-    images = [] if root is None else list(root.iter("Pixels"))
-    if not images:
-        return None
-    counts = [int(images[0].get(f"Size{axis}", 1)) for axis in "CZT"]
-    samples = [int(channel.get("SamplesPerPixel", 1)) for channel in images[0].iter("Channel")]
-    apart = len(images) == 1 and counts[1:] == [1, 1] and all(count == 1 for count in samples)
-    return OmeImage(counts[0] if apart else 1, ome_pixel_size(images[0]))
-
-
-def ome_tree(text: str | None) -> ElementTree.Element | None:
-    """The tree of OME-XML without name spaces; None where it is none."""
-    try:
-        root = ElementTree.fromstring(text or "")
-    except ElementTree.ParseError:
-        return None
-    for element in root.iter():
-        element.tag = element.tag.rpartition("}")[2]
-    return root
-
-
-def ome_pixel_size(pixels: ElementTree.Element) -> float | None:
-    """Micrometres; None where it is not said, or in no unit of length."""
-    size, scale = pixels.get("PhysicalSizeX"), MICROMETRES.get(pixels.get("PhysicalSizeXUnit", "µm"))
-    return float(size) * scale if size and scale else None

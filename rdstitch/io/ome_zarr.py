@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rdstitch.errors import OutputError
-from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, pyramid, pyramid_sizes
+from rdstitch.io.encoding import STRIP_ROWS, ImageSpec, Strip, pyramid, pyramid_sizes
 
 _SMALLEST = 512  # pixels of the longer side of the last level, at most
 _COLOURS = ("FFFFFF", "FF00FF", "00FF00", "00FFFF", "FFFF00", "FF8000")
@@ -25,31 +25,31 @@ def check_zarr(path: Path) -> None:
         raise OutputError(f"{path}: writing OME-Zarr needs zarr: pip install zarr") from None
 
 
-def write_ome_zarr(folder: Path, layout: Layout, strips: Iterable[Strip]) -> None:
+def write_ome_zarr(folder: Path, spec: ImageSpec, strips: Iterable[Strip]) -> None:
     """Write an image into a folder; what no image covers is 0."""
     import zarr
 
-    sizes = pyramid_sizes(layout.size, _SMALLEST)
+    sizes = pyramid_sizes(spec.size, _SMALLEST)
     group = zarr.open_group(folder, mode="w", zarr_format=2)
     shown = (pixels if alpha is None else np.where(alpha[..., None] > 0, pixels, 0) for pixels, alpha in strips)
     for number, ((width, height), passing) in enumerate(pyramid(sizes, shown, folder.parent, transparent=False)):
         level = group.create_array(
             str(number),
-            shape=(layout.channels, height, width),
+            shape=(spec.channels, height, width),
             chunks=(1, min(STRIP_ROWS, height), min(STRIP_ROWS, width)),
-            dtype=layout.dtype,
+            dtype=spec.dtype,
             chunk_key_encoding={"name": "v2", "separator": "/"},
         )
         top = 0
         for rows in passing:
             level[:, top : top + len(rows)] = np.moveaxis(rows, -1, 0)
             top += len(rows)
-    group.attrs.update(_attributes(layout, len(sizes)))
+    group.attrs.update(_attributes(spec, len(sizes)))
 
 
-def _attributes(layout: Layout, levels: int) -> dict[str, Any]:
+def _attributes(spec: ImageSpec, levels: int) -> dict[str, Any]:
     """What NGFF says of the axes, the size of a pixel and the channels."""
-    size = layout.metadata.pixel_size
+    size = spec.metadata.pixel_size
     unit = {} if size is None else {"unit": "micrometer"}
     axes = [{"name": "c", "type": "channel"}, *({"name": axis, "type": "space", **unit} for axis in "yx")]
     datasets = []
@@ -58,9 +58,9 @@ def _attributes(layout: Layout, levels: int) -> dict[str, Any]:
         steps = [{"type": "scale", "scale": [1.0, pixel, pixel]}]
         steps += [{"type": "translation", "translation": [0.0, shift, shift]}] if number else []
         datasets.append({"path": str(number), "coordinateTransformations": steps})
-    colours = _RGB if layout.channels == 3 and not layout.metadata.planes else _COLOURS
-    names = layout.metadata.channel_names or [str(k) for k in range(layout.channels)]
-    top = 1.0 if layout.dtype.kind == "f" else float(np.iinfo(layout.dtype).max)
+    colours = _RGB if spec.channels == 3 and not spec.metadata.planes else _COLOURS
+    names = spec.metadata.channel_names or [str(k) for k in range(spec.channels)]
+    top = 1.0 if spec.dtype.kind == "f" else float(np.iinfo(spec.dtype).max)
     window = {"min": 0.0, "max": top, "start": 0.0, "end": top}
     return {
         "multiscales": [{"version": "0.4", "name": "image", "axes": axes, "datasets": datasets, "type": "mean"}],
@@ -68,7 +68,7 @@ def _attributes(layout: Layout, levels: int) -> dict[str, Any]:
             "version": "0.4",
             "channels": [
                 {"label": name, "color": colours[k % len(colours)], "active": True, "window": window}
-                for k, name in zip(range(layout.channels), names, strict=False)
+                for k, name in zip(range(spec.channels), names, strict=False)
             ],
         },
     }

@@ -14,20 +14,20 @@ from PIL import Image
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turned
 from rdstitch.io.colour import without_inks
-from rdstitch.io.metadata import Metadata, is_grey_palette, metadata_of, read_metadata, read_ome
+from rdstitch.io.metadata import Metadata, is_grey_palette, metadata_of, read_metadata
+from rdstitch.io.ome import read_ome
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image, read_raw
 from rdstitch.io.read_tiff import as_opacity, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
+from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME
 from rdstitch.system.file_access import open_regular, read_beginning
 from rdstitch.system.late_imports import imagecodecs, tifffile
 
 _END_OF_IMAGE = b"\xff\xd9"
 _PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 _MIN_JPEG_SIDE = 8  # pixels a side; below, different reductions give images of the same size
-_OPAQUE = 255
 
 _MAX_DECODED_REDUCTION = 8  # of the JPEG decoder
-_ROWS_AT_A_TIME = 128
 _JPEG = ("JPEG", "MPO")
 _GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 
@@ -69,7 +69,7 @@ def _is_padding(complaint: str, data: bytes) -> bool:
 Pixels = NDArray[Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DecodedImage:
     """One image in memory."""
 
@@ -165,10 +165,10 @@ def _samples(image: Image.Image) -> Pixels:
     """The samples of an image, taken in pieces: Pillow's own conversion holds them three times."""
     image.load()
     width, height = image.size
-    first = np.asarray(image.crop((0, 0, width, min(_ROWS_AT_A_TIME, height))))
+    first = np.asarray(image.crop((0, 0, width, min(ROWS_AT_A_TIME, height))))
     samples = np.empty((height, *first.shape[1:]), dtype=first.dtype)
-    for top in range(0, height, _ROWS_AT_A_TIME):
-        bottom = min(top + _ROWS_AT_A_TIME, height)
+    for top in range(0, height, ROWS_AT_A_TIME):
+        bottom = min(top + ROWS_AT_A_TIME, height)
         samples[top:bottom] = np.asarray(image.crop((0, top, width, bottom)))
     return samples
 
@@ -210,9 +210,9 @@ def as_image(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metada
         valid = finite if samples.ndim == 2 else finite.all(axis=2)
         if not valid.all():
             samples = np.where(finite, samples, np.float32(0.0))
-            whole = np.full(valid.shape, _OPAQUE, np.uint8) if opaque is None else opaque
+            whole = np.full(valid.shape, OPAQUE, np.uint8) if opaque is None else opaque
             opaque = np.where(valid, whole, np.uint8(0))
-    if opaque is not None and bool((opaque == _OPAQUE).all()):
+    if opaque is not None and bool((opaque == OPAQUE).all()):
         opaque = None
     if opaque is not None:
         opaque = np.ascontiguousarray(turned(opaque, metadata.orientation))

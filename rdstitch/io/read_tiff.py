@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.io.colour import srgb_of_lab, without_inks
+from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME
 from rdstitch.system.late_imports import tifffile
 
 Pixels = NDArray[Any]
 
-_OPAQUE = 255
 _MASK, _MASK_WITHIN = 4, 40  # the kind of a page that masks the image, and how many pages are looked at for one
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _STENCIL, _INKS, _YCBCR = range(7)
 _LAB, _ICC_LAB, _LINEAR_RAW = 8, 9, 34892
@@ -30,7 +30,6 @@ _INDIRECT = (_PALETTE, _INKS)  # become 8-bit RGB, beside which their other band
 _ASSOCIATED, _UNASSOCIATED = 1, 2  # alpha; colours of the first are multiplied by it
 _JPEG = (6, 7, 33007, 34892)  # compressions whose decoders make RGB of YCbCr
 _PROFILE, _NODATA = 34675, 42113
-_ROWS_AT_A_TIME = 128
 
 
 def channel_count(page: "tifffile.TiffPage") -> int:
@@ -65,13 +64,13 @@ def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[Pix
         masks.append(as_opacity(alpha, full))
     if (empty := _lacks_data(page, colours, data)) is not None:
         colours[empty] = data[empty] = 0
-        masks.append(np.where(empty, np.uint8(0), np.uint8(_OPAQUE)))
+        masks.append(np.where(empty, np.uint8(0), np.uint8(OPAQUE)))
     samples = _grey_or_rgb(page, kind, colours, full)
     if kind not in _INDIRECT:
         if data.shape[2]:
             samples = np.concatenate([samples, data], axis=2)
-        if stored.dtype.kind in "bu" and full < _OPAQUE:
-            samples = np.rint(samples * (_OPAQUE / full)).astype(np.uint8)
+        if stored.dtype.kind in "bu" and full < OPAQUE:
+            samples = np.rint(samples * (OPAQUE / full)).astype(np.uint8)
     found = [mask for mask in masks if mask is not None]
     return samples[..., 0] if samples.shape[2] == 1 else samples, np.minimum.reduce(found) if found else None
 
@@ -84,7 +83,7 @@ def _grey_or_rgb(page: "tifffile.TiffPage", kind: int, colours: Pixels, full: fl
     if kind == _PALETTE:
         table = np.asarray(page.colormap).T[:, : channel_count(page)]
         # Some programs write 8 bits where there should be 16.
-        table = (table if table.max() <= _OPAQUE else table >> 8).astype(np.uint8)
+        table = (table if table.max() <= OPAQUE else table >> 8).astype(np.uint8)
         return table[colours[..., 0].astype(np.intp)]
     if kind in (_LAB, _ICC_LAB, _INKS) and not integers:
         raise ValueError(f"photometric interpretation {kind} with samples of type {colours.dtype} is not read")
@@ -109,8 +108,8 @@ def _by_pillow(page: "tifffile.TiffPage", colours: Pixels, mode: str) -> Pixels:
 def _straight(colours: Pixels, alpha: Pixels, full: float) -> Pixels:
     """Colours that were multiplied by alpha without it; black where it is 0."""
     straight = np.empty_like(colours)
-    for top in range(0, len(colours), _ROWS_AT_A_TIME):
-        rows = slice(top, top + _ROWS_AT_A_TIME)
+    for top in range(0, len(colours), ROWS_AT_A_TIME):
+        rows = slice(top, top + ROWS_AT_A_TIME)
         share = np.maximum(alpha[rows, :, None] / full, 0.0)
         values = np.divide(colours[rows], share, out=np.zeros(colours[rows].shape), where=share > 0.0)
         straight[rows] = np.rint(np.clip(values, 0, full)) if colours.dtype.kind in "ui" else values
@@ -142,7 +141,7 @@ def _lacks_data(page: "tifffile.TiffPage", *bands: Pixels) -> NDArray[np.bool_] 
 
 def as_opacity(alpha: Pixels, full: float) -> NDArray[np.uint8]:
     """Alpha of any sample type, which is ``full`` where the image is opaque, as 0..255."""
-    if alpha.dtype == np.uint8 and full == _OPAQUE:
+    if alpha.dtype == np.uint8 and full == OPAQUE:
         return np.asarray(alpha, dtype=np.uint8)
     share = np.clip(np.nan_to_num(alpha.astype(np.float32) / full), 0.0, 1.0)
-    return np.asarray(np.rint(share * _OPAQUE), dtype=np.uint8)
+    return np.asarray(np.rint(share * OPAQUE), dtype=np.uint8)

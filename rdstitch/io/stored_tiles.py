@@ -18,23 +18,14 @@ from numpy.typing import NDArray
 
 from rdstitch.choices import ZPlane
 from rdstitch.errors import InputError
-from rdstitch.io.metadata import MICROMETRES, ome_pixel_size, ome_tree
+from rdstitch.io.ome import MICROMETRES, Page, ome_pixel_size, ome_planes, ome_tree
 from rdstitch.io.opening import TIFF_MAGIC, decoding
 from rdstitch.io.read_tiff import read_page
 from rdstitch.system.file_access import canonical_name, canonical_text, open_regular
 from rdstitch.system.late_imports import tifffile
 
 _FOLDER_METADATA = "metadata.txt"
-_COUNTED = "CZT"
 _LEADING = {"C": "C", "Z": "Z", "T": "T", "I": "Z", "Q": "Z"}  # what axes of tifffile are; unknown ones are taken for z
-
-
-@dataclass(frozen=True)
-class Page:
-    """A plane of a file."""
-
-    file: Path
-    number: int
 
 
 @dataclass(frozen=True)
@@ -188,7 +179,7 @@ def _ome(file: Path, text: str | None) -> list[StoredTile]:
         pixels = image.find("Pixels")
         if pixels is None:
             continue
-        planes = _ome_planes(file, pixels, None if by_name else own)
+        planes = ome_planes(file, pixels, None if by_name else own)
         if any(page.file == file for page in planes.values()):
             tiles.append(_ome_tile(file, image, pixels, planes))
     shared = len(tiles) > 1
@@ -206,32 +197,6 @@ def _companion(file: Path) -> str | None:
                 return str(tiff.ome_metadata or "")
     except (OSError, ValueError, InputError):
         return None
-
-
-def _ome_planes(file: Path, pixels: ElementTree.Element, own: str | None) -> dict[tuple[int, int, int], Page]:
-    """Where the planes of an image are; the file is known by its name, or by its UUID where that is not there."""
-    samples = [int(channel.get("SamplesPerPixel", 1)) for channel in pixels.iter("Channel")]
-    counts = {axis: int(pixels.get(f"Size{axis}", 1)) for axis in _COUNTED}
-    counts["C"] = len(samples) or counts["C"]
-    order = [axis for axis in pixels.get("DimensionOrder", "XYCZT")[2:] if axis in _COUNTED]
-    total = math.prod(counts.values())
-    planes = {}
-    for data in list(pixels.iter("TiffData")) or [ElementTree.Element("TiffData")]:
-        identity = data.find("UUID")
-        holder = file
-        if identity is not None:
-            name = identity.get("FileName")
-            mine = (identity.text or "").strip() == own if own is not None else name == file.name
-            holder = file if mine or name is None else file.parent / name
-        first = np.ravel_multi_index(
-            [int(data.get(f"First{axis}", 0)) for axis in reversed(order)], [counts[axis] for axis in reversed(order)]
-        )
-        count = int(data.get("PlaneCount", total if data.get("IFD") is None else 1))
-        for k in range(min(count, total - int(first))):
-            index = np.unravel_index(int(first) + k, [counts[axis] for axis in reversed(order)])
-            at = dict(zip(reversed(order), (int(i) for i in index), strict=True))
-            planes[at["C"], at["Z"], at["T"]] = Page(holder, int(data.get("IFD", 0)) + k)
-    return planes
 
 
 def _ome_tile(

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, pyramid, pyramid_sizes, with_alpha
+from rdstitch.io.encoding import STRIP_ROWS, ImageSpec, Strip, pyramid, pyramid_sizes, with_alpha
 from rdstitch.io.metadata import Metadata
 from rdstitch.system.late_imports import imagecodecs, tifffile
 
@@ -43,18 +43,18 @@ _COPIED_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.Artist, E
 ExtraTag = tuple[int, int, int, Any, bool]
 
 
-def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
+def write_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
     """Write a TIFF file whose first page is the image and whose other pages are its overviews."""
-    sizes = pyramid_sizes(layout.size, _MIN_OVERVIEW)
-    total = sum(w * h for w, h in sizes) * layout.samples_per_pixel * layout.dtype.itemsize
-    joined = (with_alpha(*strip) if layout.transparent else strip[0] for strip in strips)
-    mask: list[bytes] | None = [] if _has_mask(layout) else None
+    sizes = pyramid_sizes(spec.size, _MIN_OVERVIEW)
+    total = sum(w * h for w, h in sizes) * spec.samples_per_pixel * spec.dtype.itemsize
+    joined = (with_alpha(*strip) if spec.transparent else strip[0] for strip in strips)
+    mask: list[bytes] | None = [] if _has_mask(spec) else None
     with tifffile.TiffWriter(path, bigtiff=total > _BIGTIFF_FROM) as tiff:
-        for size, passing in pyramid(sizes, joined, path.parent, transparent=layout.transparent):
-            kind = 0 if size == layout.size else _REDUCED
-            tags = [] if kind else [*_copied_tags(layout.metadata), *_band_names(layout), *extra_tags]
+        for size, passing in pyramid(sizes, joined, path.parent, transparent=spec.transparent):
+            kind = 0 if size == spec.size else _REDUCED
+            tags = [] if kind else [*_copied_tags(spec.metadata), *_band_names(spec), *extra_tags]
             shown = passing if mask is None else _without_alpha(passing, mask)
-            _write_page(tiff, layout, size, shown, tags, kind)
+            _write_page(tiff, spec, size, shown, tags, kind)
             if mask is not None:
                 _write_mask(tiff, size, mask, kind | _MASK)
                 mask.clear()
@@ -95,14 +95,14 @@ def _tile(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage", index: int) -> N
     return np.pad(tile, [(0, _TILE - tile.shape[0]), (0, _TILE - tile.shape[1]), (0, 0)])
 
 
-def _has_mask(layout: Layout) -> bool:
+def _has_mask(spec: ImageSpec) -> bool:
     """Check whether transparency goes onto a page of its own."""
-    return layout.transparent and layout.channels == 1
+    return spec.transparent and spec.channels == 1
 
 
 def _write_page(
     tiff: "tifffile.TiffWriter",
-    layout: Layout,
+    spec: ImageSpec,
     size: tuple[int, int],
     strips: Iterable[NDArray[Any]],
     tags: list[ExtraTag],
@@ -110,21 +110,21 @@ def _write_page(
 ) -> None:
     """Write one page from strips that hold all its samples."""
     width, height = size
-    transparent = layout.transparent and not _has_mask(layout)
-    samples = layout.channels + transparent
-    colour = 3 if layout.channels == 3 and not layout.metadata.planes else 1
-    extra = ["unspecified"] * (layout.channels - colour) + ["unassalpha"] * transparent
-    dpi = None if kind else layout.metadata.dpi
+    transparent = spec.transparent and not _has_mask(spec)
+    samples = spec.channels + transparent
+    colour = 3 if spec.channels == 3 and not spec.metadata.planes else 1
+    extra = ["unspecified"] * (spec.channels - colour) + ["unassalpha"] * transparent
+    dpi = None if kind else spec.metadata.dpi
     tiff.write(
         (_encoded_tile(tile) for tile in _tiles_of(strips)),
         shape=(height, width, samples) if samples > 1 else (height, width),
-        dtype=layout.dtype,
+        dtype=spec.dtype,
         photometric="rgb" if colour == 3 else "minisblack",
         planarconfig="contig" if samples > 1 else None,
         extrasamples=extra or None,
         tile=(_TILE, _TILE),
         compression="zlib",
-        predictor=_has_predictor(layout.dtype),
+        predictor=_has_predictor(spec.dtype),
         # Tiles that tifffile holds before it writes them; 256 MB by default.
         buffersize=_BUFFER,
         metadata=None,
@@ -132,7 +132,7 @@ def _write_page(
         subfiletype=kind,
         resolution=dpi,
         resolutionunit="inch" if dpi else None,
-        iccprofile=None if kind else layout.metadata.icc_profile or None,
+        iccprofile=None if kind else spec.metadata.icc_profile or None,
         extratags=tags,
     )
 
@@ -188,12 +188,12 @@ def _deflated(stored: NDArray[Any]) -> bytes:
     return bytes(imagecodecs.deflate_encode(stored.tobytes(), _LEVEL))
 
 
-def _band_names(layout: Layout) -> Iterator[ExtraTag]:
+def _band_names(spec: ImageSpec) -> Iterator[ExtraTag]:
     """Names of bands, as GDAL has them."""
-    if layout.metadata.planes and len(layout.metadata.channel_names) == layout.channels:
+    if spec.metadata.planes and len(spec.metadata.channel_names) == spec.channels:
         items = "".join(
             f'<Item name="DESCRIPTION" sample="{number}" role="description">{escape(name)}</Item>'
-            for number, name in enumerate(layout.metadata.channel_names)
+            for number, name in enumerate(spec.metadata.channel_names)
         )
         yield _GDAL_METADATA, 2, 0, f"<GDALMetadata>{items}</GDALMetadata>".encode(), True
 
@@ -297,29 +297,23 @@ def _even(length: int) -> int:
     return length + length % 2
 
 
-def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
+def write_ome_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
     """Write an OME-TIFF file with a pyramid; what no image covers is 0.
 
     Channels become pages; those of a colour image stay together.
     """
-    sizes = pyramid_sizes(layout.size, _MIN_OVERVIEW)
-    apart = layout.metadata.planes or layout.channels != 3
+    sizes = pyramid_sizes(spec.size, _MIN_OVERVIEW)
+    apart = spec.metadata.planes or spec.channels != 3
     shown = (pixels if alpha is None else np.where(alpha[..., None] > 0, pixels, 0) for pixels, alpha in strips)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         levels: list[NDArray[Any]] = []
         for number, ((width, height), passing) in enumerate(pyramid(sizes, shown, path.parent, transparent=False)):
-            level = np.memmap(Path(folder) / str(number), layout.dtype, "w+", shape=(height, width, layout.channels))
+            level = np.memmap(Path(folder) / str(number), spec.dtype, "w+", shape=(height, width, spec.channels))
             top = 0
             for rows in passing:
                 level[top : top + len(rows)] = rows
                 top += len(rows)
             levels.append(level)
-        size = layout.metadata.pixel_size
-        units = {} if size is None else {"PhysicalSizeX": size, "PhysicalSizeY": size}
-        names: dict[str, Any] = {key + "Unit": "µm" for key in units}
-        if apart and len(layout.metadata.channel_names) == layout.channels:
-            names["Channel"] = {"Name": list(layout.metadata.channel_names)}
-        identity = uuid.uuid5(uuid.NAMESPACE_OID, f"rdstitch {layout.size} {layout.channels} {layout.dtype}")
         total = sum(level.nbytes for level in levels)
         with tifffile.TiffWriter(path, ome=True, bigtiff=total > 2**31) as tiff:
             for number, pixels in enumerate(levels):
@@ -330,21 +324,31 @@ def write_ome_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_ta
                 tiff.write(
                     (_encoded_tile(tile) for tile in _tiles_of(shown)),
                     shape=(channels, height, width) if apart else (height, width, channels),
-                    dtype=layout.dtype,
+                    dtype=spec.dtype,
                     photometric="minisblack" if apart else "rgb",
                     planarconfig=None if apart else "contig",
                     tile=(_TILE, _TILE),
                     compression="zlib",
-                    predictor=_has_predictor(layout.dtype),
+                    predictor=_has_predictor(spec.dtype),
                     subifds=None if number else len(levels) - 1,
                     subfiletype=1 if number else 0,
-                    metadata=None
-                    if number
-                    else {"axes": "CYX" if apart else "YXS", "UUID": f"urn:uuid:{identity}", **units, **names},
+                    metadata=None if number else _ome_metadata(spec, apart=apart),
                     software="rdstitch",
-                    iccprofile=None if number else layout.metadata.icc_profile or None,
-                    extratags=[] if number else [*_copied_tags(layout.metadata), *extra_tags],
+                    iccprofile=None if number else spec.metadata.icc_profile or None,
+                    extratags=[] if number else [*_copied_tags(spec.metadata), *extra_tags],
                 )
+
+
+def _ome_metadata(spec: ImageSpec, *, apart: bool) -> dict[str, Any]:
+    """What OME-XML says of the image, whose channels are pages where they are ``apart``."""
+    identity = uuid.uuid5(uuid.NAMESPACE_OID, f"rdstitch {spec.size} {spec.channels} {spec.dtype}")
+    content: dict[str, Any] = {"axes": "CYX" if apart else "YXS", "UUID": f"urn:uuid:{identity}"}
+    if spec.metadata.pixel_size is not None:
+        for axis in "XY":
+            content |= {f"PhysicalSize{axis}": spec.metadata.pixel_size, f"PhysicalSize{axis}Unit": "µm"}
+    if apart and len(spec.metadata.channel_names) == spec.channels:
+        content["Channel"] = {"Name": list(spec.metadata.channel_names)}
+    return content
 
 
 def write_cropped_tiff(

@@ -16,12 +16,13 @@ from PIL import Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.io.deepzoom import write_deep_zoom
-from rdstitch.io.encoding import STRIP_ROWS, Layout, Strip, as_eight_bit, check_strips, jpeg_pieces, png_pieces
+from rdstitch.io.encoding import STRIP_ROWS, ImageSpec, Strip, as_eight_bit, check_strips, jpeg_pieces, png_pieces
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.ome_zarr import check_zarr, write_ome_zarr
+from rdstitch.io.samples import OPAQUE
 from rdstitch.io.tiff import OME_SUFFIXES, ExtraTag, write_ome_tiff, write_tiff
 from rdstitch.system.outputs import (
-    IMAGE_SUFFIXES,
+    WRITABLE_SUFFIXES,
     Fingerprint,
     Outputs,
     check_tiles_folder,
@@ -38,7 +39,6 @@ _JPEG = (".jpg", ".jpeg")
 _WEBP_EFFORT = 4
 # The samples, Pillow's copy of them, the encoder's own, and the output; measured: 13 to 16 with 4 and 16 megapixels.
 _WEBP_BYTES_PER_PIXEL = 20
-_OPAQUE = 255
 _ROWS_AT_A_TIME = 4 * STRIP_ROWS
 
 
@@ -65,16 +65,16 @@ def write_image(
     samples = pixels[..., None] if pixels.ndim == 2 else pixels
     height, width, channels = samples.shape
     described = metadata or Metadata((width, height))
-    layout = Layout((width, height), channels, samples.dtype, alpha is not None, described, quality, background)
+    spec = ImageSpec((width, height), channels, samples.dtype, alpha is not None, described, quality, background)
     pieces = (slice(top, top + _ROWS_AT_A_TIME) for top in range(0, height, _ROWS_AT_A_TIME))
     strips = ((samples[rows], None if alpha is None else alpha[rows]) for rows in pieces)
     with Outputs(overwrite) as outputs:
-        write_strips(path, layout, strips, outputs=outputs)
+        write_strips(path, spec, strips, outputs=outputs)
 
 
 def write_strips(
     path: str | Path,
-    layout: Layout,
+    spec: ImageSpec,
     strips: Iterable[Strip],
     extra_tags: Iterable[ExtraTag] = (),
     *,
@@ -83,62 +83,62 @@ def write_strips(
     """Write an image that comes in strips; see :func:`write_image`. Gives size and digest of what was written."""
     if outputs is None:
         with Outputs(overwrite=True) as alone:
-            return write_strips(path, layout, strips, extra_tags, outputs=alone)
+            return write_strips(path, spec, strips, extra_tags, outputs=alone)
     file = Path(path)
-    check_format(file, layout)
+    check_format(file, spec)
     suffix = file.suffix.lower()
-    checked = check_strips(layout, strips)
+    checked = check_strips(spec, strips)
     tiles = None
     if suffix == ".dzi":
         folder = tiles_folder(Path(os.path.realpath(file)))
         check_tiles_folder(folder, overwrite=True)
         with outputs.writing(folder, is_folder=True) as tiles, outputs.writing(file) as staged:
-            write_deep_zoom(staged, tiles, layout, checked)
+            write_deep_zoom(staged, tiles, spec, checked)
     elif is_zarr(file):
         with outputs.writing(file, is_folder=True) as staged:
-            write_ome_zarr(staged, layout, checked)
+            write_ome_zarr(staged, spec, checked)
     else:
         with outputs.writing(file) as staged:
             if file.name.lower().endswith(OME_SUFFIXES):
-                write_ome_tiff(staged, layout, checked, extra_tags)
+                write_ome_tiff(staged, spec, checked, extra_tags)
             else:
-                _write_file(staged, suffix, layout, checked, extra_tags)
+                _write_file(staged, suffix, spec, checked, extra_tags)
     with naming(file):
         return fingerprint(staged, tiles)
 
 
 def _write_file(
-    file: Path, suffix: str, layout: Layout, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag]
+    file: Path, suffix: str, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag]
 ) -> None:
     """Write one file in the format of a suffix."""
     if suffix in _TIFF:
-        write_tiff(file, layout, strips, extra_tags)
+        write_tiff(file, spec, strips, extra_tags)
         return
     pieces: Iterable[bytes | memoryview]
     if suffix in _JPEG:
-        pieces = jpeg_pieces(layout, strips)
+        pieces = jpeg_pieces(spec, strips)
     elif suffix == ".png":
-        pieces = png_pieces(layout, strips)
+        pieces = png_pieces(spec, strips)
     else:
-        pieces = [_webp(layout, strips)]
+        pieces = [_webp(spec, strips)]
     with file.open("wb") as stream:
         stream.writelines(pieces)
 
 
-def check_format(path: str | Path, layout: Layout) -> None:
+def check_format(path: str | Path, spec: ImageSpec) -> None:
     """Find out before long work whether the format of ``path`` can hold an image."""
     suffix = Path(path).suffix.lower()
-    if suffix not in IMAGE_SUFFIXES:
-        raise OutputError(f"{path}: unknown file type '{suffix}'; use one of {' '.join(IMAGE_SUFFIXES)}")
+    if suffix not in WRITABLE_SUFFIXES:
+        raise OutputError(f"{path}: unknown file type '{suffix}'; use one of {' '.join(WRITABLE_SUFFIXES)}")
     if suffix == ".zarr":
         check_zarr(Path(path))
     if suffix in (*_TIFF, ".zarr"):
         return
-    if layout.channels not in (1, 3):
-        raise OutputError(f"{path}: {layout.channels} channels do not fit into {suffix[1:]}; write a .tif")
-    if layout.dtype == np.float32:
+    if spec.channels not in (1, 3):
+        raise OutputError(f"{path}: {spec.channels} channels do not fit into {suffix[1:]}; write a .tif")
+    if spec.dtype == np.float32:
         raise OutputError(f"{path}: floating-point samples do not fit into {suffix[1:]}; write a .tif")
-    check_size(path, layout.size)
+    check_size(path, spec.size)
 
 
 def check_size(path: str | Path, size: tuple[int, int]) -> None:
@@ -162,26 +162,26 @@ def check_memory(path: str | Path, size: tuple[int, int], max_memory: int | None
         )
 
 
-def _webp(layout: Layout, strips: Iterable[Strip]) -> bytes:
+def _webp(spec: ImageSpec, strips: Iterable[Strip]) -> bytes:
     """WebP file in memory: the encoder takes the image whole; see :data:`_WEBP_BYTES_PER_PIXEL`."""
-    width, height = layout.size
-    samples = np.empty((height, width, 3 + layout.transparent), dtype=np.uint8)
+    width, height = spec.size
+    samples = np.empty((height, width, 3 + spec.transparent), dtype=np.uint8)
     top = 0
     for strip in strips:
         rows = samples[top : top + len(strip[0])]
         # Grey goes to all three colours.
         rows[..., :3] = as_eight_bit(strip[0])
-        if layout.transparent:
-            rows[..., 3] = _OPAQUE if strip[1] is None else strip[1]
+        if spec.transparent:
+            rows[..., 3] = OPAQUE if strip[1] is None else strip[1]
         top += len(rows)
     stream = io.BytesIO()
     Image.fromarray(samples).save(
         stream,
         "WEBP",
-        quality=layout.quality,
+        quality=spec.quality,
         method=_WEBP_EFFORT,
-        exif=layout.metadata.exif,
-        icc_profile=layout.metadata.icc_profile,
-        xmp=layout.metadata.xmp,
+        exif=spec.metadata.exif,
+        icc_profile=spec.metadata.icc_profile,
+        xmp=spec.metadata.xmp,
     )
     return stream.getvalue()

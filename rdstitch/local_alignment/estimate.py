@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
@@ -126,8 +126,8 @@ def align_locally(
     text = f"matches held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} pixels with it"
     if seen > enough:
         return LocalAlignment((), f"not worth while; {text}", 0, before, after)
-    final = fit_fields(placed, images, start.stiffness, start).of_images()
-    return LocalAlignment(final, text, cells, before, after)
+    final = fit_fields(placed, images, start.stiffness, start)
+    return LocalAlignment(tuple(map(final.of_image, range(len(cameras)))), text, cells, before, after)
 
 
 def _agreement_of_neighbours(matches: PlacedMatches) -> float:
@@ -149,7 +149,7 @@ def _seen(residual: FloatArray) -> float:
 def _long_edges(edges: Callable[[int], FloatArray], cameras: Sequence[Camera]) -> dict[int, FloatArray]:
     """Those that a person sees to be straight, of some images."""
     count, found = len(cameras), {}
-    for k in np.unique(np.linspace(0, count - 1, min(count, _MAX_IMAGES)).astype(np.intp)).tolist():
+    for k in evenly_spaced(count, _MAX_IMAGES).tolist():
         ends = edges(k)
         found[k] = ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > _EDGE * 2.0 * cameras[k].scale]
     return found
@@ -157,6 +157,5 @@ def _long_edges(edges: Callable[[int], FloatArray], cameras: Sequence[Camera]) -
 
 def _bend(fields: PlacedFields, edges: dict[int, FloatArray]) -> float:
     """How far fields bend edges, as a person sees it; 0 where there are none."""
-    displacement = fields.of_images()
-    bent = np.concatenate([displacement[k].bends(ends) for k, ends in edges.items()])
+    bent = np.concatenate([fields.of_image(k).bends(ends) for k, ends in edges.items()])
     return float(np.percentile(bent, _BENDS)) if len(bent) else 0.0

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Self
 
 import numpy as np
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.system.late_imports import ndimage
 
 _DECIMALS = 3  # pixels; what a sidecar stores is what was used
 # Nodes by which a field goes on as it does at the border, so that a spline, which is level at its end, is so beyond it.
@@ -49,9 +48,15 @@ class DisplacementField:
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Displacement (..., 2) at measured pixels (..., 2), also beside the image; far out as there, 0 at NaN."""
-        place = np.moveaxis(self._grid_coordinates(points), -1, 0)[::-1] + _APRON
-        return np.stack([ndimage.map_coordinates(c, place, order=3, mode="mirror", prefilter=False)
-                         for c in self._coefficients], axis=-1)  # fmt: skip
+        place = self._grid_coordinates(points) + _APRON
+        cell = place.astype(np.intp)
+        across, down = np.moveaxis(_cubic_weights(place - cell), -2, 0)
+        weights = (down[..., :, None] * across[..., None, :]).reshape(*cell.shape[:-1], 16)
+        # What matters in each cell, side by side: many times faster to gather.
+        patches = np.lib.stride_tricks.sliding_window_view(self._coefficients, (4, 4), axis=(0, 1))
+        patches = patches.reshape(*patches.shape[:3], 16)
+        moved = np.einsum("...ck,...k->...c", patches[cell[..., 1] - 1, cell[..., 0] - 1], weights)
+        return np.asarray(moved, dtype=np.float64)
 
     def resized(self, image_size: tuple[int, int]) -> "DisplacementField":
         """The same for an image of another size that shows the same."""
@@ -66,11 +71,13 @@ class DisplacementField:
     @cached_property
     def steepest(self) -> float:
         """Largest change of the displacement per pixel in any direction; below 1 the image does not fold."""
-        rows, columns = (_PROBES * (n - 1) + 1 for n in self.values.shape[:2])
-        moved = self(node_points(self.image_size, (rows, columns))).reshape(rows, columns, 2)
-        spacing = (np.array(self.image_size) - 1.0) / (columns - 1, rows - 1)
-        across, down = np.diff(moved, axis=1)[:-1] / spacing[0], np.diff(moved, axis=0)[:, :-1] / spacing[1]
-        return float(np.linalg.norm(np.stack([across, down], axis=-1), ord=2, axis=(-2, -1)).max())
+        down, across = (_evaluation(n) for n in self.values.shape[:2])
+        # Rows, then columns: (2, rows, columns).
+        moved = down @ np.moveaxis(self.values, -1, 0) @ across.T
+        spacing = (np.array(self.image_size) - 1.0) / (moved.shape[2] - 1, moved.shape[1] - 1)
+        (a, c), (b, d) = np.diff(moved, axis=2)[:, :-1] / spacing[0], np.diff(moved, axis=1)[:, :, :-1] / spacing[1]
+        # The larger singular value of each matrix of two rows and columns.
+        return float((np.hypot(a + d, c - b) + np.hypot(a - d, c + b)).max()) / 2.0
 
     def bends(self, edges: FloatArray) -> FloatArray:
         """How far straight edges with such ends (K, 2, 2) are bent, measured pixels (K,)."""
@@ -82,16 +89,46 @@ class DisplacementField:
         return np.asarray(np.abs((off * normal).sum(axis=-1)).max(axis=0))
 
     @cached_property
-    def _coefficients(self) -> list[FloatArray]:
-        around = [(_APRON, _APRON)] * 2
-        padded = [np.pad(self.values[..., k], around, mode="reflect", reflect_type="odd") for k in (0, 1)]
-        return [ndimage.spline_filter(values, order=3, mode="mirror") for values in padded]
+    def _coefficients(self) -> FloatArray:
+        """Of the B-spline, with the apron around, (rows, columns, 2)."""
+        down, across = (_prefilter(n) for n in self.values.shape[:2])
+        return np.moveaxis(down @ np.moveaxis(self.values, -1, 0) @ across.T, 0, -1)
 
     def _grid_coordinates(self, points: FloatArray) -> FloatArray:
         """Column and row (..., 2) in units of the grid, within it or not far from it."""
         last = np.array([self.values.shape[1] - 1, self.values.shape[0] - 1])
         place = np.asarray(points, dtype=np.float64) * (last / (np.array(self.image_size) - 1.0))
         return np.clip(np.nan_to_num(place), -_BEYOND, last + _BEYOND)
+
+
+def _cubic_weights(share: FloatArray) -> FloatArray:
+    """What the four nodes around a place count in a cubic B-spline, (..., 4), by its share of a cell (...)."""
+    left, square = 1.0 - share, share * share
+    rest = left * left
+    weights = [rest * left, 4.0 + square * (3.0 * share - 6.0), 4.0 + rest * (3.0 * left - 6.0), square * share]
+    return np.stack(weights, axis=-1) * (1.0 / 6.0)
+
+
+@lru_cache(maxsize=64)
+def _prefilter(count: int) -> FloatArray:
+    """From values at nodes in a row to the coefficients of their cubic B-spline (count + 2 aprons, count)."""
+    around = ((_APRON, _APRON), (0, 0))
+    padded = np.pad(np.eye(count), around, mode="reflect", reflect_type="odd")
+    one, beside = np.eye(len(padded)), np.eye(len(padded), k=1)
+    values = (4.0 * one + beside + beside.T) / 6.0
+    values[0, 1] = values[-1, -2] = 2.0 / 6.0
+    return np.asarray(np.linalg.solve(values, padded), dtype=np.float64)
+
+
+@lru_cache(maxsize=64)
+def _evaluation(count: int) -> FloatArray:
+    """From values at nodes in a row to those of their spline at evenly spread places, some between two nodes."""
+    place = np.linspace(0.0, count - 1.0, _PROBES * (count - 1) + 1) + _APRON
+    cell = np.minimum(place.astype(np.intp), count + _APRON - 2)
+    basis = np.zeros((len(place), count + 2 * _APRON))
+    columns = cell[:, None] + np.arange(-1, 3)
+    np.put_along_axis(basis, columns, _cubic_weights(place - cell), axis=1)
+    return basis @ _prefilter(count)
 
 
 def bilinear(

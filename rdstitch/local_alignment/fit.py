@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.conjugate_gradients import conjugate_gradients
 from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_shape, node_points
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches
 from rdstitch.system.late_imports import sparse, sparse_linalg
@@ -33,6 +34,9 @@ _FADE = 0.2
 _STEPS = 4
 # Limit of the displacement's change per pixel: half of what would fold an image.
 _MAX_GRADIENT = 0.5
+# Nodes of all images up to which equations are factorized as they are, cells of a grid from which on there is a coarser
+# one, and the residual of the equations that is left, as a share of their right side: a thousandth of a pixel.
+_FACTORIZED, _MIN_HALVED, _TOLERANCE = 5000, 8, 1e-6
 # A residual leads from the second image to the first.
 _SIGNS = np.array([1.0, -1.0])
 
@@ -65,20 +69,17 @@ class PlacedFields:
             expected = _expected(matches, self.images, design, values)
         return matches.residual - design @ values, expected
 
-    def of_images(self) -> tuple[DisplacementField, ...]:
-        """The displacements in measured pixels of each image, limited so that nothing folds."""
-        done = []
-        for k, (shape, values) in enumerate(zip(self.shapes, self.values, strict=True)):
-            size = self.images.cameras[k].image_size
-            points = node_points(size, shape)
-            with np.errstate(invalid="ignore"):
-                shown = self.images.from_surface(k, self.images.to_surface(k, points) + values)
-            displaced = np.where(np.isfinite(shown), shown - points, 0.0).reshape(*shape, 2)
-            field = DisplacementField.of(size, displaced)
-            if field.steepest > _MAX_GRADIENT:
-                field = DisplacementField.of(size, field.values * (_MAX_GRADIENT / field.steepest))
-            done.append(field)
-        return tuple(done)
+    def of_image(self, k: int) -> DisplacementField:
+        """The displacement in measured pixels of an image, limited so that nothing folds."""
+        size = self.images.cameras[k].image_size
+        points = node_points(size, self.shapes[k])
+        with np.errstate(invalid="ignore"):
+            shown = self.images.from_surface(k, self.images.to_surface(k, points) + self.values[k])
+        displaced = np.where(np.isfinite(shown), shown - points, 0.0).reshape(*self.shapes[k], 2)
+        field = DisplacementField.of(size, displaced)
+        if field.steepest <= _MAX_GRADIENT:
+            return field
+        return DisplacementField.of(size, field.values * (_MAX_GRADIENT / field.steepest))
 
 
 def fit_fields(
@@ -93,7 +94,7 @@ def fit_fields(
     cameras = images.cameras
     shapes = tuple(grid_shape(camera.image_size, stiffness.cells) for camera in cameras)
     priors = [_smoothness(shape, camera.image_size, stiffness) for shape, camera in zip(shapes, cameras, strict=True)]
-    prior = sparse.block_diag(priors, format="csr")
+    prior, coarser = sparse.block_diag(priors, format="csr"), _coarser(shapes, cameras, stiffness.cells)
     if start is None:
         left, expected = matches.residual, matches.points.reshape(-1, 2)
         scale = float(np.percentile(np.linalg.norm(left, axis=1), _WIDEST))
@@ -107,7 +108,7 @@ def fit_fields(
         scale = max(scale, sharpest)
         weight = (1.0 / (1.0 + (length / scale) ** 2)) ** 2 / sharpest**2
         design = _design(matches, expected, cameras, shapes)
-        solution = _solve(design, weight, prior, matches.residual)
+        solution = _solve(design, weight, prior, matches.residual, coarser)
         left = matches.residual - design @ solution
         expected = _expected(matches, images, design, solution)
         scale *= _SHARPENED
@@ -115,13 +116,48 @@ def fit_fields(
 
 
 def _solve(
-    design: "sparse.csr_array", weight: FloatArray, prior: "sparse.csr_array", residual: FloatArray
+    design: "sparse.csr_array",
+    weight: FloatArray,
+    prior: "sparse.csr_array",
+    residual: FloatArray,
+    coarser: "sparse.csr_array | None",
 ) -> FloatArray:
-    """All coordinates (nodes, D) of the fields."""
+    """All coordinates (nodes, D) of the fields.
+
+    By conjugate gradients where values of ``coarser`` grids lead to those of the nodes: the equations of these grids
+    are factorized, and solve what is smooth.
+    """
     weighted = sparse.csr_array(design.T * weight)
-    matrix, options = sparse.csc_array(weighted @ design + prior), {"SymmetricMode": True}
-    factor = sparse_linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    return np.asarray(factor.solve(weighted @ residual), dtype=np.float64)
+    matrix, right = sparse.csr_array(weighted @ design + prior), weighted @ residual
+    if coarser is None:
+        return np.asarray(_factorized(matrix).solve(right), dtype=np.float64)
+    factor, finest = _factorized(coarser.T @ matrix @ coarser), 1.0 / matrix.diagonal()[:, None]
+
+    def smooth(left: FloatArray) -> FloatArray:
+        return np.asarray(coarser @ factor.solve(coarser.T @ left), dtype=np.float64)
+
+    return conjugate_gradients(matrix, right, smooth(right), lambda left: finest * left + smooth(left), _TOLERANCE)
+
+
+def _factorized(matrix: Any) -> Any:
+    options = {"SymmetricMode": True}
+    return sparse_linalg.splu(
+        sparse.csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
+    )
+
+
+def _coarser(shapes: Shapes, cameras: Sequence[Camera], cells: int) -> "sparse.csr_array | None":
+    """From values at the nodes of grids of half as many cells to those of all images; None where these are few."""
+    if cells < _MIN_HALVED or _first_nodes(shapes)[-1] <= _FACTORIZED:
+        return None
+    parts = {}
+    for shape, camera in zip(shapes, cameras, strict=True):
+        if (size := camera.image_size) not in parts:
+            few = grid_shape(size, cells // 2)
+            nodes, shares = bilinear(node_points(size, shape), size, few)
+            ends = np.arange(0, nodes.size + 1, 4)
+            parts[size] = sparse.csr_array((shares.ravel(), nodes.ravel(), ends), shape=(len(nodes), few[0] * few[1]))
+    return sparse.block_diag([parts[camera.image_size] for camera in cameras], format="csr")
 
 
 def _expected(

@@ -21,7 +21,7 @@ _SEARCH_RADIUS = 0.15
 _MIN_MATCHES = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Match:
     """Putative matches of one pair of images: measured pixels (N, 2) of either."""
 

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.robust.loss import NORMAL_MEDIAN
 
 _BINS = 50  # of the histogram, for the report alone
 _ROUNDS = 20  # of reweighting; three or four are needed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Consensus:
     """What the pairs agree on."""
 
@@ -83,4 +84,4 @@ def _scatter(residual: FloatArray, errors: FloatArray) -> float:
     if len(residual) < 3:
         return 0.0
     # Where the median of some ratios of squares is a number, that of the differences times it is zero.
-    return float(np.sqrt(max(np.median((residual / 0.6745) ** 2 - errors**2), 0.0)))
+    return float(np.sqrt(max(np.median((residual / NORMAL_MEDIAN) ** 2 - errors**2), 0.0)))

@@ -31,7 +31,7 @@ def spread_choice(points: FloatArray, most: int | None) -> IntArray:
     return np.sort(np.argsort(turn, kind="stable")[:most])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Link:
     """Two images that overlap."""
 

@@ -21,7 +21,7 @@ def connected_components(count: int, image1: ArrayLike, image2: ArrayLike) -> li
     return sorted(groups, key=lambda group: (-len(group), group[0]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SpanningTree:
     """A tree over a connected graph, as the steps that reach one image after the other from the root."""
 

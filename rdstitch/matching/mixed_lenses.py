@@ -29,7 +29,7 @@ _REWEIGHTINGS = 6
 _PAIRS_AT_ONCE = 64
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Votes:
     """What pairs see of λ, each on its own."""
 
@@ -133,7 +133,7 @@ _MIN_GAIN, _GAIN_OF_FEW = 4.0, 2.8
 _MIN_MARGIN = 5.0  # standard deviations by which votes must tell of which of the two lenses an image is
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TwoLenses:
     """Images of two lenses."""
 

@@ -9,7 +9,7 @@ a board that is shifted by a square is as flat as before. It is not for the plac
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from rdstitch.features import Correspondences, Features
 
 MIN_REPETITION = 0.1
@@ -59,7 +59,7 @@ def match_pattern(features1: Features, features2: Features) -> Correspondences:
     turn = features2.angle[partner] - features1.angle[keypoint]
     motion = features2.scale[partner] / features1.scale[keypoint] * np.exp(1j * turn)
     likely = np.argsort(distance, kind="stable")[: len(distance) // 2]
-    tried = likely[np.linspace(0, len(likely) - 1, min(_HYPOTHESES, len(likely))).astype(np.intp)]
+    tried = likely[evenly_spaced(len(likely), _HYPOTHESES)]
     support = np.array([len(np.unique(keypoint[_agreeing(z1, z2, motion, index)])) for index in tried])
     best, error = np.zeros(len(keypoint), dtype=np.bool_), np.full(len(keypoint), np.inf)
     for index in tried[np.argsort(-support, kind="stable")[:_REFINED]]:

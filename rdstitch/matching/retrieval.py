@@ -38,7 +38,7 @@ Array32 = NDArray[np.float32]
 Descriptors = NDArray[np.floating[Any]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Similarity:
     """How alike N images are, as far as they are."""
 
@@ -47,7 +47,7 @@ class Similarity:
     ordered: bool  # whether images that follow one another are alike, so that their order means something
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Vocabulary:
     """Words in a tree of two levels."""
 

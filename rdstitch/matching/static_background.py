@@ -6,10 +6,13 @@ plane moved.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.features import Correspondences
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import PairRegistration
@@ -31,20 +34,40 @@ _MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE = 2, 0.2
 """Pairs with such matches, in number and as a share of the pairs that move; by one pair alone nothing is decided."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """How the matches of a pair moved, which is read once."""
+
+    matches: Correspondences
+    moved: FloatArray  # (M,): how far each match moved in the image, pixels
+    static: bool  # whether the pair is registered as if nothing had moved
+    overlay: BoolArray  # (M,): static matches of a pair that moves; none where they are no more than chance brings
+
+    @classmethod
+    def of(cls, pair: PairRegistration, threshold: float) -> Self:
+        """``threshold`` is that of the pair's inliers, pixels."""
+        matches, inliers, radius = pair.correspondences, pair.relation.inliers, threshold * _MAX_STATIC_MOTION
+        moved = np.linalg.norm(matches.points2 - matches.points1, axis=1)
+        static = bool(pair.relation) and float(np.median(moved[inliers])) < radius
+        overlay = (moved < radius) & ~inliers
+        overlaid = bool(pair.relation) and not static and int(overlay.sum()) >= _MIN_STATIC_MATCHES
+        return cls(matches, moved, static, overlay & overlaid)
+
+
 def is_static_pair(pair: PairRegistration, threshold: float) -> bool:
     """Whether a pair is registered as if nothing had moved; ``threshold`` is that of its inliers, pixels."""
-    return (
-        bool(pair.relation) and float(np.median(_moved(pair)[pair.relation.inliers])) < threshold * _MAX_STATIC_MOTION
-    )
+    return bool(pair.relation) and _Motion.of(pair, threshold).static
 
 
 def has_static_background(pairs: Sequence[PairRegistration], threshold: float) -> bool:
     """Whether most of the registered pairs are static, or several that move have static matches besides."""
-    registered = [pair for pair in pairs if pair.relation]
-    static = sum(is_static_pair(pair, threshold) for pair in registered)
-    overlaid = sum(_is_overlaid(pair, threshold) for pair in registered)
-    moving = len(registered) - static
-    return 2 * static > len(registered) or overlaid >= max(_MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE * moving)
+    registered = static = overlaid = 0
+    for motion in (_Motion.of(pair, threshold) for pair in pairs if pair.relation):
+        registered += 1
+        static += motion.static
+        overlaid += bool(motion.overlay.any())
+    enough = max(_MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE * (registered - static))
+    return 2 * static > registered or overlaid >= enough
 
 
 def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], threshold: float) -> FeatureStore:
@@ -55,7 +78,10 @@ def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], t
     moving = [np.ones(count, dtype=np.bool_) for count in features.counts]
     begun = [np.empty((0, 2))]
     for pair in pairs:
-        matched = pair.correspondences.take(np.flatnonzero(_static_matches(pair, threshold)))
+        motion = _Motion.of(pair, threshold)
+        # Of a static pair all that move little, of others those of an overlay.
+        static_matches = motion.moved < threshold if motion.static else motion.overlay
+        matched = motion.matches.take(np.flatnonzero(static_matches))
         moving[pair.image1][matched.indices[:, 0]] = False
         moving[pair.image2][matched.indices[:, 1]] = False
         begun.append(matched.points1)
@@ -69,36 +95,8 @@ def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], t
     )
 
 
-def _static_matches(pair: PairRegistration, threshold: float) -> BoolArray:
-    """Which matches (M,) of a pair are static: of a static pair all that move little, of others those of an overlay."""
-    if is_static_pair(pair, threshold):
-        return _moved(pair) < threshold
-    return _overlay(pair, threshold) & _is_overlaid(pair, threshold)
-
-
-def _overlay(pair: PairRegistration, threshold: float) -> BoolArray:
-    """Which matches (M,) are static although the rest of the pair moves."""
-    static: BoolArray = (_moved(pair) < threshold * _MAX_STATIC_MOTION) & ~pair.relation.inliers
-    return static
-
-
-def _is_overlaid(pair: PairRegistration, threshold: float) -> bool:
-    """Whether a pair moves, and has more static matches than chance brings."""
-    return (
-        bool(pair.relation)
-        and not is_static_pair(pair, threshold)
-        and int(_overlay(pair, threshold).sum()) >= _MIN_STATIC_MATCHES
-    )
-
-
 def show_motion(pairs: Sequence[PairRegistration], count: int, threshold: float) -> bool:
     """Whether pairs that do move connect a good part of the ``count`` images, so that this is no chance."""
     linked = [pair for pair in pairs if pair.relation and not is_static_pair(pair, threshold)]
     connected = connected_components(count, [pair.image1 for pair in linked], [pair.image2 for pair in linked])[0]
     return len(connected) >= max(_MIN_IMAGES, _MIN_SHARE * count)
-
-
-def _moved(pair: PairRegistration) -> FloatArray:
-    """How far each match moved in the image, pixels."""
-    moved: FloatArray = np.linalg.norm(pair.correspondences.points2 - pair.correspondences.points1, axis=1)
-    return moved

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rdstitch.arrays import evenly_spaced
 from rdstitch.executors import batches, in_order
 from rdstitch.features import Matcher, match_near
 from rdstitch.geometry.camera import Camera
@@ -143,7 +144,7 @@ class Pairing:
         """Whether keypoints of most of the images look like others elsewhere in the same image."""
         if self.network is not None:
             return False
-        sampled = np.unique(np.linspace(0, len(self.features) - 1, _SAMPLED).astype(np.intp)).tolist()
+        sampled = evenly_spaced(len(self.features), _SAMPLED).tolist()
         return bool(np.median([repetition(self.features[k]) for k in sampled]) >= MIN_REPETITION)
 
     def rematch_elsewhere(self, pairs: Sequence[PairRegistration], transfer: Transfer) -> list[PairRegistration]:

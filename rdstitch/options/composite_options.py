@@ -56,7 +56,7 @@ class CompositeOptions(UprightOptions):
     epsg: int | None = option(
         None,
         "Coordinate system of the map, and of x and y in --positions; otherwise UTM (UPS near the poles) on WGS "
-        "84. All but these need rasterio.",
+        "84. All but these need pyproj.",
         "EPSG:N",
         "--crs",
         above=0,

@@ -1,17 +1,16 @@
 """Options of the recipes: the same names and defaults as on the command line."""
 
 import math
-from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Self
 
 from rdstitch.choices import CameraFormat, ChannelOrder, LensName, LocalAlignmentMode, ModelName
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.options.estimation_options import Confidence, EstimationOptions, Iterations, Seed, Solver, Threshold
+from rdstitch.options.estimation_options import EstimationOptions, RansacOptions
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.options.option import check_options, documented, option
+from rdstitch.options.option import documented, option
 from rdstitch.options.shared_options import Distortion, DryRun, Mask, Overwrite, Strict, Topic, Workers
 from rdstitch.system.machine import processor_count
 
@@ -25,7 +24,7 @@ _SELECT_MODEL_BELOW = 50
 
 @documented
 @dataclass(frozen=True)
-class StitchOptions:
+class StitchOptions(RansacOptions):
     """How images are registered and composited.
 
     Raises :class:`rdstitch.errors.ArgumentError` where a value is out of range, unknown, or contradicts another one.
@@ -40,14 +39,10 @@ class StitchOptions:
         command_line=False,
     )
     lightglue_model: str | Path | None = option(None, "LightGlue network (ONNX) for these features.", "FILE")
-    solver: Solver = "auto"
     lens: LensName = option(
         "auto", "Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient."
     )
     model: ModelName = option("auto", "Motion model of the camera.")
-    threshold: Threshold = 3.0
-    confidence: Confidence = 0.999
-    max_iterations: Iterations = 10000
     camera: "Camera | None" = option(
         None,
         "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is not "
@@ -128,7 +123,6 @@ class StitchOptions:
     cache: Path | None = option(
         None, "Folder for features, pairs and alignments, to reuse in later runs; made if missing.", "DIR"
     )
-    seed: Seed = 0
     workers: Workers = 0
     scheduler: str | None = option(
         None,
@@ -148,7 +142,7 @@ class StitchOptions:
     dry_run: DryRun = False
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if isinstance(file := getattr(self, "camera"), str | Path):  # noqa: B009 - by its type it is a camera
             from rdstitch.inputs.rosbag import camera_in
 
@@ -196,21 +190,8 @@ class StitchOptions:
     @property
     def estimation(self) -> EstimationOptions:
         """How pairs are estimated."""
-        return EstimationOptions(
-            self.solver,
-            self.known_distortion,
-            self.threshold,
-            self.confidence,
-            self.max_iterations,
-            self.seed,
-            _SELECT_MODEL_BELOW,
-        )
-
-    def executor(self, images: int) -> Executor:
-        """Give where the tasks of a set of so many images are computed; to be used in a ``with`` block."""
-        from rdstitch.executors import open_executor
-
-        return open_executor(self.threads, images, scheduler=self.scheduler, store=self.cache)
+        search = {each.name: getattr(self, each.name) for each in fields(RansacOptions)}
+        return EstimationOptions(**search, distortion=self.known_distortion, select_below=_SELECT_MODEL_BELOW)
 
     @property
     def threads(self) -> int:

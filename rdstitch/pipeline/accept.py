@@ -1,6 +1,6 @@
 """Stage: check a registration; what fails a check is left out by name, and the rest is aligned anew."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -82,11 +82,11 @@ def aligner_of(registration: Registration, options: StitchOptions, purpose: Purp
     return replace(aligner, needs_poses=purpose.poses)
 
 
-def realigned(registration: Registration, aligner: Aligner) -> Registration | None:
-    """The pairs of a registration aligned by another aligner; None where a draft shows that they do not fit."""
+def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Alignment], bool]) -> Registration | None:
+    """The pairs of a registration aligned by another aligner; None where a draft does not fit, or is not wanted."""
     try:
         draft = aligner.draft(registration.pairs)
-        if draft.alignment.rms > limit("error of rough ground") * aligner.threshold:
+        if draft.alignment.rms > limit("error of rough ground") * aligner.threshold or not wanted(draft.alignment):
             return None
         return _aligned_anew(registration, aligner.completed(draft), aligner.paths, {})
     except RegistrationError:

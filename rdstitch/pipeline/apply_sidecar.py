@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
+from msgspec.structs import replace as replace_fields
 
 from rdstitch.arrays import FloatArray
+from rdstitch.camera_files.own_format import CameraRecord, camera_record, lens_fields
 from rdstitch.choices import ChannelOrder, MatchBy
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, PartialResultError
@@ -32,21 +35,13 @@ from rdstitch.results.messages import Message, told_once
 from rdstitch.results.messages import left_out as left_out_message
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
-from rdstitch.sidecar.write import (
-    VERSION,
-    georeference_fields,
-    identity_fields,
-    lens_fields,
-    output_geometry,
-    plain,
-    seams_fields,
-    to_output,
-    versions,
-)
+from rdstitch.sidecar.records import VERSION, Applied, ImageRecord
+from rdstitch.sidecar.write import output_record, seams_record, to_output, versions
 from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
 from rdstitch.system.progress import Progress, silent
+from rdstitch.system.records import to_jsonable
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -87,66 +82,64 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
 
     It can be applied like any other. Pairs are those of the sidecar that was applied, and stay there.
     """
-    then = result.saved.content
-    entries = [_image(result, index, dict(entry)) for index, entry in enumerate(then["images"])]
-    reference = next(
-        (index for index in (result.saved.reference, *range(len(entries))) if entries[index]["used"]), None
-    )
-    assert reference is not None, "an image without any image in it is never written"
+    then, saved = result.saved.record, result.saved
+    images = [_image(result, index) for index in range(len(then.images))]
+    # An image without any image in it is never written.
+    reference = next(index for index in (saved.reference, *range(len(images))) if images[index].used)
     source = result.sources[reference]
     assert source is not None
-    camera = source.camera
-    content = {
-        **then,
-        "version": VERSION,
-        "lambda_px": camera.distortion_px,
-        "lambda_focal": camera.distortion_focal,
-        "camera": {
-            **camera.turned(inverse(source.metadata.orientation)).as_dict(),
-            # How far the camera was determined then.
-            "lambda_std": then.get("lambda_std"),
-            **{name: then["camera"].get(name) for name in ("lens_covariance", "tilt_deg", "tilt_std_deg")},
-            "focal_std_px": _resized_std(then["camera"], camera.focal),
-        },
-        "focal_px": camera.focal,
-        "reference": source.name,
-        "output": {
-            **identity_fields(result.output, result.fingerprint),
-            **output_geometry(result.canvas, turned=result.saved.turned),
-            "georeference": georeference_fields(result.georeference, result.not_georeferenced),
-        },
-        "seams": seams_fields(result.seams, [source.name for source in result.placed.sources]),
-        "images": entries,
-        "pairs": [],
-        "options": {**then["options"], "composite": result.options.composite},
-        "versions": versions(),
-        "applied": {"sidecar": str(result.saved.path), "matched": result.matched},
-    }
-    return {key: plain(value) for key, value in content.items()}
+    # How far the camera was determined then.
+    determined = ("lens_covariance", "tilt_deg", "tilt_std_deg")
+    camera = replace_fields(
+        camera_record(source.camera.turned(inverse(source.metadata.orientation))),
+        lambda_std=then.lambda_std,
+        **{name: getattr(then.camera, name) for name in determined},
+        focal_std_px=_resized_std(then.camera, source.camera.focal),
+    )
+    now = replace_fields(
+        then,
+        version=VERSION,
+        lambda_px=camera.lambda_px,
+        lambda_focal=camera.lambda_focal,
+        camera=camera,
+        focal_px=camera.focal_px,
+        reference=source.name,
+        output=output_record(result, turned=saved.turned),
+        seams=seams_record(result.seams, [source.name for source in result.placed.sources]),
+        images=images,
+        pairs=[],
+        options={**then.options, "composite": result.options.composite},
+        versions=versions(),
+        applied=Applied(str(saved.path), result.matched),
+    )
+    content: dict[str, Any] = to_jsonable(now)
+    return content
 
 
-def _image(result: Recomposition, index: int, entry: dict[str, Any]) -> dict[str, Any]:
-    """One image's entry, brought up to date."""
+def _image(result: Recomposition, index: int) -> ImageRecord:
+    """One image's record, brought up to date."""
     source, image = result.sources[index], result.saved.images[index]
     if source is None or image.to_plane is None:
         reason = result.left_out[index].text if index in result.left_out else image.reason
         lens = {} if image.camera is None else lens_fields(image.camera)
-        return {**entry, **lens, "used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
+        gone = {"used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
+        return replace_fields(image, **lens, **gone, lambda2=UNSET)
     to_plane = result.placed.homographies[sum(earlier is not None for earlier in result.sources[:index])]
-    return {
-        **entry,
-        "name": source.name,
-        "path": str(source.path),
-        "size": source.camera.image_size,
+    return replace_fields(
+        image,
+        name=source.name,
+        path=str(source.path),
+        size=source.camera.image_size,
+        to_plane=to_plane.tolist(),
+        to_output=to_output(result.canvas, to_plane),
+        lambda2=UNSET,
         **lens_fields(source.camera),
-        "to_plane": to_plane,
-        "to_output": to_output(result.canvas, to_plane),
-    }
+    )
 
 
-def _resized_std(then: Mapping[str, Any], focal: float | None) -> float | None:
+def _resized_std(then: CameraRecord, focal: float | None) -> float | None:
     """The standard deviation that a focal length had, for the same lens on an image of another size."""
-    std, former = then.get("focal_std_px"), then.get("focal_px")
+    std, former = then.focal_std_px, then.focal_px
     return std * (focal / former) if std and former and focal else None
 
 
@@ -229,22 +222,23 @@ def apply(
     if strict and doubts:
         raise InputError(doubts[0].text)
     given = as_inputs(images, channel_order)
-    if saved.content.get("stage") is not None:
+    stage = saved.record.stage
+    if stage is not None:
         given = with_position_folders(given)
     with found_images(given, output=output, every=every, topic=topic) as listed, Outputs(overwrite) as outputs:
         if output is not None:
             check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
         given_frames: Sequence[Frame] = listed.frames
-        if (stage := saved.content.get("stage")) is not None:
-            given_frames, _, said = tile_frames(given_frames, stage.get("z"), stage.get("time"))
+        if stage is not None:
+            given_frames, _, said = tile_frames(given_frames, stage.z, stage.time)
             doubts += said
         chosen, matched, said = counterparts(saved, given_frames, match)
         doubts += said
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
         used = _used(saved, sources, left_out, mask, strict=strict)
-        if stage is not None and stage["pixel_um"] is not None:
-            used = {k: replace(s, metadata=replace(s.metadata, pixel_size=stage["pixel_um"])) for k, s in used.items()}
+        if stage is not None and stage.pixel_um is not None:
+            used = {k: replace(s, metadata=replace(s.metadata, pixel_size=stage.pixel_um)) for k, s in used.items()}
         if flat_field != "off":
             check_size(list(used.values()))
             corrected, said = with_flat_field(list(used.values()), flat_field)
@@ -306,13 +300,19 @@ def _same_grid(
     saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions
 ) -> tuple[FloatArray, tuple[int, int], Georeference | None] | None:
     """The pixels of the saved output, where images of the same sizes are to have the same: bands, and dates."""
-    output = saved.content["output"]
     asked = any(getattr(options, name) != getattr(saved.composite, name) for name in _GEOMETRY)
+    matrix, size = saved.plane_to_output, saved.record.output.size
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
-    if asked or not same_sizes or saved.turned or not options.same_turn(saved.composite) or not output.get("size"):
+    if (
+        asked
+        or not same_sizes
+        or saved.turned
+        or not options.same_turn(saved.composite)
+        or matrix is None
+        or size is None
+    ):
         return None
-    width, height = output["size"]
-    return np.array(output["plane_to_output"], dtype=np.float64), (width, height), saved.output_place
+    return matrix, size, saved.output_place
 
 
 def _lens_of_band(
@@ -344,7 +344,7 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens
         ],
         saved.turned,
         saved.place,
-        whole=saved.content.get("stage") is not None,
+        whole=saved.record.stage is not None,
         orientation=saved.orientation,
     )
 

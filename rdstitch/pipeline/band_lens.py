@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
@@ -72,7 +72,7 @@ def band_lens(
     Where the images show nothing in common, as masks do, nothing is known, and nothing changed. Raises InputError where
     images were evidently not taken from the same places.
     """
-    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_IMAGES)).astype(np.intp)).tolist()
+    chosen = evenly_spaced(len(pairs), _MAX_IMAGES).tolist()
     compared = [list(pairs.values())[k] for k in chosen]
     compared = [pair for pair in compared if pair[0].camera.image_size == pair[1].camera.image_size]
     if not compared:

@@ -14,7 +14,7 @@ from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
-from rdstitch.io import Layout, write_strips
+from rdstitch.io import ImageSpec, write_strips
 from rdstitch.io.encoding import Strip
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import written_strips
@@ -109,7 +109,7 @@ def _write_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, *, 
         count = samples.shape[2]
         names += [name] if count == 1 else [f"{name} {k}" for k in range(1, count + 1)]
     metadata = Metadata(first.canvas.size, channels=len(names), planes=True, channel_names=tuple(names))
-    layout = Layout(first.canvas.size, len(names), heads[0][0].dtype, transparent=True, metadata=metadata)
+    layout = ImageSpec(first.canvas.size, len(names), heads[0][0].dtype, transparent=True, metadata=metadata)
     tags = [] if first.georeference is None else first.georeference.tiff_tags()
     strips = map(joined, chain([heads], zip(*streams, strict=True)))
     with Outputs(overwrite) as outputs:

@@ -8,11 +8,14 @@ fills a good part of the images and moves of its own, what lies behind it.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 
 from rdstitch.alignment.result import Alignment
+from rdstitch.arrays import FloatArray
 from rdstitch.compositing.projection import PLANE
+from rdstitch.compositing.seam_quality import DIAGONAL
 from rdstitch.errors import ArgumentError, LimitError, RdstitchError
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.options.composite_options import CompositeOptions
@@ -20,7 +23,7 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import plane_of_most, realigned
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.compose import Layout
-from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
+from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally, straight_edges
 from rdstitch.pipeline.register import with_frontal_reference
 from rdstitch.pipeline.straighten import turned
 from rdstitch.pipeline.whole_pixels import on_whole_pixels
@@ -40,6 +43,10 @@ _CLEARLY = 0.5
 
 _MISFIT = 2.0
 """Times the errors of the most probable layout that another one may have."""
+
+_ELSEWHERE, _MOST = 3.0 / DIAGONAL, 0.95
+"""Of an image's diagonal: by how much another layout must move more than a few places of the overlaps for its seams to
+be others."""
 
 _BY_CHANCE = Message(
     "the images are no more alike where they were put together than anywhere else; take images that overlap more",
@@ -93,9 +100,13 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
     Pixels are those of the working size; with ``pano`` the output is always in the frame of an image.
     """
 
+    @cache
+    def edges(image: int) -> FloatArray:
+        return straight_edges(registration.sources[image])
+
     def laid(candidate: Registration, local: LocalAlignment | None = None) -> LaidOut:
         whole = on_whole_pixels(with_frontal_reference(at_full_size(candidate), options, always=pano))
-        local = align_registration_locally(whole, options.local_alignment) if local is None else local
+        local = align_registration_locally(whole, options.local_alignment, edges) if local is None else local
         one = lay_out(whole, local, options.composite)
         return one if options.dry_run else replace(one, layout=one.layout.decided(options.composite, options.threads))
 
@@ -109,7 +120,11 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         return _first(tried, failed)
     if tried and tried[0].local.fields and options.local_alignment == "auto":
         tried.append(laid(registration, no_local_alignment("seams hold better without it")))
-    for other in _others(registration, options, aligner, tried[0] if tried else None):
+    others = _others(registration, options, aligner, tried[0] if tried else None)
+    # Of those that nothing speaks against, the most probable is taken.
+    while not (tried and tried[-1].clipped <= tried[0].clipped and not any(tried[-1].faults)):
+        if (other := next(others, None)) is None:
+            break
         try:
             tried.append(laid(other))
         except (LimitError, ArgumentError):
@@ -143,7 +158,8 @@ def _others(
     if first is not None and first.layout.placed.has_place:  # a map needs a plane with a metric
         names = [name for name in names if name == "pose"]
     for name in names:
-        other = realigned(registration, replace(aligner, options=replace(aligner.options, model=name)))
+        by_name = replace(aligner, options=replace(aligner.options, model=name))
+        other = realigned(registration, by_name, partial(_differs, registration, allowed, stretched=stretched))
         if other is not None and _joins(other.alignment, alignment, allowed):
             reason = f"{other.alignment.model_reason.removesuffix('; as requested')}; seams break less than with a "
             reason += f"{alignment.model} model"
@@ -159,6 +175,22 @@ def _joins(other: Alignment, alignment: Alignment, allowed: float) -> bool:
     that nothing else does.
     """
     return bool((other.used >= alignment.used).all()) and other.rms <= allowed
+
+
+def _differs(registration: Registration, allowed: float, other: Alignment, *, stretched: bool) -> bool:
+    """Whether another alignment can have other seams: it joins the images, and puts them elsewhere on each other."""
+    alignment = registration.alignment
+    if not _joins(other, alignment, allowed):
+        return False
+    if stretched:
+        return True
+    moved = [np.zeros(1)]
+    for i, j in alignment.support:
+        points = _GRID * alignment.cameras[i].image_size
+        before, after = (one.transfer(i, j, points) for one in (alignment, other))
+        inside = ((before >= 0.0) & (before < alignment.cameras[j].image_size)).all(axis=1)
+        moved.append(np.linalg.norm(after - before, axis=1)[inside] / (2.0 * alignment.cameras[j].scale))
+    return not np.quantile(np.nan_to_num(np.concatenate(moved), nan=np.inf), _MOST) <= _ELSEWHERE
 
 
 def _is_stretched(layout: Layout) -> bool:

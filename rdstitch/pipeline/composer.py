@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.tables import CompositeTables
-from rdstitch.inputs.frame import in_order
+from rdstitch.inputs.frame import to_channel_order
 from rdstitch.options.composite_options import Interpolation
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.stitch_result import StitchResult
@@ -76,8 +76,8 @@ class Composer:
         ArgumentError
             When number, size or kind of the images is another.
         """
-        return in_order(
-            self._tables.compose([in_order(np.asarray(image), self._order) for image in images]), self._order
+        return to_channel_order(
+            self._tables.compose([to_channel_order(np.asarray(image), self._order) for image in images]), self._order
         )
 
 

@@ -12,12 +12,14 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import MatchBy
 from rdstitch.errors import InputError
+from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.frame import Frame, files_of
 from rdstitch.inputs.measurements import metres_around_median
-from rdstitch.io.metadata import GpsPosition, read_metadata
+from rdstitch.io.metadata import read_metadata
 from rdstitch.io.opening import check_readable
 from rdstitch.results.messages import Message, names_of, shortened
-from rdstitch.sidecar.read import ImageRecord, SavedRegistration
+from rdstitch.sidecar.read import SavedRegistration
+from rdstitch.sidecar.records import ImageRecord
 from rdstitch.system.file_access import canonical_name, canonical_text
 
 MatchedBy = Literal["name", "time", "position", "order"]

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.choices import LocalAlignmentMode
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.compositing.canvas import NearPart
@@ -19,8 +19,8 @@ from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference, Located, has_place
 from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.source import Source
-from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
@@ -32,10 +32,19 @@ _COMPARED, _COMPARED_SIDE = 8, 400
 """Images, and pixels of their longer side, that are compared to find what is static in them."""
 
 
-def align_registration_locally(registration: Registration, choice: LocalAlignmentMode) -> LocalAlignment:
+def straight_edges(source: Source) -> FloatArray:
+    """Ends (N, 2, 2) of the straight edges in an image, pixels."""
+    return line_segments(source.view(MEGAPIXELS))[0]
+
+
+def align_registration_locally(
+    registration: Registration,
+    choice: LocalAlignmentMode,
+    edges: Callable[[int], FloatArray] | None = None,
+) -> LocalAlignment:
     """Displacement fields of the images that are used, in their order, from the matches of all their pairs.
 
-    The registration is in pixels of the images.
+    The registration is in pixels of the images; ``edges`` are those of an image that fields should not bend.
     """
     if choice == "off":
         return no_local_alignment("switched off")
@@ -60,11 +69,11 @@ def align_registration_locally(registration: Registration, choice: LocalAlignmen
         choice,
         pairs=len(pairs),
         on_sphere=alignment.on_sphere,
-        edges=lambda image: line_segments(registration.sources[used[image]].view(MEGAPIXELS))[0],
+        edges=lambda image: edges(int(used[image])) if edges else straight_edges(registration.sources[used[image]]),
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlacedImages:
     """The images that are used, and where they belong."""
 
@@ -115,7 +124,7 @@ class PlacedImages:
         if self.whole or count < MIN_IMAGES:
             return None
         alike = [s for s, camera in zip(self.sources, self.cameras, strict=True) if camera.image_size == size]
-        chosen = np.linspace(0, count - 1, min(count, _COMPARED)).astype(np.intp).tolist()
+        chosen = evenly_spaced(count, _COMPARED).tolist()
         reduction = fitting_reduction(max(size) / _COMPARED_SIDE)
         return static_pixels([alike[k].read(reduction, keep=True).pixels for k in chosen])
 

@@ -259,7 +259,7 @@ def _stitch_found(listed: FoundImages, run: Run, outputs: Outputs, further: Sequ
     check_map(sources, options.composite)
     if run.beside.frame == "first":
         run = replace(run, options=replace(options, reference=sources[0].name))
-    with options.executor(len(sources)) as executor:
+    with run.executor(len(sources)) as executor:
         known = [*unread, *listed.messages]
         accepted = _accepted(sources, known, run, executor)
         first = accepted.alignment.used.tolist().index(True)
@@ -305,7 +305,7 @@ def calibrate(
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
         check_run(run, listed.files, ())
         sources, unread = read_inputs(with_times(listed.frames, options.timestamps), options, skip_bad=True)
-        with options.executor(len(sources)) as executor:
+        with run.executor(len(sources)) as executor:
             result = _finished(at_full_size(_accepted(sources, [*unread, *listed.messages], run, executor)))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
@@ -368,8 +368,8 @@ def trajectory(
         # Numbered as they were named: what is left out leaves a gap.
         frames = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
         sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
-        with options.executor(len(sources)) as executor:
-            run = Run(options, progress=progress, purpose=Purpose.TRAJECTORY)
+        run = Run(options, progress=progress, purpose=Purpose.TRAJECTORY)
+        with run.executor(len(sources)) as executor:
             registration = at_full_size(_accepted(sources, [*unread, *listed.messages, *notes], run, executor))
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its images are looked at.

@@ -1,9 +1,11 @@
 """What all stages of one run have in common."""
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
 from rdstitch.choices import Purpose
+from rdstitch.executors import open_executor
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.system.progress import Progress, silent
@@ -18,3 +20,8 @@ class Run:
     beside: FilesBeside = NOTHING_BESIDE
     progress: Progress = silent
     purpose: Purpose = Purpose.MOSAIC
+
+    def executor(self, images: int) -> Executor:
+        """Where the tasks of so many images are computed; to be used in a ``with`` block."""
+        options = self.options
+        return open_executor(options.threads, images, scheduler=options.scheduler, store=options.cache)

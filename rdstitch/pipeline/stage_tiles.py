@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.result import LinkFit, ReliefTest, Unused
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
+from rdstitch.export.places_files import fiji_list, places_table
 from rdstitch.features import Correspondences
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
@@ -49,18 +50,15 @@ from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.positions import (
     Scan,
-    fiji_list,
     grid_from_arrays,
     grid_from_names,
     grid_from_table,
     grid_from_tiles,
 )
 from rdstitch.stage.register_tiles import (
+    SearchPlan,
     TileRegistration,
-    coarse_factor,
-    places_table,
     register_tiles,
-    search_radius,
 )
 from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.system.opencv_state import one_opencv_thread
@@ -107,7 +105,7 @@ def tiles(
     run = Run(_stitch_options(options), output, beside, progress)
     with found_images(_as_tiles(inputs), output=output, topic=options.topic) as listed:
         registration, tiled = _registered(listed, run, options, positions_file)
-        with Outputs(options.overwrite) as outputs, run.options.executor(len(registration.sources)) as executor:
+        with Outputs(options.overwrite) as outputs, run.executor(len(registration.sources)) as executor:
             _write_beside(outputs, positions_file, options, registration, tiled)
             chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
             chosen = replace(chosen, layout=replace(chosen.layout, photographs=False))
@@ -273,13 +271,14 @@ def _placed(
     else:
         sources, said = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
-    search, factor = search_radius(nominal, options.search), coarse_factor(nominal)
-    grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, search)
+    plan = SearchPlan.of(nominal, options.search)
+    factor = plan.factor
+    grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
     if shown:
         said.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
-    tiled = register_tiles(grid, read, search=search, distortion=options.distortion, progress=progress)
+    tiled = register_tiles(replace(plan, grid=grid), read, distortion=options.distortion, progress=progress)
     for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
         read(index)
     if options.flat_field == "auto" and sources[0].flat_field is not None and not _overlaps_show(sources, tiled):
@@ -293,7 +292,7 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
     assert field is not None
     raw = [replace(source, flat_field=None) for source in sources]
     pairs = tiled.links.tiles[tiled.adjustment.weights > 0.5]
-    chosen = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _COMPARED)).astype(np.intp))]
+    chosen = pairs[evenly_spaced(len(pairs), _COMPARED)]
     places = tiled.adjustment.places
     compared = ((raw[a].read().pixels, raw[b].read().pixels, places[b] - places[a]) for a, b in chosen.tolist())
     return agrees_with_overlaps(field, compared)
@@ -380,17 +379,8 @@ def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registr
         reference=0,
         model="rigid",
         model_reason="a stage moves without turning",
-        poses=None,
-        tilt=None,
-        tilt_spread=0.0,
-        focal=None,
-        focal_std=None,
         distortion=fitted.distortion,
         distortion_std=fitted.distortion_std,
-        lens="division",
-        lens_reason="one parameter",
-        parameters=(),
-        covariance=np.empty((0, 0)),
         rms=rms,
         links=fits,
         relief=ReliefTest(False, 0.0, 0.0, "Taken to be flat: tiles on a stage."),

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.planar_motion import nearest_rotation
@@ -150,7 +150,7 @@ def _edges(placed: PlacedImages) -> Edges:
     to_reference = np.linalg.inv(placed.homographies[placed.reference]) @ placed.homographies
     segments, error = [], 0.0
     count = len(placed.sources)
-    for k in np.unique(np.linspace(0, count - 1, min(count, _MAX_IMAGES)).astype(np.intp)).tolist():
+    for k in evenly_spaced(count, _MAX_IMAGES).tolist():
         camera, (ends, pixel) = placed.cameras[k], line_segments(placed.sources[k].view(MEGAPIXELS))
         flat = camera.normalize(camera.undistort(ends.reshape(-1, 2))).reshape(-1, 2, 2)
         flat = flat[np.linalg.norm(flat[:, 1] - flat[:, 0], axis=1) > _MIN_LENGTH]

@@ -15,7 +15,7 @@ from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedImag
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.find import found_images
-from rdstitch.inputs.frame import Images, as_inputs, in_order
+from rdstitch.inputs.frame import Images, as_inputs, to_channel_order
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.read import DecodedImage
@@ -23,7 +23,7 @@ from rdstitch.io.write import write_image
 from rdstitch.pipeline.result_files import make_folder
 from rdstitch.results.messages import Message, ignored
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import IMAGE_SUFFIXES, check_outputs, file_name
+from rdstitch.system.outputs import WRITABLE_SUFFIXES, check_outputs, file_name
 from rdstitch.system.progress import Progress, silent
 
 _POINTS_PER_SIDE = 256
@@ -106,7 +106,7 @@ def undistort(
         for message in listed.messages:
             warn(message)
         if folder is None:
-            images = [in_order(_undistorted(source, view).pixels, channel_order) for source in sources]
+            images = [to_channel_order(_undistorted(source, view).pixels, channel_order) for source in sources]
             for message in guard.messages:
                 warn(message)
             return images
@@ -155,7 +155,7 @@ def _outputs(sources: Sequence[Source], folder: Path, image_format: ImageFormat 
 
 def _output_name(source: Source, image_format: ImageFormat | None) -> str:
     in_memory = source.frame is not None and source.frame.image is not None
-    if image_format is None and not in_memory and source.path.suffix.lower() in IMAGE_SUFFIXES:
+    if image_format is None and not in_memory and source.path.suffix.lower() in WRITABLE_SUFFIXES:
         return file_name(source.name)
     stem = source.name if in_memory else Path(file_name(source.name)).stem
     return f"{stem}.{image_format or ('png' if _fits_png(source) else 'tif')}"

@@ -47,7 +47,7 @@ class Focal:
         return Focal(math.exp(mean), float(weights.sum() ** -0.5))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Upright:
     """Directions (2, 3) that shall be horizontal and vertical, in the axes of the reference image's camera."""
 
@@ -119,7 +119,7 @@ def _aspect(sides: tuple[FloatArray, FloatArray], focal: float) -> float:
     return across / down
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Edges:
     """Straight edges, to which directions in the axes of the reference image's camera are parallel or not."""
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rdstitch.alignment.result import LinkFit
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.compositing.projection import PROJECTIONS
 from rdstitch.geometry.radial_homography import to_directions, to_plane
 from rdstitch.matching.two_view import PairRegistration
@@ -133,7 +133,7 @@ def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
 
 def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: float) -> list[Markup]:
     """Lines between points, spread evenly over the matches where there are too many."""
-    chosen = np.unique(np.linspace(0, max(len(starts) - 1, 0), min(len(starts), _MAX_LINES)).astype(int))
+    chosen = evenly_spaced(len(starts), _MAX_LINES)
     ends = zip(starts[chosen], stops[chosen], strict=True)
     return [line(start, stop, stroke=colour, stroke_opacity=opacity) for start, stop in ends]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rdstitch.compositing import Canvas, Composite, CompositePlan, FileComposite, SeamQuality
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference
-from rdstitch.inputs.frame import in_order
+from rdstitch.inputs.frame import to_channel_order
 from rdstitch.io.preview import encode_preview, read_preview
 from rdstitch.io.read import read_image
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
@@ -81,7 +81,7 @@ class OutputImage:
 
         An image that went to a file is read from there.
         """
-        return in_order(self._samples()[0], self.options.channel_order)
+        return to_channel_order(self._samples()[0], self.options.channel_order)
 
     @property
     def alpha(self) -> NDArray[np.uint8]:

@@ -24,7 +24,7 @@ _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
 _MATCHES_AT_ONCE = 1 << 14
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PairMatches:
     """Matches of one pair of images, and what is known of the cameras."""
 
@@ -133,7 +133,7 @@ def estimate_radial_homography(
     """
     camera1 = Camera(image_size, focal=focal, focal_source=None if focal is None else focal_source or "option")
     camera1 = (camera1 if center is None else replace(camera1, center=center)).with_focal()
-    options = EstimationOptions(solver, distortion, threshold, confidence, max_iterations, seed)
+    options = EstimationOptions(solver, threshold, confidence, max_iterations, seed, distortion)
     tilts = _tilts(tilt)
     p1, p2 = checked_matches(points1, points2)
     weights = None if quality is None else np.asarray(quality, dtype=np.float64)

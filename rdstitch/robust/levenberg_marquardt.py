@@ -17,7 +17,7 @@ FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e4
 _MIN_DAMPING = 1e-9
 
 
-@dataclass
+@dataclass(eq=False)
 class BatchedNormalEquations(Rows):
     """The loss of B problems at some parameters, and what a step from there takes."""
 

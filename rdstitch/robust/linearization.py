@@ -21,7 +21,7 @@ _ENTRY = np.zeros((3, 3), dtype=np.intp)
 _ENTRY[_PAIRS] = _ENTRY.T[_PAIRS] = np.arange(6)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PairLenses:
     """The lens of each of B pairs, in the half-diagonal frame; shapes (B,), and (B, 2) for the centre.
 
@@ -34,7 +34,7 @@ class PairLenses:
     center: FloatArray | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TransferDerivatives(Rows):
     """Errors of transfer and their derivatives, pairs first and matches last.
 

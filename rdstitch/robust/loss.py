@@ -4,12 +4,18 @@ Geman and McClure's ``e² / (1 + e²/w²)`` of an error's length e: the square f
 most, so that wrong matches lose their influence without ever being decided upon (Black and Rangarajan, IJCV 1996).
 """
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a two-dimensional normal vector of standard deviation 1: ``sqrt(2 log 2)``."""
+
+NORMAL_MEDIAN = 0.6745
+"""Median of the magnitude of a normal number of standard deviation 1."""
 
 PAIR_WIDTH, ALIGNMENT_WIDTH = 4.0, 3.5
 """Widths of the loss in standard deviations of an error's coordinate.
@@ -20,6 +26,11 @@ over 72 rendered pairs the median error of λ is 0.0017 at half that width, and 
 
 # Halved or doubled, it changes the median error of λ by a sixth at most.
 _MIN_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
+
+
+def normal_std(values: NDArray[Any]) -> float:
+    """Standard deviation of normal numbers about 0, among which there may be others, by their median magnitude."""
+    return float(np.median(np.abs(values))) / NORMAL_MEDIAN
 
 
 def noise_of(errors: FloatArray, threshold: FloatArray | float, fitted: int = 0) -> FloatArray:

@@ -16,7 +16,7 @@ _STEPS_PER_OCTAVE = 4
 _MIN_WIDTH = 16
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Measurements(Rows):
     """Matches of B pairs of images, normalized by half the diagonal of their image, padded to N a pair."""
 

@@ -18,7 +18,7 @@ _SAMPLED_DISTORTION = (0.0, -0.12, -0.3)
 Solve = Callable[[FloatArray, FloatArray, FloatArray | None], Solutions]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MinimalSolver:
     """A minimal solver."""
 

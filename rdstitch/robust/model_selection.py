@@ -17,7 +17,7 @@ from rdstitch.robust.refinement import Fits, PairEquations, PairProblems, refine
 _STEPS = 20  # of refinement; halved or doubled, the median error of λ changes by a sixth at most
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PairFit:
     """The chosen model of one pair, fitted."""
 
@@ -39,7 +39,7 @@ class _Fitted(NamedTuple):
     equations: PairEquations
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PairSelection:
     """B pairs for which a model is to be chosen."""
 

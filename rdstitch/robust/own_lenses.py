@@ -24,7 +24,7 @@ _OWN_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of image 1, λ of image 2, μ, and
 _ITERATIONS = 20
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OwnLenses:
     """λ of both images of a pair, half-diagonal frame."""
 

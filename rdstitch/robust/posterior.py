@@ -65,6 +65,9 @@ _SIZES = 14
 
 _EXACT_STD = 1e-6
 
+_MODE_STEPS = 50
+"""From a part of a mixture to the least cost near it."""
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -89,11 +92,14 @@ class Prior:
         return sum(share / std**2 for share, (_, _, std) in self._shares(value))
 
     def combined(self, value: float, std: float) -> float:
-        """Where a measurement, and the part of the mixture that it comes from the most likely, put the parameter."""
+        """Where a measurement and the prior put the parameter: where their cost is least about its likeliest part."""
         weight, mean, scatter = np.array(self.parts).T
         spread = np.hypot(scatter, std)
         part = int(np.argmax(np.log(weight / spread) - ((value - mean) / spread) ** 2 / 2.0))
-        return float(value + (mean[part] - value) * (std / spread[part]) ** 2)
+        found = float(value + (mean[part] - value) * (std / spread[part]) ** 2)
+        for _ in range(_MODE_STEPS):
+            found -= (self.slope(found) + (found - value) / std**2) / (self.curvature(found) + std**-2)
+        return found
 
     @cached_property
     def _heights(self) -> list[float]:
@@ -157,7 +163,7 @@ WRONG_GIVEN_FOCAL = 0.02, 0.2
 TILT = Prior(((0.8, 0.0, math.radians(20.0)), (0.2, 0.0, math.radians(45.0))))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ErrorCost:
     """What the errors of G problems say of a hypothesis, each array (G,)."""
 
@@ -167,7 +173,7 @@ class ErrorCost:
     count: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """Cells of the overlaps of links, by which hypotheses on the same matches are compared, for G problems at once."""
 

@@ -32,7 +32,7 @@ _LOCAL_STEPS = 4
 _GOLDEN = 0.618034  # its multiples are spread evenly, whatever their number
 
 
-@dataclass
+@dataclass(eq=False)
 class Hypotheses(Rows):
     """For each of B pairs a homography with λ, and how well it explains the matches."""
 
@@ -68,7 +68,7 @@ class Hypotheses(Rows):
         return cls(homography, distortion, missed / data.count, inliers, np.full(len(data), solver))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Search:
     """What RANSAC found."""
 

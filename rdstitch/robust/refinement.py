@@ -17,7 +17,7 @@ from rdstitch.robust.pair_models import PairModel
 _STATE = 9  # numbers of a state of any pair model; before these, parameters have those of the lens
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fits(Rows):
     """One model fitted to the matches of B pairs."""
 
@@ -31,7 +31,7 @@ class Fits(Rows):
         return np.column_stack([self.distortion, self.state])
 
 
-@dataclass
+@dataclass(eq=False)
 class PairEquations(BatchedNormalEquations):
     """The equations of B pairs, and what they were made from."""
 
@@ -46,7 +46,7 @@ class PairEquations(BatchedNormalEquations):
         return self.noise**2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PairProblems:
     """Refinement of B pairs as problems of least squares.
 

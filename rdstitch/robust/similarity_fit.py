@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 
 OUTLYING = 3.0
 """Standard deviations from which on a point is an outlier."""
@@ -36,7 +36,7 @@ def fit_similarity(source: Points, target: Points, std: float) -> SimilarityFit:
     residual counts where that is more.
     """
     count = len(source)
-    anchors = np.unique(np.linspace(0, count - 1, min(count, _ANCHORS)).astype(np.intp))
+    anchors = evenly_spaced(count, _ANCHORS)
     one, two = (anchors[side] for side in np.triu_indices(len(anchors), 1))
     apart = source[two] - source[one]
     scale = np.divide(target[two] - target[one], apart, out=np.zeros_like(apart), where=apart != 0)

@@ -62,7 +62,7 @@ def five_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
     return solve_in_blocks(solve, x1, x2, 5)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DirectionEquation(SampleArrays):
     """The equation of :func:`five_point`."""
 

@@ -63,7 +63,7 @@ def four_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
     return solve_in_blocks(solve, x1, x2, 4)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class QuarticEquation(SampleArrays):
     """The quartic in H that is invariant to rotations of the camera frame, of degree 18 in λ.
 
@@ -120,7 +120,7 @@ class QuarticEquation(SampleArrays):
         return value
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SexticEquation(SampleArrays):
     """``tr(adj H)³ = det(H) tr(H)³`` without its common factor ``(α_0 α_1 α_2 α_3)²``: of degree 16 in λ.
 

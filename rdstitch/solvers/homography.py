@@ -23,7 +23,7 @@ from rdstitch.solvers.lines import Lines, squared_radii, triangle_determinants
 _COLLINEAR = 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Quadrangles(SampleArrays):
     """Samples of four or more points, of which the first four have a homography for every λ."""
 

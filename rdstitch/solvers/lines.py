@@ -16,7 +16,7 @@ from rdstitch.solvers.batch import SampleArrays
 _RING = [1, 2, 0, 1]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lines(SampleArrays):
     """Lines in both images."""
 

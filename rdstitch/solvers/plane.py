@@ -26,7 +26,7 @@ _MIN_DEPTH = 1e-9
 _MIN_SEPARATION = 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TiltRotations(SampleArrays):
     """Rotations of the two images' tilts."""
 

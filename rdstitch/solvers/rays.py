@@ -21,7 +21,7 @@ from rdstitch.solvers.lines import squared_radii
 from rdstitch.solvers.solutions import Solutions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RayPairs(SampleArrays):
     """Pairs of rays, P of them in each sample."""
 

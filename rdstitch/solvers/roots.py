@@ -97,7 +97,7 @@ def polish(equation: Equation, start: FloatArray, slope: FloatArray, half: Float
     return np.where(improved, closer - second, start)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Brackets:
     """Intervals in [-1, 1] that hold one root each, by polynomial."""
 

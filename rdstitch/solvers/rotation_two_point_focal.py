@@ -65,7 +65,7 @@ def rotation_two_point_focal(
     return solve_in_blocks(solve, x1, x2, 2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _AngleEquation(SampleArrays):
     """The equation of :func:`rotation_two_point_focal`, homogeneous in (1 - t, t)."""
 

@@ -10,7 +10,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solutions:
     """All solutions of a batch of samples; a sample may have none or several.
 

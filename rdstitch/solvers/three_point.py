@@ -112,7 +112,7 @@ def _in_front(points: FloatArray, state: FloatArray) -> BoolArray:
     return np.asarray((depth > 0.0).all(axis=(0, 1)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DistanceSystem(SampleArrays):
     """The three equations of :func:`three_point`."""
 

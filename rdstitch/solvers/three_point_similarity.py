@@ -71,7 +71,7 @@ def three_point_similarity(
     return solve_in_blocks(solve, x1, x2, 3)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DistanceRatioEquation(SampleArrays):
     """The equation of :func:`three_point_similarity`."""
 

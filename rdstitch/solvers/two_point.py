@@ -64,7 +64,7 @@ def two_point(
     return solve_in_blocks(solve, x1, x2, 2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DistanceEquation(SampleArrays):
     """``|m|² (ŵ_1 ŵ_2)² - |m̂|² (w_1 w_2)² = 0``."""
 

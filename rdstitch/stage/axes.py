@@ -20,7 +20,7 @@ _RIGHT_ANGLE = 0.1  # radians that the two axes may be off it
 _SIMILAR = 0.2  # share by which the steps of pairs may differ to be compared with each other
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Axis:
     """What pairs of neighbours along one of the stage's axes show."""
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.io.reduction import block_mean
+from rdstitch.robust.loss import normal_std
 from rdstitch.system.late_imports import fft
 
 Image = NDArray[np.float32]
@@ -38,7 +39,7 @@ def _count(length: int, side: int) -> int:
     return max(1, min(round(length / side * _BLOCKS), length // _LEAST_SIDE))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Overlap:
     """Two tiles and what they should have in common."""
 
@@ -88,7 +89,7 @@ class Overlap:
         return np.array(parts, dtype=np.intp)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surfaces:
     """Correlation of each block over all displacements within a radius."""
 
@@ -136,14 +137,18 @@ def correlate(first: Image, second: Image, overlap: Overlap, reach: int) -> Surf
     product = spectra[0] * np.conj(spectra[1])
     rows, columns = (np.arange(-reach, reach + 1) % side for side in shape)
     plain = fft.irfft2(product.sum(axis=0), s=shape)[rows[:, None], columns]
-    floor = np.float32(_NOISE_SHARE) * np.sqrt(noise[0] * noise[1]).astype(np.float32)
-    product /= np.abs(product) + floor[:, None, None] + np.float32(1e-12)
+    _whiten(product, noise[0][:, None, None], noise[1][:, None, None])
     power = float((np.abs(product) ** 2).sum()) * 2.0
     surface = fft.irfft2(product, s=shape) * (shape[0] * shape[1] / np.sqrt(power + 1e-12))
     return Surfaces(surface[:, rows[:, None], columns].astype(np.float16), plain)
 
 
-@dataclass(frozen=True)
+def _whiten(product: NDArray[np.complexfloating], noise1: FloatArray, noise2: FloatArray) -> None:
+    """Make all frequencies of a product of spectra as strong as they are sure, by the noise power of both."""
+    product /= np.abs(product) + (_NOISE_SHARE * np.sqrt(noise1 * noise2)).astype(np.float32) + np.float32(1e-12)
+
+
+@dataclass(frozen=True, eq=False)
 class CoarseTile:
     """A tile as overlaps are looked for."""
 
@@ -239,7 +244,7 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
     spectra = fft.rfft2(frames)
     product = spectra[0] * np.conj(spectra[1])
     plain = fft.irfft2(product, s=shape)
-    product /= np.abs(product) + np.float32(_NOISE_SHARE * math.sqrt(noise[0] * noise[1])) + np.float32(1e-12)
+    _whiten(product, *np.array(noise))
     surface = fft.irfft2(product, s=shape)
     y, x = (
         np.where(np.arange(n) < side, np.arange(n), np.arange(n) - n) for n, side in zip(shape, sizes[0], strict=True)
@@ -250,7 +255,7 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
     aside = (np.abs(y)[:, None] > _ASIDE * height) | (np.abs(x) > _ASIDE * width)
     broad = (common[0][:, None] > 0.5 * height) | (common[1] > 0.5 * width)
     possible = aside & broad & (common[0][:, None] > least[0]) & (common[1] > least[1])
-    deviation = float(np.median(np.abs(surface[possible]))) / 0.6745 + 1e-12
+    deviation = normal_std(surface[possible]) + 1e-12
     found: dict[tuple[int, int], None] = {}
     # A pattern that repeats itself is as high in many places of the plain correlation, and in chance ones of the other.
     for values, threshold in ((surface, peak_threshold(deviation, surface.size)), (plain, 0.0)):
@@ -292,8 +297,7 @@ def noise_variance(part: Image) -> float:
     """Variance of white noise in an image, by second differences, which content hardly has; half of them count."""
     rows = part[::2]
     second = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]
-    deviation = float(np.median(np.abs(second))) / 0.6745
-    return deviation**2 / 6.0
+    return normal_std(second) ** 2 / 6.0
 
 
 @lru_cache(maxsize=64)

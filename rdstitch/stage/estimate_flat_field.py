@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.io.flat_field import FlatField
 from rdstitch.io.reduction import block_mean
+from rdstitch.robust.loss import NORMAL_MEDIAN, normal_std
 
 LEAST_TILES = 20  # fewer show one flat field as well as another
 LARGEST_ERROR = 0.01  # root mean square, by which two halves of the tiles may differ from their mean
@@ -32,7 +33,7 @@ _TRUNCATED = 0.9113  # variance of a standard normal number within 2.5 of its me
 _BINS, _LEAST_BINS, _LEAST_IN_BIN = 24, 6, 16
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Illumination:
     """The flat field that tiles show, or why they do not."""
 
@@ -83,7 +84,7 @@ def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
     second = _cells(np.abs(rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]))
     second, light = (np.take_along_axis(values, ground, axis=-1) for values in (second, _cells(rows[:, 1:-1])))
     # Squares of what is within 2.5 standard deviations, which whole numbers do not make coarse as their median is.
-    inside = second <= np.maximum(np.median(second, axis=-1, keepdims=True), 1.0) * (2.5 / 0.6745)
+    inside = second <= np.maximum(np.median(second, axis=-1, keepdims=True), 1.0) * (2.5 / NORMAL_MEDIAN)
     variance = np.where(inside, second**2, 0.0).sum(axis=-1) / np.maximum(inside.sum(axis=-1), 1) / _TRUNCATED
     return np.asarray(light.mean(axis=-1)), np.asarray(variance / 6.0)
 
@@ -196,7 +197,7 @@ def _fitted(light: FloatArray) -> FloatArray:
     for _ in range(5):
         solution = np.linalg.lstsq(matrix * weights[:, None], right * weights, rcond=None)[0]
         residual = right - matrix @ solution
-        scale = max(float(np.median(np.abs(residual))) / 0.6745, 1e-12)
+        scale = max(normal_std(residual), 1e-12)
         weights = 1.0 / (1.0 + (residual / (3.0 * scale)) ** 2)
     return np.asarray(solution)
 

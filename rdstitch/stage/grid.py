@@ -13,7 +13,7 @@ _SAME_LINE = 0.25  # share of a tile within which places belong to one row or co
 _MIN_OVERLAP = 0.3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TileGrid:
     """Nominal places of tiles."""
 

@@ -133,13 +133,6 @@ def _fiji_places(text: str, file: str | Path) -> dict[str, tuple[float, float]]:
     return table
 
 
-def fiji_list(names: Sequence[str], places: FloatArray) -> str:
-    """The places as Fiji's list of tiles."""
-    heading = ("# Define the number of dimensions we are working on", "dim = 2", "", "# Define the image coordinates")
-    lines = [f"{name}; ; ({x:.3f}, {y:.3f})" for name, (x, y) in zip(names, places.tolist(), strict=True)]
-    return "\n".join([*heading, *lines, ""])
-
-
 def grid_from_arrays(
     positions: Any, numbers: Sequence[int], size: tuple[int, int], pixel_size: float | None
 ) -> TileGrid:

@@ -25,7 +25,7 @@ Transfer = Callable[[FloatArray], FloatArray]
 Gradient = list[NDArray[np.float32]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BlockMatches:
     """Matches of the blocks of overlaps."""
 

@@ -1,18 +1,17 @@
 """From nominal places and tiles to all places: correlate, learn the stage, refine, adjust."""
 
-import csv
-import io
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.stage.adjustment import Adjustment, LinkedPoints, adjust
+from rdstitch.robust.loss import normal_std
+from rdstitch.stage.adjustment import Adjustment, adjust
 from rdstitch.stage.correlation import (
     CoarseTile,
     Overlap,
@@ -24,6 +23,7 @@ from rdstitch.stage.correlation import (
     wide_peaks,
 )
 from rdstitch.stage.grid import TileGrid
+from rdstitch.stage.linked_points import LinkedPoints
 from rdstitch.stage.refinement import BlockMatches, Transfer, refine
 from rdstitch.system.late_imports import csgraph, sparse
 from rdstitch.system.progress import Progress, silent
@@ -33,30 +33,32 @@ Reader = Callable[[int], NDArray[Any]]
 
 _Tile = TypeVar("_Tile")
 
-COARSE_SIDE = 512  # pixels of the longer side of a tile that are enough to find a displacement to a pixel of theirs
-# displacement from the nominal place that is searched where the user does not say, share of the longer side
-_SEARCH = 0.05
-# largest displacement of an overlap's blocks against each other that the lens may add, share of the longer side
-_LENS_REACH = 0.02
-_LENSES = np.linspace(-0.04, 0.04, 21)  # values of λ that are tried before it is estimated
-_NARROW = 2  # pixels about where others say that a pair is: peaks are kept that rise above the noise of so few
+# What is searched; sides are longer sides of tiles.
+_COARSE_SIDE = 512  # pixels that are enough to find a displacement to a pixel of theirs
+_SEARCH = 0.05  # of a side: displacement from the nominal place where the user does not say
+_MIN_OVERLAP = 0.02  # of a side: overlap that is compared at least
+_NARROW = 2  # coarse pixels about where others say that a pair is: peaks are kept above the noise of so few
 _CANDIDATES = 8  # highest peaks of a pair that are compared by normalized cross-correlation
-_AGREES = 0.25  # weight of a pair from which on it holds its tiles
-_LEAST_BLOCK = 0.02  # overlap that is compared at least, share of the longer side
-_POOR = 6.0  # nats below which a pair is looked for elsewhere: a correlation of about 0.6
-_RIVAL = 4.6  # nats from which on a place is possible that the whitened correlation does not show: a hundred to one
-_SHOWS = 0.5  # share of the variance of a tile that must be content to look for it elsewhere
-_SURE = 0.99  # probability that one place of a pair must have among all that are possible
-_ASTRAY = 1e-3  # probability that a tile is anywhere but where its stage was sent, within its errors
-_LARGEST_STD = 1.0  # coarse pixels
 _ROUNDS = 4  # by which what is certain of the stage decides about what was not
-# λ is taken where pairs along rows and pairs along columns show it by so many standard deviations each
-_LENS_SHOWN = 5.0
-_LENS_AGREES = 0.25  # and where the two differ by no more than so much of it, beyond chance
-_WHOLE_PIXEL = 0.5  # and where corners move farther than by leaving whole pixels
+
+# What decides about a place of a pair. Evidence is in nats: logarithms of odds.
+_POOR = 6.0  # nats below which a pair is looked for elsewhere: a correlation of about 0.6
+_RIVAL = 4.6  # nats from which on a place is possible that the whitened correlation does not show: 100 to 1
+_SURE = math.log(99.0)  # nats of one place of a pair against all others that are possible
+_MOVED = math.log(1e-3)  # nats for that a tile is anywhere but where its stage was sent, within its errors
+_MIN_CONTENT = 0.5  # share of the variance of a tile that must be content to look for it elsewhere
+_AGREES = 0.25  # weight of a pair from which on it holds its tiles
+_MAX_STD = 1.0  # coarse pixels: a refined place that is less sure than that was not found
+
+# When a lens is taken to be there.
+_LENSES = np.linspace(-0.04, 0.04, 21)  # values of λ that are tried before it is estimated
+_LENS_REACH = 0.02  # of a side: largest displacement of an overlap's blocks against each other by the lens
+_LENS_SHOWN = 5.0  # standard deviations that pairs along rows and pairs along columns must show each
+_LENS_AGREES = 0.25  # of λ: by how much the two may differ beyond chance
+_WHOLE_PIXEL = 0.5  # pixels by which a lens must move corners: leaving whole pixels costs as much
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TileRegistration:
     """The places of all tiles, and the matches that show them."""
 
@@ -88,60 +90,67 @@ class TileRegistration:
         return 2 * int(self.linked.sum()) < len(self.grid)
 
 
-def search_radius(grid: TileGrid, search: float | None) -> float:
-    """How far neighbours may be off, pixels."""
-    return _SEARCH * max(grid.size) if search is None else search
+@dataclass(frozen=True)
+class SearchPlan:
+    """How neighbours are looked for."""
 
+    grid: TileGrid
+    search: float  # how far they may be off, pixels
+    factor: int  # by which tiles are made smaller
 
-def coarse_factor(grid: TileGrid) -> int:
-    """By how much tiles are made smaller to be looked for."""
-    return max(1, round(max(grid.size) / COARSE_SIDE))
+    @classmethod
+    def of(cls, grid: TileGrid, search: float | None = None) -> "SearchPlan":
+        """By what the user says of the search, or as usual."""
+        side = max(grid.size)
+        return cls(grid, _SEARCH * side if search is None else search, max(1, round(side / _COARSE_SIDE)))
+
+    @property
+    def stage_std(self) -> float:
+        """Standard deviation of where the stage goes, pixels, of which the search is three."""
+        return self.search / 3.0
 
 
 def register_tiles(
-    grid: TileGrid,
+    plan: SearchPlan,
     read: Reader,
     *,
-    search: float | None = None,
     distortion: float | Literal["auto"] | None = None,
     progress: Progress = silent,
 ) -> TileRegistration:
-    """Find the places of all tiles; ``search`` is how far neighbours may be off, pixels.
+    """Find the places of all tiles.
 
     ``distortion`` is λ where it is known, "auto" where it is to be estimated; otherwise it is 0 unless pairs along rows
     and pairs along columns show the same.
     """
-    search, factor = search_radius(grid, search), coarse_factor(grid)
-    pairs = grid.neighbours(search)
+    pairs = plan.grid.neighbours(plan.search)
     known = distortion if isinstance(distortion, float | int) else None
-    finder = _PairFinder(grid, pairs, factor, search)
+    finder = _PairFinder(plan, pairs)
     candidates, lens = finder.candidates(read, known, progress)
-    chosen, rough = _chosen(grid, pairs, candidates, factor, search, lens)
+    chosen, rough = _chosen(pairs, candidates, plan, lens)
     if not chosen:
-        return _result(grid, pairs, _links(pairs, {}), rough, search)
+        return _result(plan, pairs, LinkedPoints.of(pairs, {}), rough)
     matches: dict[int, BlockMatches] = {}
-    camera = Camera(grid.size, lens)
-    numbers = sorted(chosen)
-    for count, (one, two) in enumerate(_in_pairs(read, pairs[numbers])):
-        number = numbers[count]
-        offset = chosen[number]
+    camera = Camera(plan.grid.size, lens)
+    tiles = _in_pairs(read, pairs[list(chosen)])
+    for count, ((number, offset), (one, two)) in enumerate(zip(chosen.items(), tiles, strict=True)):
         overlap = finder.overlap(number, offset, 1)
-        for cells in (overlap.cells(grid.size), overlap.whole):
+        for cells in (overlap.cells(plan.grid.size), overlap.whole):
             cut = replace(overlap, blocks=cells)
-            refined = refine(one, two, cells, _transfer(cut, offset, camera), factor + 1.5)
+            refined = refine(one, two, cells, _transfer(cut, offset, camera), plan.factor + 1.5)
             # What is less sure than the coarse place was not found by looking around that.
-            if refined.std < _LARGEST_STD * factor:
+            if refined.std < _MAX_STD * plan.factor:
                 matches[number] = refined
                 break
         progress("refining", count + 1, len(chosen))
-    links = _links(pairs, matches)
-    return _result(grid, pairs, links, _with_lens(grid, links, search / 3.0, lens, distortion), search)
+    links = LinkedPoints.of(pairs, matches)
+    return _result(plan, pairs, links, _with_lens(plan, links, lens, distortion))
 
 
 def _with_lens(
-    grid: TileGrid, links: LinkedPoints, std: float, lens: float, wanted: float | Literal["auto"] | None
+    plan: SearchPlan, links: LinkedPoints, lens: float, wanted: float | Literal["auto"] | None
 ) -> Adjustment:
     """All places, with λ where it is asked for, or where it is there."""
+    grid, std = plan.grid, plan.stage_std
     if isinstance(wanted, float | int):
         return adjust(grid, links, std, float(wanted))
     straight = adjust(grid, links, std)
@@ -170,7 +179,7 @@ def _lens_is_there(grid: TileGrid, links: LinkedPoints, std: float, lens: float)
     return apart and a * b > 0.0 and all(abs(value) > _LENS_SHOWN * deviation for value, deviation in shown)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Candidates:
     """Where the second tile of a pair may be in the first."""
 
@@ -178,16 +187,25 @@ class _Candidates:
     nats: FloatArray  # (K,): evidence for each, see :func:`log_evidence`
     grain: float  # pixels within which two of them are one
 
+    def apart(self, index: int) -> BoolArray:
+        """Which others (K,) are another place than one of them."""
+        return np.asarray(np.abs(self.offsets - self.offsets[index]).max(axis=1) > self.grain)
+
+    def best_besides(self, index: int) -> float:
+        """The most evidence, nats, for any other place than one of them; 0 for none."""
+        return float(self.nats[self.apart(index)].max(initial=0.0))
+
 
 class _PairFinder:
     """Looks for the second tile of each pair in the first, on coarse tiles."""
 
-    def __init__(self, grid: TileGrid, pairs: IntArray, factor: int, search: float) -> None:
-        self.grid, self.pairs, self.factor = grid, pairs, factor
+    def __init__(self, plan: SearchPlan, pairs: IntArray) -> None:
+        self.grid, self.pairs, self.factor = plan.grid, pairs, plan.factor
+        grid, factor = plan.grid, plan.factor
         side = max(grid.size)
-        self.radius = max(2, math.ceil(search / factor))
+        self.radius = max(2, math.ceil(plan.search / factor))
         self.spare = math.ceil(_LENS_REACH * side / factor)
-        self.least = math.ceil(_LEAST_BLOCK * side)
+        self.least = math.ceil(_MIN_OVERLAP * side)
         self.sizes = grid.sizes
         self.coarse = Camera((-(-grid.size[0] // factor), -(-grid.size[1] // factor)))
 
@@ -248,7 +266,7 @@ class _PairFinder:
             if len(offsets) < len(likely) or value > _RIVAL:
                 offsets.append(offset)
                 nats.append(value)
-        if max(nats, default=0.0) < _POOR and min(tile.content_share for tile in tiles) > _SHOWS:
+        if max(nats, default=0.0) < _POOR and min(tile.content_share for tile in tiles) > _MIN_CONTENT:
             places, values = wide_peaks(tiles)
             offsets, nats = [*offsets, *places], [*nats, *values.tolist()]
         return _Candidates(self.factor * np.array(offsets).reshape(-1, 2), np.array(nats), self.factor * grain)
@@ -265,44 +283,56 @@ def _vertex(surface: FloatArray, x: int, y: int) -> FloatArray:
 
 
 def _chosen(
-    grid: TileGrid, pairs: IntArray, candidates: Sequence[_Candidates], factor: int, search: float, lens: float
+    pairs: IntArray, candidates: Sequence[_Candidates], plan: SearchPlan, lens: float
 ) -> tuple[dict[int, FloatArray], Adjustment]:
     """Where the second tile of a pair is in the first, by pair, where one place stands out; and all places by that.
 
     What is certain teaches what the stage does, and that decides among the places of the other pairs.
     """
     chosen: dict[int, FloatArray] = {}
-    std = search / 3.0
-    fitted = adjust(grid, _links(pairs, {}), std, lens)
-    outside = math.log(float(np.prod(grid.size)))
+    fitted = adjust(plan.grid, LinkedPoints.of(pairs, {}), plan.stage_std, lens)
     for count in range(_ROUNDS):
         before = dict(chosen)
         doubted = {number for number, weight in zip(chosen, fitted.weights, strict=True) if weight < _AGREES}
         for number, of_pair in enumerate(candidates):
             if not len(of_pair.nats) or (number in chosen and number not in doubted):
                 continue
-            expected, covariance = fitted.between(pairs[number])
-            covariance = covariance + np.eye(2) * (factor / 2.0) ** 2
-            off = of_pair.offsets - expected
-            log_prior = -0.5 * np.einsum("ki,ij,kj->k", off, np.linalg.inv(covariance), off) - 0.5 * math.log(
-                (2.0 * math.pi) ** 2 * float(np.linalg.det(covariance))
-            )
-            score = of_pair.nats + np.logaddexp(log_prior, math.log(_ASTRAY) - outside)
-            best = int(score.argmax())
-            # Nothing of what was found may be right, either.
-            apart = np.abs(of_pair.offsets - of_pair.offsets[best]).max(axis=1) > of_pair.grain
-            others = np.append(score[apart], -outside)
             chosen.pop(number, None)
-            sure = score[best] - np.logaddexp.reduce(others) > math.log(_SURE / (1.0 - _SURE))
+            best, odds = _most_likely(of_pair, *fitted.between(pairs[number]), plan)
             # What is likely wherever the stage is goes first, and what is so only near where it should be second.
-            if sure and (count > 0 or of_pair.nats[best] > _RIVAL):
+            if odds > _SURE and (count > 0 or of_pair.nats[best] > _RIVAL):
                 chosen[number] = of_pair.offsets[best]
-        chosen.update(_moved_tiles(pairs, candidates, fitted, chosen, search))
+        chosen.update(_moved_tiles(pairs, candidates, fitted, chosen, plan.search))
         chosen = dict(sorted(chosen.items()))
         if count > 0 and {k: v.tolist() for k, v in chosen.items()} == {k: v.tolist() for k, v in before.items()}:
             break
-        fitted = adjust(grid, _coarse_links(grid, pairs, chosen, factor), std, lens)
+        fitted = adjust(plan.grid, _coarse_links(pairs, chosen, plan), plan.stage_std, lens)
     return chosen, fitted
+
+
+def _most_likely(
+    candidates: _Candidates, expected: FloatArray, covariance: FloatArray, plan: SearchPlan
+) -> tuple[int, float]:
+    """The candidate that is likely the most where the stage leads one to expect it, and the logarithm of its odds."""
+    covariance = covariance + np.eye(2) * (plan.factor / 2.0) ** 2
+    off = candidates.offsets - expected
+    log_prior = -0.5 * np.einsum("ki,ij,kj->k", off, np.linalg.inv(covariance), off) - 0.5 * math.log(
+        (2.0 * math.pi) ** 2 * float(np.linalg.det(covariance))
+    )
+    anywhere = -math.log(float(np.prod(plan.grid.size)))
+    score = candidates.nats + np.logaddexp(log_prior, _MOVED + anywhere)
+    best = int(score.argmax())
+    # Nothing of what was found may be right, either.
+    others = np.append(score[candidates.apart(best)], anywhere)
+    return best, float(score[best] - np.logaddexp.reduce(others))
+
+
+class _Move(NamedTuple):
+    """A candidate of a pair, as a move of one of its tiles away from where the stage was sent."""
+
+    pair: int
+    candidate: int  # its number among those of the pair
+    nats: float
 
 
 def _moved_tiles(
@@ -320,31 +350,30 @@ def _moved_tiles(
     for tile, numbers in of_tile.items():
         if any(number in chosen or number in found for number in numbers):
             continue
-        moves, nats = list[FloatArray](), list[FloatArray]()
-        owner, index = list[int](), list[int]()
-        for number in numbers:
-            expected, _ = fitted.between(pairs[number])
-            sign = 1.0 if pairs[number][1] == tile else -1.0
-            moves.append(sign * (candidates[number].offsets - expected))
-            nats.append(candidates[number].nats)
-            owner += [number] * len(candidates[number].nats)
-            index += range(len(candidates[number].nats))
-        move, value, pair = np.concatenate(moves), np.concatenate(nats), np.array(owner, dtype=np.intp)
-        near = np.abs(move[:, None] - move).max(axis=2) <= search
-        together = [sum(value[row & (pair == n)].max(initial=0.0) for n in set(owner)) for row in near]
-        best = int(np.argmax(together)) if together else -1
-        if best < 0 or np.abs(move[best]).max() <= search:
+        signs = [1.0 if pairs[number][1] == tile else -1.0 for number in numbers]
+        moved = [s * (candidates[n].offsets - fitted.between(pairs[n])[0]) for s, n in zip(signs, numbers, strict=True)]
+        moves = [_Move(n, k, nats) for n in numbers for k, nats in enumerate(candidates[n].nats.tolist())]
+        place, agreeing = _largest_group(np.concatenate(moved), moves, search)
+        if np.abs(place).max() <= search:
             continue
-        margins: dict[int, tuple[float, int]] = {}
-        for number in {owner[k] for k in np.flatnonzero(near[best])}:
-            own = candidates[number]
-            k = index[max(np.flatnonzero(near[best] & (pair == number)), key=value.__getitem__)]
-            apart = np.abs(own.offsets - own.offsets[k]).max(axis=1) > own.grain
-            margins[number] = own.nats[k] - own.nats[apart].max(initial=0.0), k
-        shown = {number: k for number, (margin, k) in margins.items() if margin > 0.0}
-        if len(shown) > 1 and sum(margins[n][0] for n in shown) > math.log(_SURE / (1.0 - _SURE) / _ASTRAY):
-            found |= {number: candidates[number].offsets[k] for number, k in shown.items()}
+        margins = {move: move.nats - candidates[move.pair].best_besides(move.candidate) for move in agreeing}
+        shown = {move: margin for move, margin in margins.items() if margin > 0.0}
+        if len(shown) > 1 and sum(shown.values()) > _SURE - _MOVED:
+            found |= {move.pair: candidates[move.pair].offsets[move.candidate] for move in shown}
     return found
+
+
+def _largest_group(places: FloatArray, moves: Sequence[_Move], reach: float) -> tuple[FloatArray, list[_Move]]:
+    """A move (2,) that pairs of a tile agree on the most, and the strongest candidate of each for it."""
+    best, total, agreeing = np.zeros(2), -math.inf, list[_Move]()
+    for place in places:
+        strongest: dict[int, _Move] = {}
+        for k in np.flatnonzero(np.abs(places - place).max(axis=1) <= reach).tolist():
+            if moves[k].nats > strongest.get(moves[k].pair, (0, 0, -math.inf))[2]:
+                strongest[moves[k].pair] = moves[k]
+        if (together := sum(max(move.nats, 0.0) for move in strongest.values())) > total:
+            best, total, agreeing = place, together, list(strongest.values())
+    return best, agreeing
 
 
 def _in_pairs(read: Callable[[int], _Tile], pairs: IntArray) -> Iterator[tuple[_Tile, _Tile]]:
@@ -380,55 +409,25 @@ def _transfer(overlap: Overlap, offset: FloatArray, camera: Camera) -> Transfer:
 
 def _threshold(total: FloatArray, radius: int) -> float:
     """Height that a peak of noise hardly reaches within a window."""
-    deviation = float(np.median(np.abs(total))) / 0.6745
-    return peak_threshold(deviation, (2 * radius + 1) ** 2)
+    return peak_threshold(normal_std(total), (2 * radius + 1) ** 2)
 
 
-def _coarse_links(grid: TileGrid, pairs: IntArray, chosen: dict[int, FloatArray], factor: int) -> LinkedPoints:
+def _coarse_links(pairs: IntArray, chosen: dict[int, FloatArray], plan: SearchPlan) -> LinkedPoints:
     """Matches of whole overlaps, as exact as coarse tiles show them."""
     matches = {}
     for number, offset in chosen.items():
-        middle = (np.array(grid.size) - 1.0 + offset) / 2.0
-        information = np.eye(2)[None] / (factor / 2.0) ** 2
+        middle = (np.array(plan.grid.size) - 1.0 + offset) / 2.0
+        information = np.eye(2)[None] / (plan.factor / 2.0) ** 2
         matches[number] = BlockMatches(middle[None], (middle - offset)[None], information)
-    return _links(pairs, matches)
+    return LinkedPoints.of(pairs, matches)
 
 
-def _links(pairs: IntArray, matches: dict[int, BlockMatches]) -> LinkedPoints:
-    """Concatenate the matches of all pairs."""
-    blocks = [BlockMatches.none(), *matches.values()]
-    return LinkedPoints(
-        np.repeat(np.arange(-1, len(matches)), [len(match) for match in blocks]),
-        pairs[list(matches)],
-        np.concatenate([match.points1 for match in blocks]),
-        np.concatenate([match.points2 for match in blocks]),
-        np.concatenate([match.information for match in blocks]),
-    )
-
-
-def _result(
-    grid: TileGrid, pairs: IntArray, links: LinkedPoints, fitted: Adjustment, search: float
-) -> TileRegistration:
+def _result(plan: SearchPlan, pairs: IntArray, links: LinkedPoints, fitted: Adjustment) -> TileRegistration:
+    grid = plan.grid
     held = links.tiles[fitted.weights[: len(links.tiles)] > _AGREES]
     joined = sparse.coo_matrix((np.ones(len(held)), held.T), shape=(len(grid),) * 2)
     count, label = csgraph.connected_components(joined, directed=False)
     groups = [np.flatnonzero(label == k) for k in range(count)]
     groups = sorted((group for group in groups if len(group) > 1), key=len, reverse=True)
     linked = np.isin(np.arange(len(grid)), held)
-    return TileRegistration(grid, fitted, links, pairs, linked, tuple(tuple(g.tolist()) for g in groups), search)
-
-
-def places_table(names: Sequence[str], tiled: TileRegistration) -> str:
-    """CSV of name, x and y of the first pixel, row, column, what placed it, and micrometres where they are known."""
-    grid, places = tiled.grid, tiled.adjustment.places
-    places = places - places.min(axis=0)
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    micrometres = [] if grid.pixel_size is None else ["x_um", "y_um"]
-    table.writerow(["name", "x", "y", "std", "row", "column", "placed_by", *micrometres])
-    rows, columns = grid.rows, grid.columns
-    for k, (name, place, std) in enumerate(zip(names, places.tolist(), tiled.stds, strict=True)):
-        line = [name, *(f"{value:.3f}" for value in (*place, std)), rows[k], columns[k]]
-        by = "overlap" if tiled.linked[k] else "stage"
-        table.writerow([*line, by, *(f"{value * grid.pixel_size:.4f}" for value in place if grid.pixel_size)])
-    return text.getvalue()
+    return TileRegistration(grid, fitted, links, pairs, linked, tuple(tuple(g.tolist()) for g in groups), plan.search)

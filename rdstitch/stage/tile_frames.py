@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rdstitch.choices import ZPlane
 from rdstitch.errors import ArgumentError
-from rdstitch.inputs.find import IMAGE_SUFFIXES, natural_key
+from rdstitch.inputs.find import READABLE_SUFFIXES, natural_key
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage, as_image
@@ -28,7 +28,7 @@ def with_position_folders(inputs: Sequence[Named]) -> list[Named]:
 
 
 def _has_images(folder: Path) -> bool:
-    return any(part.suffix.lower() in IMAGE_SUFFIXES for part in folder.iterdir())
+    return any(part.suffix.lower() in READABLE_SUFFIXES for part in folder.iterdir())
 
 
 def tile_frames(

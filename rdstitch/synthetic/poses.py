@@ -1,4 +1,4 @@
-"""Poses of the camera of a sequence, one an image; ready-made ones: pairs, grids, a robot's paths, a survey.
+"""Poses of the camera of a sequence, one an image; ready-made ones: pairs and grids.
 
 The plane's coordinates are the pixels of its texture ("texels"): X to the right, Y down, the centre of the top-left
 texel at (0, 0), as in an image. The camera looks down on it: with the tilt ``R``, the yaw φ, the foot of the camera
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
@@ -22,10 +22,9 @@ from rdstitch.geometry.radial_homography import project
 from rdstitch.synthetic.lenses import Lens, focal_length
 
 Tilt = tuple[float, float]
-_PARKING_ANGLE = 0.7  # radians: how far a robot is turned in the middle of the S
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Poses:
     """Poses of N images."""
 
@@ -133,7 +132,7 @@ def pair_poses(
     image is turned by ``yaw`` radians, and ``scale`` times as high as the first.
     """
     along = np.array([np.cos(direction), np.sin(direction)])
-    extent = np.min(_extent(lens, tilt) / np.maximum(np.abs(along), 1e-12))
+    extent = np.min(extent_of(lens, tilt) / np.maximum(np.abs(along), 1e-12))
     height = focal_length(lens) * np.array([1.0, scale])
     return Poses.of([(0.0, 0.0), (1.0 - overlap) * extent * along], height, [0.0, yaw], tilt)
 
@@ -154,7 +153,7 @@ def grid_poses(
     Neighbours share ``overlap`` along both axes. Each image is turned by a random angle within ± ``yaw`` radians, and
     moved by a random share, within ± ``shift``, of the step to its neighbours.
     """
-    step = (1.0 - overlap) * _extent(lens, tilt)
+    step = (1.0 - overlap) * extent_of(lens, tilt)
     j, i = np.meshgrid(np.arange(columns), np.arange(rows))
     j[1::2] = j[1::2, ::-1]
     places = np.column_stack([j.ravel(), i.ravel()]).astype(np.float64)
@@ -163,68 +162,7 @@ def grid_poses(
     return poses.shaken(seed=seed, yaw=yaw)
 
 
-def drive_poses(
-    lens: Lens,
-    path: str,
-    count: int,
-    *,
-    overlap: float = 0.8,
-    heading: float = 0.0,
-    tilt: Tilt = (0.0, 0.0),
-) -> Poses:
-    """A robot, to which the camera is fixed, drives a path of the paper (§5.5).
-
-    ``path`` is "line"; "turn": on, through a right angle, and on; or "parking": past the gap, back into it in an S, and
-    up. Consecutive images share ``overlap`` along their shorter side. The robot drives along its image's u axis, at
-    first ``heading`` radians from the plane's X axis.
-    """
-    turning, forward = np.zeros(count - 1), np.ones(count - 1)
-    if path == "turn":
-        bend = _phases(count - 1, (0.0, 0.35), (1.0, 0.3), (0.0, 0.35))
-        turning = np.pi / 2 * bend / bend.sum()
-    elif path == "parking":
-        bend = _phases(count - 1, (0.0, 0.4), (1.0, 0.25), (-1.0, 0.25), (0.0, 0.1))
-        forward = _phases(count - 1, (1.0, 0.4), (-1.0, 0.5), (1.0, 0.1))
-        left, right = bend > 0.0, bend < 0.0
-        turning[left], turning[right] = _PARKING_ANGLE / max(1, left.sum()), -_PARKING_ANGLE / max(1, right.sum())
-    headings = heading + np.r_[0.0, np.cumsum(turning)]
-    # On an arc, the chord points along the mean of the headings at its ends.
-    chord = (headings[:-1] + headings[1:]) / 2.0
-    length = (1.0 - overlap) * _extent(lens, tilt).min()
-    moves = length * forward[:, None] * np.column_stack([np.cos(chord), np.sin(chord)])
-    places = np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)])
-    return Poses.of(places, focal_length(lens), -headings, tilt)
-
-
-def survey_poses(
-    lens: Lens,
-    count: int,
-    *,
-    forward_overlap: float = 0.7,
-    side_overlap: float = 0.5,
-    height_jitter: float = 0.03,
-    attitude_jitter: float = 0.0,
-    tilt: Tilt = (0.0, 0.0),
-    seed: int = 0,
-) -> Poses:
-    """A drone mows a nearly square field (paper Fig. 10: 117 and 158 frames).
-
-    It takes ``count`` images, the last lane may be shorter; flies towards the top of its image, and turns round after
-    each lane. Each height is changed by a random share within ± ``height_jitter``, ψ and θ by random angles within ±
-    ``attitude_jitter`` radians.
-    """
-    extent = _extent(lens, tilt)
-    side, ahead = (1.0 - side_overlap) * extent[0], (1.0 - forward_overlap) * extent[1]
-    lanes = max(1, round(np.sqrt(count * ahead / side)))
-    per_lane = -(-count // lanes)
-    lane, place = np.divmod(np.arange(count), per_lane)
-    back = lane % 2 == 1
-    places = np.column_stack([side * lane, -ahead * np.where(back, per_lane - 1 - place, place)])
-    poses = Poses.of(places, focal_length(lens), np.where(back, np.pi, 0.0), tilt)
-    return poses.shaken(seed=seed, position=0.05 * float(ahead), height=height_jitter, yaw=0.05, tilt=attitude_jitter)
-
-
-def _extent(lens: Lens, tilt: Tilt) -> FloatArray:
+def extent_of(lens: Lens, tilt: Tilt) -> FloatArray:
     """Width and height in texels that an image shows of the plane along its middle row and column."""
     pose = Poses.of((0.0, 0.0), focal_length(lens), 0.0, tilt)
     top, right, bottom, left = plane_outline(lens, pose.from_plane()[0], 2)[1::2]
@@ -232,9 +170,3 @@ def _extent(lens: Lens, tilt: Tilt) -> FloatArray:
     if not np.isfinite(extent).all():
         raise ArgumentError("the image sees beyond the horizon or beyond its lens")
     return extent
-
-
-def _phases(count: int, *phases: tuple[float, float]) -> NDArray[np.float64]:
-    """``count`` values in phases (value, share of the count)."""
-    ends = np.rint(count * np.cumsum([share for _, share in phases])).astype(int)
-    return np.repeat([value for value, _ in phases], np.diff(np.r_[0, ends]))

@@ -23,7 +23,7 @@ _NOWHERE = np.float32(-1e6)
 _TOO_LONG = 32767
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Relief:
     """Heights above the plane: they give parallax and occlusion, and no homography describes that.
 

@@ -31,7 +31,7 @@ _HIDDEN = 0.5
 _APRON = 3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Photometry:
     """The way from light to an image."""
 

@@ -37,7 +37,7 @@ class Texture(Protocol):
         """Texels of a rectangle inside the texture, shape (bottom - top, right - left, channels), in [0, 1]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ImageTexture:
     """An image as texture: uint8 or uint16 of full range, or float32 in [0, 1], (h, w) or (h, w, 3)."""
 

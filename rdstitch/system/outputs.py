@@ -30,7 +30,7 @@ from rdstitch.system.file_access import local_file
 if sys.platform != "win32":
     import fcntl
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi", ".zarr")
+WRITABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi", ".zarr")
 _LEVEL_NAME, _TILE_NAME = re.compile(r"[0-9]{1,2}"), re.compile(r"[0-9]+_[0-9]+\.jpg")
 _LOCK = "lock"
 
@@ -39,7 +39,7 @@ def check_output(
     path: str | Path,
     overwrite: bool = False,
     inputs: Iterable[str | Path] = (),
-    suffixes: Iterable[str] = IMAGE_SUFFIXES,
+    suffixes: Iterable[str] = WRITABLE_SUFFIXES,
 ) -> Path:
     """Find out before long work whether a file can be written, over none of the inputs; nothing is created."""
     file = check_suffix(path, suffixes)
@@ -47,7 +47,7 @@ def check_output(
     return file
 
 
-def check_suffix(path: str | Path, suffixes: Iterable[str] = IMAGE_SUFFIXES) -> Path:
+def check_suffix(path: str | Path, suffixes: Iterable[str] = WRITABLE_SUFFIXES) -> Path:
     """Refuse an output whose name does not say what it shall be; without suffixes any name will do."""
     file, known = Path(path), tuple(suffixes)
     if known and file.suffix.lower() not in known:

@@ -90,6 +90,19 @@ def convert(value: Any, kind: Callable[..., Kind], file: str, field: str = "", *
         raise InputError(f"{file}: cannot be read: {error}") from error
 
 
+def to_jsonable(value: Any) -> Any:
+    """Records as plain JSON values: arrays are lists, paths texts, and what is not finite is null."""
+    return _finite(msgspec.to_builtins(value, enc_hook=lambda item: getattr(item, "tolist", item.__str__)()))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def check_invertible(matrix: tuple[Triple, Triple, Triple], name: str) -> None:
     """Refuse a matrix that has no inverse, or of which products are no numbers."""
     largest = float(np.abs(matrix).max())

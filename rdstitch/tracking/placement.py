@@ -25,7 +25,7 @@ class CameraPose:
     height: float  # in the same unit
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Placement:
     """An image on the plane."""
 

@@ -21,7 +21,7 @@ _SHARED = 2.0  # pairs that the errors of a frame are common to
 _PSI, _THETA, _LOG_FOCAL, _DELAY = range(4)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SeenPairs:
     """Points that K pairs of frames share."""
 

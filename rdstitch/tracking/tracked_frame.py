@@ -51,7 +51,7 @@ class Tracked:
         return None if self.placement is None else self.placement.pose
 
 
-@dataclass
+@dataclass(eq=False)
 class TrackedFrame:
     """A frame, and what is known of its place so far."""
 

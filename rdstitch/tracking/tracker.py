@@ -13,6 +13,7 @@ from importlib import import_module
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.alignment.given_checks import LATE, attitudes_late, focal_contradicted
 from rdstitch.alignment.odometry import OdometryFit, motions_of
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import BoolArray, FloatArray
@@ -40,7 +41,7 @@ from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 from rdstitch.tracking.shown_camera import SeenPairs, ShownCamera, judged_focal, shown_camera
 from rdstitch.tracking.tracked_frame import Tracked, TrackedFrame
 
-_ALIGNMENT_IMPORTS = "scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial"
+_ALIGNMENT_IMPORTS = "scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial"
 _WINDOW = 48  # keyframes that are aligned together
 _FIRST_ALIGNMENT = 5  # keyframes that the first alignment takes
 _GROWTH = 1.5  # from one alignment to the next, while λ is not known
@@ -55,6 +56,7 @@ _CONTRADICTED = 0.999  # probability that a given focal length is wrong
 _EXACT = 1e-4  # of the logarithm of a focal length that an alignment keeps
 _MAX_LOST_FRAMES = 10  # frames in a row without a place, after which a new map begins, if all keyframes were searched
 _SAME_LENGTHS = 0.1  # of their standard deviation: change of all lengths that leaves the places of earlier frames
+_SURER = 0.5  # of the standard deviation of all lengths that earlier frames were given with: they come again
 _REVISED = 500  # frames between keyframes, whose places are revised with those of the keyframes
 _MATCHES = 80  # of a link, that the alignment uses
 _MOUNTED = 60  # keyframes by which it is found how the camera is mounted on the body whose odometry is known
@@ -115,10 +117,9 @@ class Tracker:
         self._model = options.alignment.model
         self._distortion = options.pair.distortion
         self._std = 0.0 if self.distortion_known else math.inf
-        self._length_std = math.nan
+        self._length_std = self._given_length_std = math.nan  # now, and when all frames were given last
         # Of positions, relative to their distance from the first, and of yaw, by a lens that is still estimated.
         self._shape_std = (0.0, 0.0)
-        self._origin_std = 0.0  # by how much an alignment has moved the first frame from the origin, in heights
         self._focal: float | None = None  # half diagonals: that of the map, whose lengths it determines
         self._stated_std = 0.0  # of the logarithm of the focal length that was given
         self._delay, self._delay_std = 0.0, DELAY_STD  # s, of attitudes
@@ -243,6 +244,7 @@ class Tracker:
         assert camera.focal is not None
         self._focal, self._stated_std = camera.focal / camera.scale, camera.focal_log_std
         self._length_std, _ = judged_focal(self._stated_std, 0.0, math.inf)
+        self._given_length_std = self._length_std
         if tilt is None:
             return None
         self._model = "rigid" if rigid else "similarity"
@@ -309,9 +311,10 @@ class Tracker:
         if self._plane is None or other.covariance is None:
             frame.place = replace(stay, homography=start.homography @ homography)
             return inliers
-        below, measured = self._plane.below(stay.camera, self._attitude(frame)), frame.attitude is not None
+        below = self._plane.below(stay.camera, self._attitude(frame))
+        tilt_std = 0.0 if frame.attitude is None else self._attitude_std(frame)
         points, places = now[inliers], start.to_plane(before[inliers])
-        frame.place, step = self._plane.placed(below, points, places, tilts_err=measured)
+        frame.place, step = self._plane.placed(below, points, places, tilt_std=tilt_std)
         at, was = frame.place.pose, start.pose
         if at is not None and was is not None:
             frame.covariance = chained(other.covariance, step, (at.x - was.x, at.y - was.y), was.height)
@@ -425,8 +428,11 @@ class Tracker:
         if self._mapped and self._map.seen not in _CAMERA_CHECKS:
             return []
         shown = self._shown_camera()
+        before = self._delay
         if frame.attitude is not None:
             self._delay, self._delay_std = shown.delay, shown.delay_std
+            if abs(shown.delay) > LATE * shown.delay_std:
+                self._tell(attitudes_late(shown.delay, shown.delay_std))
         if math.isinf(self._stated_std):  # it was wrong
             if abs(shown.log_focal) > shown.log_focal_std:
                 return self._with_shown_focal(frame, shown)
@@ -434,10 +440,15 @@ class Tracker:
             self._length_std, wrong = judged_focal(self._stated_std, shown.log_focal, shown.log_focal_std)
             if wrong > _CONTRADICTED:
                 return self._with_shown_focal(frame, shown)
+            if self._mapped and abs(self._delay - before) > self._delay_std:
+                return self._placed_anew(frame, 1.0)
+            if self._mapped and self._length_std < _SURER * self._given_length_std:
+                self._given_length_std = self._length_std
+                return self._revised(except_for=frame.number)
         pixels = self._focal * frame.camera.scale
         if self._mapped or not (shown.tilt_std * pixels < MATCH_ERROR and shown.rms * pixels < MATCH_ERROR):
             return []
-        self._plane = MetricPlane(self._focal, shown.tilt, rigid=True)
+        self._plane = MetricPlane(self._focal, shown.tilt, True, shown.tilt_std)
         return self._placed_anew(frame, 1.0)
 
     def _shown_camera(self) -> ShownCamera:
@@ -459,15 +470,11 @@ class Tracker:
         given = self._focal * frame.camera.scale
         found, std = given * math.exp(shown.log_focal), shown.log_focal_std
         if not math.isinf(self._stated_std):
-            self._tell(
-                f"the images contradict the given focal length of {given:.1f} pixels, which is not used: they show "
-                f"{found:.1f} ± {std * found:.1f}",
-                "focal-contradicted",
-            )
+            self._tell(focal_contradicted(given, found, std))
         self._focal, self._stated_std = found / frame.camera.scale, math.inf  # from now on it is what they show
         self._length_std = std
         self._alignment = None  # one that is under way was begun with the old focal length
-        self._plane = MetricPlane(self._focal, shown.tilt_by_itself, rigid=True)
+        self._plane = MetricPlane(self._focal, shown.tilt_by_itself, True, shown.tilt_std)
         return self._placed_anew(frame, math.exp(-shown.log_focal))
 
     def _placed_anew(self, latest: TrackedFrame, longer: float) -> list[Tracked]:
@@ -558,14 +565,14 @@ class Tracker:
             return []
         except Exception as error:  # noqa: BLE001 - what one window cannot do the next one may
             self._alignment = None
-            self._tell(f"an alignment of the last keyframes failed ({error}); the next one is tried")
+            self._tell(Message(f"an alignment of the last keyframes failed ({error}); the next one is tried"))
             return []
         (keyframes, _, kept), self._alignment = self._alignment, None
         for message in alignment.messages:
             if message.severity in ("warning", "note"):
-                self._tell(message.text, message.code)
+                self._tell(message)
         if alignment.on_sphere:
-            self._tell("the camera turns on the spot: there is no path")
+            self._tell(Message("the camera turns on the spot: there is no path"))
             return []
         if not self.distortion_known and alignment.distortion_std < self._std:
             self._distortion, self._std = alignment.distortion, alignment.distortion_std
@@ -577,16 +584,14 @@ class Tracker:
             if used
         ]
         waiting, (move, longer) = self._waiting, _to_map(placed)
-        if not kept and placed[0][0] is self._map.keyframes[0] and (pose := placed[0][1].pose) is not None:
-            move = PlaneSimilarity.to_origin(pose)
+        first, placement = placed[0]
+        if self._map.whole and first.number == self._map.keyframes[0].number and (pose := placement.pose) is not None:
+            move = PlaneSimilarity.to_origin(pose)  # the others are relative to it
         self._mapped = True
         if not kept:
             self._length_std = alignment.length_std
         for keyframe, placement in placed:
             keyframe.place, keyframe.aligned = move.applied(placement), True
-        first = placed[0][0]
-        if self._map.whole and first is self._map.keyframes[0] and first.place is not None and first.place.pose:
-            self._origin_std = math.hypot(first.place.pose.x, first.place.pose.y)
         self._focal = self._focal if kept else alignment.focal
         self._learn(alignment, keyframes)
         aligned = {id(keyframe) for keyframe, _ in placed}
@@ -617,7 +622,10 @@ class Tracker:
             mount = np.array(tilt)
             if tilts_known:
                 mount = np.nanmedian(poses.tilt - np.array(measured), axis=0)
-            self._plane = MetricPlane(self._focal, (float(mount[0]), float(mount[1])), alignment.model == "rigid")
+            given = self._options.alignment.tilt is not None
+            tilt_std = None if given else math.sqrt(float(np.trace(alignment.covariance[:2, :2])))
+            rigid = alignment.model == "rigid"
+            self._plane = MetricPlane(self._focal, (float(mount[0]), float(mount[1])), rigid, tilt_std)
             # Until there is a window, errors have nothing to grow from.
             reached = np.zeros((4, 4))
             for keyframe in self._map.keyframes:
@@ -640,20 +648,19 @@ class Tracker:
                 return None
             known = np.zeros((4, 4))
         far = math.hypot(pose.x, pose.y)
-        if self._plane is not None and math.isfinite(self._length_std):
-            # A tilted camera with a wrong focal length is one with a wrong tilt, by which paths bend.
-            relative = math.hypot(relative, self._length_std * math.hypot(*self._plane.tilt))
-            yaw_std = math.hypot(yaw_std, self._length_std * math.hypot(*self._plane.tilt))
-        place = (relative * far) ** 2 + self._origin_std**2
+        if self._plane is not None and not relative:
+            relative = yaw_std = self._plane.bend_std(self._length_std)
+        place = (relative * far) ** 2
         if frame.attitude is not None:
             # The foot of the camera is off by the error of its tilt, and so is that of the first frame.
             place += 2.0 * (pose.height * self._attitude_std(frame)) ** 2
         return np.asarray(known + np.diag([place, place, 0.0, yaw_std**2]))
 
-    def _tell(self, text: str, code: str = "") -> None:
-        """Keep a message, if it is new."""
-        if all(message.text != text for message in self.messages):
-            self.messages.append(Message(text, code=code))
+    def _tell(self, message: Message) -> None:
+        """Keep a message, if nothing of its kind is known."""
+        kinds = {known.code or known.text for known in self.messages}
+        if (message.code or message.text) not in kinds:
+            self.messages.append(message)
 
     def _tracked(self, frame: TrackedFrame, *, keyframe: bool, inliers: int, reason: str = "") -> Tracked:
         placement = frame.place if frame.aligned else None

@@ -50,7 +50,7 @@ class Agreement:
         return self.confirming / self.cells if self.cells else 1.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ComparedImage:
     """A registered image as it is compared."""
 

@@ -100,7 +100,7 @@ def _strongest_motions(
 ) -> dict[Pair, RadialHomography]:
     """Of each pair the motion that most of some of its matches agree on, with the inliers among all."""
     result = {}
-    how = EstimationOptions("auto", lens, threshold)
+    how = EstimationOptions(distortion=lens, threshold=threshold)
     enough = [pair for pair in pairs if len(rests[pair.images]) >= limit("inliers of a motion")]
     for batch in batches(enough, PAIRS_ESTIMATED_AT_ONCE):
         given = []

@@ -45,7 +45,7 @@ class Ambiguity:
         return as_well and left_elsewhere < limit("unexplained elsewhere") * left
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drawing:
     """An image drawn on the plane, without its brightness."""
 
@@ -138,7 +138,7 @@ def _without_brightness(image: Grey, coarsest: float) -> Grey:
     return np.where(seen, image - coarse, np.float32(np.nan)).astype(np.float32)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Overlaps:
     """Sums over the overlap of two images, the first at every position in the second, shape (h, w) each."""
 

@@ -26,7 +26,7 @@ _MARGIN = 6  # pixels at the border of an image, where brightness cannot be remo
 _MOST = 25.0  # spreads of the copies: a larger departure counts as this
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class UniqueShift:
     """The shift of one image's drawing within another's at which what is unique in both agrees best."""
 
@@ -126,7 +126,7 @@ def unique_shift(first: Drawing, second: Drawing, unique1: Grey, unique2: Grey) 
     return UniqueShift(peaks.shift[best], float(matched[best]), float(share[best]), rival)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Peaks:
     """Shifts by which two drawings fit, (N, 2) as (x, y), pixels, and their rows and columns (N, 2) among all."""
 

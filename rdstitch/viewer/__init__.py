@@ -44,7 +44,7 @@ def seam_image(
     return stream.getvalue(), (x, y, float(labels.shape[1] * factor), float(labels.shape[0] * factor))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ViewedImage:
     """What the page says of an image."""
 

@@ -17,8 +17,9 @@ import numpy as np
 from jsonschema import Draft202012Validator
 
 from rdstitch.arrays import FloatArray
+from rdstitch.camera_files.own_format import CameraRecord
 from rdstitch.features import FeatureOptions
-from rdstitch.geometry.camera import Camera, CameraRecord
+from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import project
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.sidecar.read import json_schema
@@ -121,6 +122,12 @@ def state_of(folder: Path) -> dict[str, bytes | None]:
 def shown(path: Path) -> str:
     """A name as it appears within a line."""
     return str(path).encode("utf-8", "backslashreplace").decode("utf-8").replace("\n", " ")
+
+
+def sidecar_of(output: str | Path) -> dict[str, Any]:
+    """What lies beside an output."""
+    record: dict[str, Any] = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    return record
 
 
 def check_sidecar(file: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rdstitch.io import read_image
-from tests.cli.running import CACHED, Outcome, Run
+from tests.cli.running import CACHED, Outcome, Run, sidecar_of
 
 
 def _sidecar(image: Path) -> Path:
@@ -29,7 +29,7 @@ def test_same_images_give_the_same_bytes(rdstitch: Run, frames: list[Path], stit
     output = tmp_path / "again.tif"
     _apply(rdstitch, _sidecar(stitched), frames[0].parent, output, out="", err="")
     assert output.read_bytes() == stitched.read_bytes()
-    then, now = (json.loads(_sidecar(image).read_text(encoding="utf-8")) for image in (stitched, output))
+    then, now = (sidecar_of(image) for image in (stitched, output))
     assert now.pop("applied") == {"sidecar": str(_sidecar(stitched)), "matched": "name"}
     assert (now.pop("pairs"), now["output"].pop("file")) == ([], "again.tif")
     assert now == {key: value for key, value in then.items() if key != "pairs"} | {"output": now["output"]}
@@ -46,10 +46,10 @@ def test_local_alignment_is_applied_again(rdstitch: Run, frames: list[Path], tmp
         made[choice] = tmp_path / f"{choice}.png"
         rdstitch("mosaic", *frames, "-o", made[choice], "--local-alignment", choice, *CACHED)
     assert made["auto"].read_bytes() == made["off"].read_bytes() != made["5"].read_bytes()
-    content = json.loads(_sidecar(made["5"]).read_text(encoding="utf-8"))
+    content = sidecar_of(made["5"])
     assert content["local_alignment"]["used"]
     assert content["images"][0]["displacement"]["grid"] == [6, 5]
-    assert json.loads(_sidecar(made["auto"]).read_text(encoding="utf-8"))["images"][0]["displacement"] is None
+    assert sidecar_of(made["auto"])["images"][0]["displacement"] is None
     again = tmp_path / "again.png"
     _apply(rdstitch, _sidecar(made["5"]), frames[0].parent, again)
     assert again.read_bytes() == made["5"].read_bytes()
@@ -90,7 +90,7 @@ def test_images_of_another_size(rdstitch: Run, frames: list[Path], stitched: Pat
     inside = cv2.erode(small.alpha, np.ones((15, 15), np.uint8)) > 0
     a, b = (image[inside].astype(float).ravel() for image in (reduced, small.pixels))
     assert np.corrcoef(a, b)[0, 1] > 0.98
-    record = json.loads((tmp_path / "large.tif.json").read_text(encoding="utf-8"))
+    record = sidecar_of(tmp_path / "large.tif")
     assert [image["size"] for image in record["images"]] == [[800, 600]] * 3
     assert record["camera"]["image_size"] == [800, 600]
     assert record["lambda_px"] == pytest.approx(record["lambda"] / 500.0**2)
@@ -117,8 +117,7 @@ def test_a_missing_image_is_named(rdstitch: Run, frames: list[Path], stitched: P
     for frame in frames[:2]:
         shutil.copy(frame, folder)
     _apply(rdstitch, _sidecar(stitched), folder, tmp_path / "some.tif", told=frames[2].name)
-    record = json.loads((tmp_path / "some.tif.json").read_text(encoding="utf-8"))
-    assert [image["used"] for image in record["images"]] == [True, True, False]
+    assert [image["used"] for image in sidecar_of(tmp_path / "some.tif")["images"]] == [True, True, False]
     _apply(rdstitch, _sidecar(stitched), folder, tmp_path / "strict.tif", "--strict", status=5)
     assert not (tmp_path / "strict.tif").exists()
 
@@ -130,8 +129,7 @@ def test_images_of_one_name_in_two_folders(rdstitch: Run, frames: list[Path], tm
         shutil.copy(frame, folder / "x.png")
     output, layers = tmp_path / "out.png", tmp_path / "layers"
     rdstitch("mosaic", *folders, "-o", output, "--layers", layers, *CACHED)
-    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
-    assert [image["name"] for image in record["images"]] == ["cam0/x.png", "cam1/x.png"]
+    assert [image["name"] for image in sidecar_of(output)["images"]] == ["cam0/x.png", "cam1/x.png"]
     assert {file.name for file in layers.iterdir()} == {
         f"cam{k}_x{kind}.tif" for k in range(2) for kind in ("", "_mask")
     }
@@ -208,6 +206,6 @@ def test_names_match_whatever_the_locale(
     _run(written, "mosaic", str(tmp_path / "a"), "-o", str(tmp_path / "out.tif"), *options)
     said = _run(read, "apply", f"{tmp_path}/out.tif.json", "--images", str(tmp_path / "b"), "-o", f"{tmp_path}/new.tif")
     assert "taken in order" not in said
-    saved = json.loads((tmp_path / "new.tif.json").read_text(encoding="utf-8"))
+    saved = sidecar_of(tmp_path / "new.tif")
     assert saved["applied"]["matched"] == "name"
     assert [image["name"] for image in saved["images"]] == names

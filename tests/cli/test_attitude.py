@@ -7,10 +7,10 @@ import pytest
 from PIL import Image
 
 import rdstitch
+from examples.worlds.drone_xmp import euler_angles, xmp_of
 from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 from tests.cli.running import CACHED, Run
-from tests.drone_xmp import euler_angles, xmp_of
 from tests.sampled import sampled
 
 LENS = Camera((400, 300), -0.2, focal=380.0)

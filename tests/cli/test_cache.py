@@ -1,6 +1,5 @@
 """``--cache``: an interrupted run continues, a changed option repeats only what depends on it, damage does no harm."""
 
-import json
 import shutil
 from collections.abc import Callable
 from importlib import import_module
@@ -13,13 +12,13 @@ from rdstitch_cli.main import run
 from rdstitch.matching import two_view
 from rdstitch.pipeline import detect_features
 from rdstitch.verification import overlap_check
-from tests.cli.running import FAST, Run, finished, start
+from tests.cli.running import FAST, Run, finished, sidecar_of, start
 from tests.sampled import sampled
 
 
 def _result(output: Path) -> tuple[bytes, dict[str, Any]]:
     """The image, and the sidecar apart from the options that say nothing of it."""
-    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    record = sidecar_of(output)
     del record["options"]["cache"], record["options"]["overwrite"]
     return output.read_bytes(), record
 

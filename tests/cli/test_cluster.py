@@ -14,7 +14,7 @@ import pytest
 import rdstitch
 from rdstitch.compositing.tiles import TiledOutput
 from rdstitch.executors import ProcessExecutor
-from tests.cli.running import FAST, Run, flight
+from tests.cli.running import FAST, Run, flight, sidecar_of
 
 pytest.importorskip("distributed")
 
@@ -52,7 +52,7 @@ def _cluster(folder: Path, workers: int) -> Iterator[tuple[str, list["subprocess
 
 
 def _record(output: Path) -> dict[str, Any]:
-    record: dict[str, Any] = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    record: dict[str, Any] = sidecar_of(output)
     for name in ("cache", "scheduler", "workers"):
         del record["options"][name]
     return record

@@ -1,6 +1,5 @@
 """Options of compositing on the command line, for real: layers too."""
 
-import json
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,7 @@ from rdstitch_cli.main import cli
 from rdstitch.compositing import CompositeOptions
 from rdstitch.io import read_image
 from rdstitch.io.deepzoom import read_deep_zoom
-from tests.cli.running import CACHED, Run
+from tests.cli.running import CACHED, Run, sidecar_of
 
 LIBRARY_ONLY = {"bands", "tile_size", "workers"}
 
@@ -47,8 +46,7 @@ def test_every_way_shows_the_same_place(rdstitch: Run, sidecar: Path, frames: li
         output = tmp_path / f"{number}.png"
         done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--scale", "0.5", "-j", "1", *way)
         assert (done.status, done.err) == (0, "")
-        record = json.loads(output.with_name(output.name + ".json").read_text(encoding="utf-8"))
-        used = record["options"]["composite"]
+        used = sidecar_of(output)["options"]["composite"]
         assert {name: used[name.removeprefix("--")] for name in way[::2]} == dict(zip(way[::2], way[1::2], strict=True))
         images.append(read_image(output).pixels.astype(int))
     for number, image in enumerate(images):

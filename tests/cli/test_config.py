@@ -17,7 +17,7 @@ from rdstitch_cli.main import cli
 
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
-from tests.cli.running import Run
+from tests.cli.running import Run, sidecar_of
 from tests.damaged_texts import damaged_text
 
 _DOCUMENT = Path(__file__).parents[2] / "docs" / "guide.md"
@@ -52,7 +52,7 @@ def test_flags_win_then_the_command_then_common(rdstitch: Run, frames: list[Path
     arguments = ("pano", *frames[:2], "--config", file, "--max-features", "600")
     assert rdstitch(*arguments, "-o", tmp_path / "a.png").out == "-0.200000\n"
     assert rdstitch(*arguments, "-o", tmp_path / "b.png", "--lambda", "-0.21", "--scale", "1").out == "-0.210000\n"
-    a, b = (json.loads((tmp_path / f"{name}.png.json").read_text(encoding="utf-8"))["options"] for name in "ab")
+    a, b = (sidecar_of(tmp_path / f"{name}.png")["options"] for name in "ab")
     assert (a["seed"], a["threshold"], a["composite"]["scale"], a["workers"]) == (7, 2.5, 0.5, 1)
     assert (b["seed"], b["composite"]["scale"]) == (7, 1.0)
 

@@ -1,13 +1,12 @@
 """``--features``: every kind gives what the default gives."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.cli.running import Run
+from tests.cli.running import Run, sidecar_of
 from tests.sampled import sampled
 
 PAIR = sorted((Path(__file__).resolve().parents[2] / "examples/data/garfield_red").glob("*.jpg"))
@@ -19,7 +18,7 @@ def stitched(rdstitch: Run, folder: Path, kind: str) -> dict[str, Any]:
     output = folder / f"{kind}.jpg"
     done = rdstitch("pano", *PAIR, "-o", output, "--features", kind, "--reference", PAIR[0].name, *SMALL)
     assert all("[few-images]" in line for line in done.err.splitlines())
-    record: dict[str, Any] = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    record: dict[str, Any] = sidecar_of(output)
     return record
 
 

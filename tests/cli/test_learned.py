@@ -1,12 +1,11 @@
 """Networks from ONNX files, given on the command line."""
 
-import json
 from pathlib import Path
 
 import cv2
 import pytest
 
-from tests.cli.running import DISTORTION, FAST, Run
+from tests.cli.running import DISTORTION, FAST, Run, sidecar_of
 
 pytest.importorskip("onnx")
 if not hasattr(cv2, "ALIKED"):
@@ -26,7 +25,7 @@ def test_images_are_stitched_by_networks(rdstitch: Run, frames: list[Path], tmp_
     )
     assert all("[few-images]" in line for line in done.err.splitlines())
     assert abs(float(done.out) - DISTORTION) < 0.01
-    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    record = sidecar_of(output)
     assert [image["features"] for image in record["images"]] == [KEYPOINTS, KEYPOINTS]
     assert record["options"]["features"]["aliked_model"] == str(aliked)
 

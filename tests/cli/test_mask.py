@@ -1,6 +1,5 @@
 """``--mask``: what it excludes is neither matched nor shown."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 
 from examples.worlds.adverse_sets import adverse_set
 from rdstitch.io import read_image
-from tests.cli.running import CACHED, DISTORTION, Run
+from tests.cli.running import CACHED, DISTORTION, Run, sidecar_of
 
 LEG = (255, 0, 255)
 
@@ -53,8 +52,7 @@ def test_a_leg_is_not_matched_nor_shown(rdstitch: Run, legs: Path, tmp_path: Pat
     done = rdstitch(command, *sorted(legs.iterdir()), "-o", output, "--mask", mask, *CACHED, err="")
     assert abs(float(done.out) - DISTORTION) < 0.01
     assert leg_pixels(output) == 0
-    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
-    assert record["options"]["mask"] == str(mask)
+    assert sidecar_of(output)["options"]["mask"] == str(mask)
 
 
 def test_without_a_mask_the_leg_is_seen_and_apply_takes_masks_too(rdstitch: Run, legs: Path, tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """``rdstitch mosaic``: of several blocks, with images left out, and when it warns."""
 
-import json
 import re
 import shutil
 from collections.abc import Callable
@@ -18,14 +17,14 @@ from rdstitch.pipeline import accept
 from rdstitch.results.messages import Message
 from rdstitch.synthetic import Sequence
 from rdstitch.verification.findings import Finding, Kind
-from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, flight, start, transfers
+from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, flight, sidecar_of, start, transfers
 from tests.sampled import sampled
 
 
 def test_a_folder_becomes_one_image(rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path) -> None:
     done = rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "mosaic.tif", *CACHED, err="")
     assert abs(float(done.out) - DISTORTION) < 0.01
-    record = json.loads((tmp_path / "mosaic.tif.json").read_text(encoding="utf-8"))
+    record = sidecar_of(tmp_path / "mosaic.tif")
     assert alignment_error(sequence, transfers(record), model="homography").median < 1.0
     poses = [image["pose"] for image in record["images"]]
     assert all(set(pose) == {"x", "y", "height", "yaw_deg", "tilt_deg", "covariance"} for pose in poses)
@@ -43,8 +42,7 @@ def test_every_way_to_name_images(frames: list[Path], tmp_path: Path, how: str) 
         data = ("\n" if how == "newlines" else "\0").join(names).encode()
     process = start("mosaic", *inputs, "-o", tmp_path / "mosaic.jpg", "--scale", "0.5", *CACHED, stdin=-1)
     assert finished(process, data).status == 0
-    record = json.loads((tmp_path / "mosaic.jpg.json").read_text(encoding="utf-8"))
-    assert [image["name"] for image in record["images"]] == [path.name for path in frames]
+    assert [image["name"] for image in sidecar_of(tmp_path / "mosaic.jpg")["images"]] == [path.name for path in frames]
 
 
 def test_a_camera_that_stands_still_for_a_while(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
@@ -87,8 +85,7 @@ def test_each_block_has_a_file_and_is_named(rdstitch: Run, folder: Path, tmp_pat
     done = rdstitch("mosaic", folder, "-o", tmp_path / "floor.png", "--all-blocks", "--lambda", str(DISTORTION), *FAST)
     lines = [line for line in (*done.err.splitlines(), done.made) if "pixels" in line]
     for name, block, count, line in zip(("floor", "floor-2"), "ab", (3, 2), lines, strict=True):
-        record = json.loads((tmp_path / f"{name}.png.json").read_text(encoding="utf-8"))
-        used = [image["name"] for image in record["images"] if image["used"]]
+        used = [image["name"] for image in sidecar_of(tmp_path / f"{name}.png")["images"] if image["used"]]
         assert len(used) == count
         assert all(image[0] == block and image in line for image in used)
     assert not (tmp_path / "floor-3.png").exists()

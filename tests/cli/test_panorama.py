@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from examples.worlds.drone_xmp import euler_angles, xmp_of
+from examples.worlds.turns import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import viewed_images
 from rdstitch.pipeline.recipes import pano
 from rdstitch.report.pairs import match_graph
-from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.viewer import viewer_page
-from tests.cli.running import CACHE, Run
-from tests.drone_xmp import euler_angles, xmp_of
+from tests.cli.running import CACHE, Run, sidecar_of
 
 LENS = Camera((320, 240), -0.2, focal=260.0, focal_source="option")
 
@@ -41,7 +41,7 @@ def test_a_full_turn_becomes_a_sphere_that_viewers_turn(rdstitch: Run, around: l
     output = tmp_path / "sphere.jpg"
     report = tmp_path / "report.html"
     rdstitch("pano", *around, "-o", output, "--report", report, *CACHE)
-    record = json.loads((tmp_path / "sphere.jpg.json").read_text(encoding="utf-8"))
+    record = sidecar_of(tmp_path / "sphere.jpg")
     assert record["model"] == "rotation"
     assert all(image["used"] for image in record["images"])
     assert record["lambda"] == pytest.approx(-0.2, abs=0.005)
@@ -103,7 +103,7 @@ def test_the_view_is_turned_and_turned_again(rdstitch: Run, around: list[Path], 
     rdstitch("apply", f"{first}.json", *images, "-o", second)
     assert first.read_bytes() == second.read_bytes()
     rdstitch("apply", f"{first}.json", *images, "-o", third, "--pitch", "0", "--yaw", "0")
-    turned, plain = (json.loads(Path(f"{file}.json").read_text("utf-8")) for file in (first, third))
+    turned, plain = (sidecar_of(file) for file in (first, third))
     assert plain["output"]["orientation"] is None
     ahead, base = (np.array(record["images"][0]["to_plane"])[:, 2] for record in (turned, plain))
     expected = camera_rotations(np.radians(40), np.radians(-10))[0] @ base
@@ -114,6 +114,14 @@ def test_the_view_is_turned_and_turned_again(rdstitch: Run, around: list[Path], 
 def test_a_view_of_a_plane_cannot_be_turned(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     how = ("-o", tmp_path / "out.png", "--yaw", "10", *CACHE)
     rdstitch("pano", *frames, *how, status=2, told="turning on the spot")
+
+
+def test_a_lens_is_calibrated_by_turning(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
+    camera = tmp_path / "camera.json"
+    rdstitch("calibrate", around[0].parent, "-o", camera, *CACHE)
+    found = Camera.load(camera)
+    assert found.distortion == pytest.approx(-0.2, abs=0.005)
+    assert found.focal == pytest.approx(260.0, rel=0.003)
 
 
 def test_a_turning_camera_has_no_path(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
@@ -182,4 +190,4 @@ def test_deep_zoom_of_a_full_turn_is_joined_at_the_edge(rdstitch: Run, around: l
     assert np.abs(ends[0] - ends[1])[rows].mean() < 1.5 * np.abs(np.diff(whole[60:200], axis=1)).mean()
     # The same image, but for the compression of the tiles.
     assert np.abs(ends[0][rows] - whole[rows, 0]).mean() < 6.0
-    assert (width, height) == tuple(json.loads((tmp_path / "around.dzi.json").read_text("utf-8"))["output"]["size"])
+    assert (width, height) == tuple(sidecar_of(tmp_path / "around.dzi")["output"]["size"])

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from rdstitch.io import read_image
-from tests.cli.running import CACHED, FAST, Run, finished, start
+from tests.cli.running import CACHED, FAST, Run, finished, sidecar_of, start
 from tests.faults import OPERATIONS, Operation, failing_disk
 from tests.sampled import sampled
 
@@ -104,8 +104,7 @@ def test_killed_while_it_published(rdstitch: Run, frames: list[Path], tmp_path: 
     assert (output.exists(), report.exists()) == (published > 0, published > 1)
     assert not (tmp_path / "out.png.json").exists()
     rdstitch(*arguments)
-    record = json.loads((tmp_path / "out.png.json").read_text(encoding="utf-8"))
-    assert [image["name"] for image in record["images"]] == [frame.name for frame in frames]
+    assert [image["name"] for image in sidecar_of(tmp_path / "out.png")["images"]] == [frame.name for frame in frames]
     assert {path.name for path in tmp_path.iterdir()} == {"out.png", "out.png.json", "why.html"}
 
 
@@ -118,7 +117,7 @@ def test_of_two_processes_one_succeeds(located: Path, tmp_path: Path) -> None:
     assert sorted(one.status for one in done) == [0, 6]
     (failed,) = (one for one in done if one.status)
     assert "exists already" in failed.line
-    record = json.loads((tmp_path / "out.dzi.json").read_text(encoding="utf-8"))
+    record = sidecar_of(tmp_path / "out.dzi")
     assert record["options"]["composite"]["rotate"] == (0, 90)[next(k for k, one in enumerate(done) if not one.status)]
     files = [tmp_path / "out.dzi", *sorted((tmp_path / "out_files").rglob("*.jpg"))]
     names = [".dzi", *(file.relative_to(tmp_path / "out_files").as_posix() for file in files[1:])]
@@ -149,7 +148,7 @@ def test_an_image_beside_any_sidecar_does_not_vanish(rdstitch: Run, located: Pat
     shutil.copy(located / "field.tif.json", f"{first}.json")
     done = rdstitch("mosaic", flight, "-o", tmp_path / "out.tif", *CACHED)
     assert (done.status, "warning" in done.err) == (0, False)
-    assert len(json.loads((tmp_path / "out.tif.json").read_text(encoding="utf-8"))["images"]) == 3
+    assert len(sidecar_of(tmp_path / "out.tif")["images"]) == 3
     # What rdstitch wrote itself is no input of the next run, and that is said.
     for name in ("field.tif", "field.tif.json"):
         shutil.copy(located / name, flight)
@@ -202,7 +201,7 @@ def test_what_belongs_beside_an_image_never_costs_the_image(
     expected = {"report.html", "camera.json", output.name, f"{output.name}.json"}
     expected |= {"field.html", "field_files"} if output.suffix == ".dzi" else set()
     assert {file.name for file in tmp_path.iterdir()} == expected - {name}
-    assert json.loads(Path(f"{output}.json").read_text())["images"]
+    assert sidecar_of(output)["images"]
 
 
 def test_an_earlier_page_is_older(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rdstitch.camera_files.own_format import camera_json
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs import source as sources
@@ -18,7 +19,7 @@ from rdstitch.io import Metadata, read_image, read_metadata
 from rdstitch.pipeline import accept, recipes, register
 from rdstitch.verification.verdict import judge
 from tests.cli.faulty import UNREADABLE, UNUSABLE
-from tests.cli.running import CACHED, FAST, Run, finished, shown, start, state_of
+from tests.cli.running import CACHED, FAST, Run, finished, shown, sidecar_of, start, state_of
 from tests.sampled import sampled
 
 Content = str | bytes | Path | None
@@ -205,7 +206,7 @@ def _tables() -> list[tuple[str, int, str | tuple[str, ...], Files]]:
         (PATH.replace("path.csv", "c.toml --config c.toml --overwrite"), 6, "c.toml: is read as input",
          {"c.toml": "[common]\nseed = 1\n"}),
         (PATH.replace("path.csv", "c.json --camera c.json --overwrite"), 6, "c.json: is read as input",
-         {"c.json": json.dumps(Camera((400, 300), -0.2).as_dict())}),
+         {"c.json": json.dumps(camera_json(Camera((400, 300), -0.2)))}),
         ("trajectory @n.txt -o n.txt --overwrite", 6, "n.txt: is read as input", {"n.txt": "a.png\nb.png\n"}),
         ("mosaic more -o b.png --mask b.png --overwrite", 6, "b.png: is read as input", {}),
         ("mosaic more -o masks/frame_0000.png --mask masks --overwrite", 6, "frame_0000.png: is read as input",
@@ -251,8 +252,7 @@ def test_images(rdstitch: Run, place: Path, kind: str, status: int) -> None:
 def test_a_mosaic_leaves_such_images_out_by_name(rdstitch: Run, place: Path, kind: str) -> None:
     bad = {**UNREADABLE, **UNUSABLE}[kind](place / "b.png", place)
     rdstitch("mosaic", place / "a.png", place / "b.png", bad, "-o", place / "out.jpg", *CACHED, told=shown(bad))
-    record = json.loads((place / "out.jpg.json").read_text(encoding="utf-8"))
-    assert [image["used"] for image in record["images"]] == [True, True, False]
+    assert [image["used"] for image in sidecar_of(place / "out.jpg")["images"]] == [True, True, False]
 
 
 def test_samples_of_two_kinds(rdstitch: Run, here: Path) -> None:

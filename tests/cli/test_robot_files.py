@@ -1,6 +1,5 @@
 """What robots load: a map of nav2, odometry in a bag, all in one frame."""
 
-import json
 import math
 import sys
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from tests.cli.running import CACHED, Run, rows_of
+from tests.cli.running import CACHED, Run, rows_of, sidecar_of
 
 
 def _poses(file: Path) -> np.ndarray[Any, Any]:
@@ -60,8 +59,7 @@ def test_the_first_image_is_the_frame_of_all_that_is_written(rdstitch: Run, fram
     rdstitch("mosaic", *frames, "-o", tmp_path / "f.png", *beside, *known)
     path = _poses(tmp_path / "path.csv")
     np.testing.assert_allclose(_poses(tmp_path / "poses.csv"), path, atol=1e-3)
-    content = json.loads((tmp_path / "f.png.json").read_text(encoding="utf-8"))
-    poses = [image["pose"] for image in content["images"]]
+    poses = [image["pose"] for image in sidecar_of(tmp_path / "f.png")["images"]]
     of_sidecar = np.array([[0.42 * pose["x"], 0.42 * pose["y"], pose["yaw_deg"]] for pose in poses])
     np.testing.assert_allclose(of_sidecar, path, atol=1e-3)
     assert (of_sidecar[0] == 0.0).all()

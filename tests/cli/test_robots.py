@@ -15,11 +15,12 @@ from PIL import ExifTags, Image
 import rdstitch
 from examples.judging.trajectories import compare_trajectories
 from examples.worlds.floor_drives import read_path, true_path
+from examples.worlds.paths import drive_poses
 from rdstitch.camera_files import load_camera
 from rdstitch.camera_files.lens_models import nearest_model
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image
-from rdstitch.synthetic import Photometry, Sequence, drive_poses, ground, sequence_over
+from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, rows_of, start
 from tests.videos import write_video
 

@@ -1,6 +1,5 @@
 """``rdstitch tiles``, run for real on rendered tiles of a stage."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import tifffile
 from examples.worlds.stage_grid import StageGrid
 from rdstitch.io.flat_field import FlatField
 from rdstitch.report.page import backlash
-from tests.cli.running import SIDECAR_SCHEMA, Run, rows_of
+from tests.cli.running import SIDECAR_SCHEMA, Run, rows_of, sidecar_of
 
 STAGE = StageGrid(rows=3, columns=3, tile=256, overlap=0.15, content=0.8, backlash=4.0, seed=5)
 NAMED = ("--grid", "r{row}c{col}", "--overlap", "15")
@@ -44,7 +43,7 @@ def test_samples_of_the_mosaic_are_those_of_the_tiles(rdstitch: Run, slide: Path
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "backlash of rows" in page
     assert "9 of 9" in page
-    content = json.loads(output.with_name("slide.tif.json").read_text(encoding="utf-8"))
+    content = sidecar_of(output)
     SIDECAR_SCHEMA.validate(content)
     assert content["model"] == "rigid"
     stage = content["stage"]

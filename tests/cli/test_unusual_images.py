@@ -1,6 +1,5 @@
 """Images out of the ordinary, and those that see beyond the horizon."""
 
-import json
 import os
 import sys
 from collections.abc import Callable
@@ -15,11 +14,10 @@ from PIL import Image
 
 import rdstitch as library
 from rdstitch.camera_files import load_camera
-from rdstitch.camera_files.lens_models import nearest_model
 from rdstitch.io import read_image
 from rdstitch.synthetic import FisheyeLens, ground
 from tests.cli.faulty import Make
-from tests.cli.running import CACHED, DISTORTION, Run, finished, start
+from tests.cli.running import CACHED, DISTORTION, Run, finished, sidecar_of, start
 
 
 def _saved(good: Path, file: Path, change: Callable[[Image.Image], Image.Image], **options: Any) -> Path:
@@ -85,7 +83,7 @@ def test_unusual_images_are_stitched(rdstitch: Run, place: Path, make: Make) -> 
     odd = make(place / "b.png", place)
     done = rdstitch("pano", place / "a.png", odd, "-o", place / "out.tif", *CACHED, err="")
     assert abs(float(done.out) - DISTORTION) < 0.02
-    record = json.loads((place / "out.tif.json").read_text(encoding="utf-8"))
+    record = sidecar_of(place / "out.tif")
     assert all(image["used"] for image in record["images"])
     assert [image["size"] for image in record["images"]] == [[400, 300]] * 2
 
@@ -106,8 +104,7 @@ def test_odd_names_work(place: Path, name: str) -> None:
     done = finished(start("pano", place / "a.png", image, "-o", output, *CACHED))
     assert (done.status, done.err) == (0, "")
     assert output.exists()
-    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
-    assert len(record["images"]) == 2
+    assert len(sidecar_of(output)["images"]) == 2
 
 
 def test_what_nobody_here_can_read_is_named(rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,19 +165,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cv2.imwrite(str(made / f"{number}.png"), image.astype(np.uint8))
     (made / "fisheye.yml").write_text(FILE, encoding="utf-8")
     return made
-
-
-def test_the_camera_file_is_read_to_the_horizon(folder: Path) -> None:
-    camera = load_camera(folder / "fisheye.yml")
-    assert camera.sees_beyond_horizon
-    points = np.random.default_rng(0).uniform((0, 0), (399, 299), (500, 2))
-    angle = np.degrees(np.linalg.norm(points - LENS.center, axis=1) / LENS.focal)
-    straight = camera.undistort(points)
-    near = angle < 80.0
-    assert np.linalg.norm(LENS.distort(straight[near]) - points[near], axis=1).max() < 0.1
-    assert np.isnan(straight[angle > 91.0]).all()
-    _, fit = nearest_model(camera, "fisheye")
-    assert fit.largest < 0.1
 
 
 @pytest.mark.parametrize("view", ["same", "all", "valid"])

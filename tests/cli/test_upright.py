@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from examples.worlds.drone_xmp import euler_angles, xmp_of
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
@@ -18,8 +19,7 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.synthetic import ImageTexture, Photometry, Sequence, ground, sequence_over
 from rdstitch.synthetic.poses import Poses
 from rdstitch.synthetic.textures import Texture
-from tests.cli.running import CACHED, Run
-from tests.drone_xmp import euler_angles, xmp_of
+from tests.cli.running import CACHED, Run, sidecar_of
 
 LENS = Camera((400, 300), -0.1, focal=420.0, focal_source="option")
 TILT, ROLL = (0.4, 0.25), 0.08
@@ -110,8 +110,7 @@ def test_a_facade_becomes_upright(
     # The sidecar of that does the same, without looking for anything.
     rdstitch("apply", f"{output}.json", *images, "-o", again)
     assert output.read_bytes() == again.read_bytes()
-    record = json.loads(Path(f"{output}.json").read_text("utf-8"))
-    assert np.linalg.matrix_rank(record["output"]["orientation"]) == 3
+    assert np.linalg.matrix_rank(sidecar_of(output)["output"]["orientation"]) == 3
 
 
 def test_the_output_is_cropped_to_the_rectangle(
@@ -120,7 +119,7 @@ def test_the_output_is_cropped_to_the_rectangle(
     sequence, paths = facade
     how = ("--images", paths[0].parent, "-o", tmp_path / "up.png", "--rectangle", _corners(sequence))
     rdstitch("apply", registered, *how, "--crop")
-    record = json.loads((tmp_path / "up.png.json").read_text("utf-8"))
+    record = sidecar_of(tmp_path / "up.png")
     width, height = record["output"]["size"]
     image = record["images"][0]
     lens = Camera(LENS.image_size, image["lambda"], center=tuple(image["center_px"]))
@@ -168,7 +167,7 @@ def test_gravity_makes_a_wall_level(facade: tuple[Sequence, list[Path]], rdstitc
     images = sorted(tmp_path.glob("*.jpg"))
     how = ("--lambda", "-0.1", "--focal", "420", "--reference", images[0].name)
     rdstitch("pano", *images, "-o", output, *how, "--level", *CACHED)
-    image = json.loads(Path(f"{output}.json").read_text("utf-8"))["images"][0]
+    image = sidecar_of(output)["images"][0]
     x = sequence.to_plane(0, [(100.5, 149.5), (299.5, 149.5)])[:, 0].mean()
     pixels = sequence.to_image(0, np.column_stack([np.full(5, x), np.linspace(60, 160, 5) + 100]))
     down = np.diff(to_plane(LENS, np.array(image["to_output"]), pixels), axis=0)
@@ -181,7 +180,7 @@ def test_without_gravity_what_is_vertical_in_most_images_is_level(
     """The output is turned about its axis alone, until the images stand as upright as they can."""
     output = tmp_path / "up.png"
     rdstitch("apply", registered, "--images", facade[1][0].parent, "-o", output, "--level")
-    record = json.loads(Path(f"{output}.json").read_text("utf-8"))
+    record = sidecar_of(output)
     turn = np.array(record["output"]["orientation"])
     np.testing.assert_allclose(turn[2] / turn[2, 2], (0.0, 0.0, 1.0), atol=1e-9)
     matrices = [np.array(image["to_plane"]) for image in record["images"]]
@@ -213,7 +212,7 @@ def test_scans_keep_the_axes_of_the_reference_image(rdstitch: Run, tmp_path: Pat
         output = tmp_path / f"{model}.png"
         paths = sequence.write(tmp_path)
         rdstitch("mosaic", *paths, "-o", output, "--model", model, "--reference", paths[1].name, *CACHED)
-        image = json.loads(Path(f"{output}.json").read_text("utf-8"))["images"][1]
+        image = sidecar_of(output)["images"][1]
         there = to_plane(Camera((400, 300)), np.array(image["to_output"]), [(50, 150), (350, 150)])
         across, down = there[1] - there[0]
         assert np.degrees(np.arctan2(down, across)) == pytest.approx(0.0, abs=0.02)

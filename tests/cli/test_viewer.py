@@ -15,7 +15,7 @@ from PIL import Image
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.report import svg
 from rdstitch.viewer import ViewedImage, seam_image, viewer_page
-from tests.cli.running import CACHED, Run
+from tests.cli.running import CACHED, Run, sidecar_of
 
 _ROOT = Path(__file__).parents[2]
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -36,8 +36,7 @@ def _data(page: Path) -> dict[str, Any]:
 
 def test_the_page_knows_its_images_and_is_alone(rdstitch: Run, page: Path, frames: list[Path], tmp_path: Path) -> None:
     data, text = _data(page), page.read_text(encoding="utf-8")
-    record = json.loads((tmp_path / "x.dzi.json").read_text(encoding="utf-8"))
-    assert data["size"] == record["output"]["size"]
+    assert data["size"] == sidecar_of(tmp_path / "x.dzi")["output"]["size"]
     assert data["metres"] is None
     assert [image["name"] for image in data["images"]] == [frame.name for frame in frames]
     corners = np.concatenate([outline for image in data["images"] for outline in image["outlines"]])

@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rdstitch.camera_files import load_camera, save_camera
+from rdstitch.camera_files.own_format import camera_json
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.sidecar import write
 from rdstitch.sidecar.read import read_sidecar
-from rdstitch.sidecar.write import plain
-from rdstitch.system.records import parse_json
+from rdstitch.system.records import parse_json, to_jsonable
 from tests.damaged_texts import damaged, damaged_text
 
 _IMAGE = {
@@ -45,7 +45,7 @@ GOOD: dict[str, Any] = {
     "lambda_px": -3.2e-6,
     "lambda_focal": -0.46,
     "lambda_known": False,
-    "camera": Camera((400, 300), -0.2, focal=380.0, focal_source="exif").as_dict(),
+    "camera": camera_json(Camera((400, 300), -0.2, focal=380.0, focal_source="exif")),
     "tilt_deg": None,
     "focal_px": 380.0,
     "focal_source": "exif",
@@ -57,7 +57,7 @@ GOOD: dict[str, Any] = {
     "images": [_IMAGE, _LEFT_OUT, _UNREAD],
     "pairs": [],
     "verdict": {"ok": True},
-    "options": plain(StitchOptions()),
+    "options": to_jsonable(StitchOptions()),
     "seed": 0,
     "versions": {"rdstitch": "0.1.0"},
 }
@@ -84,7 +84,7 @@ def _reads_or_complains(content: bytes) -> None:
 def test_a_good_one_is_read_whole(tmp_path: Path) -> None:
     saved = read_sidecar(_write(tmp_path, json.dumps(GOOD).encode()))
     used, left_out, unread = saved.images
-    assert (saved.reference, saved.distortion, saved.composite) == (0, -0.2, StitchOptions().composite)
+    assert (saved.reference, saved.record.lambda_, saved.composite) == (0, -0.2, StitchOptions().composite)
     assert (used.camera.image_size, used.camera.focal, used.camera.focal_source) == ((400, 300), 380.0, "exif")
     assert list(map(list, used.to_plane)) == _IMAGE["to_plane"]
     assert (left_out.to_plane, left_out.reason) == (None, "no overlap")

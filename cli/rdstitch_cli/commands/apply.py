@@ -8,7 +8,7 @@ from rdstitch.choices import MatchBy
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.option import Option
 from rdstitch.options.shared_options import DryRun, Every, FlatField, Mask, Overwrite, Strict, Topic, Workers
-from rdstitch_cli.flags import ImageFile, command, flags, flags_of, is_given, taken
+from rdstitch_cli.flags import ImageFile, command, flags, flags_of, is_given, values_of
 from rdstitch_cli.stitching import report_applied, resolve
 from rdstitch_cli.terminal import Reporter
 
@@ -57,12 +57,14 @@ def apply(
     from rdstitch.pipeline.apply_sidecar import apply as recipe
     from rdstitch.sidecar.read import read_sidecar
 
-    chosen = {name: value for name, value in taken(CompositeOptions, given).items() if is_given(name)}
+    compositing = values_of(CompositeOptions, given)
+    others = {name: value for name, value in given.items() if name not in compositing}
+    chosen = {name: value for name, value in compositing.items() if is_given(name)}
     # What is given takes the place of what the sidecar has for the same purpose.
     if "scale" in chosen or "gsd" in chosen:
         chosen = {"scale": 1.0, "gsd": None, **chosen}
     if chosen.keys() & {"rectangle", "straighten", "level"}:
         chosen = {"rectangle": None, "straighten": "off", "level": False, **chosen}
     composite = replace(read_sidecar(sidecar).composite, **chosen)
-    result = recipe(sidecar, resolve(images), output, composite, match=match, progress=reporter, **given)
+    result = recipe(sidecar, resolve(images), output, composite, match=match, progress=reporter, **others)
     report_applied(result, reporter)

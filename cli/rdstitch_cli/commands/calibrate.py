@@ -46,14 +46,14 @@ def calibrate(
     """
     from rdstitch.alignment.lens_description import describe_camera
     from rdstitch.camera_files import export_note
+    from rdstitch.camera_files.own_format import camera_json
     from rdstitch.pipeline.recipes import calibrate as recipe
-    from rdstitch.sidecar.write import plain
 
     paths = resolve(inputs)
     beside = files_beside(reporter, given)
     wanted = stitch_options(reporter, given, save_camera=output)
     registration = recipe(paths, wanted, every=every, progress=beside.timer, beside=beside)
-    report_registration(registration, reporter, (lambda: plain(registration.camera.as_dict())) if as_json else None)
+    report_registration(registration, reporter, (lambda: camera_json(registration.camera)) if as_json else None)
     for line in (
         *describe_camera(registration.alignment, registration.camera),
         *export_note(registration.camera, output, wanted.camera_format),

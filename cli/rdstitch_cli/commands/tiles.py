@@ -11,7 +11,7 @@ from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.option import Option
 from rdstitch.options.tile_options import TileOptions, measured_samples
-from rdstitch_cli.flags import Inputs, PrintSidecar, command, flags_of, taken
+from rdstitch_cli.flags import Inputs, PrintSidecar, command, flags_of, values_of
 from rdstitch_cli.stitching import files_beside, report_registration, resolve, summarize
 from rdstitch_cli.terminal import Reporter
 
@@ -66,8 +66,8 @@ def tiles(
         raise click.UsageError("nothing to write: give --output or --positions-only")
     paths = resolve(inputs)
     beside = files_beside(reporter, given)
-    composite = replace(measured_samples(), **taken(CompositeOptions, given))
-    chosen = TileOptions(**taken(TileOptions, given), composite=composite)
+    composite = replace(measured_samples(), **values_of(CompositeOptions, given))
+    chosen = TileOptions(**values_of(TileOptions, given), composite=composite)
     if output is None:
         tiled, registration = place_tiles(paths, positions_only, chosen, progress=beside.timer)
         report_registration(registration, reporter)

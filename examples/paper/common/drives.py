@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from examples.worlds.paths import drive_poses
 from rdstitch.alignment import Link
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.robust import SolverName, estimate_radial_homography
-from rdstitch.synthetic import Poses, drive_poses
+from rdstitch.synthetic import Poses
 from rdstitch.synthetic.poses import pixels_of_texels, texels_of_pixels
 
 PATHS = {"line": "line", "turn": "turn", "parallel parking": "parking"}

@@ -9,7 +9,7 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ModelMatrices:
     """Plane-to-image homographies of N images with their derivatives."""
 

@@ -249,7 +249,7 @@ def test_any_image_can_become_the_frame_after_the_adjustment(monkeypatch: pytest
     monkeypatch.setattr(recipe, "build_alignment", adjusted.append)
     aligned(given, model="similarity", reference=0)
     for reference in range(len(poses)):
-        found = build_alignment(replace(adjusted[0], problem=replace(adjusted[0].problem, reference=reference)))
+        found = build_alignment(replace(adjusted[0], problem=replace(adjusted[0].problem, fixed=reference)))
         own, height = poses[reference], np.exp(poses[reference, LOG_HEIGHT])
         c, s = np.cos(own[YAW]), np.sin(own[YAW])
         expected = (poses[:, [X, Y]] - own[[X, Y]]) @ np.array([[c, s], [-s, c]]) / height

@@ -181,6 +181,18 @@ def test_the_focal_length_of_a_long_strip_is_the_same_from_wherever_it_starts() 
     assert abs(values[0] - true) < 4 * std
 
 
+@pytest.mark.parametrize("behind", [[1, 4], [2, 3], [1, 3, 5]])
+def test_what_leaves_most_matches_behind_the_camera_is_no_solution(behind: list[int]) -> None:
+    truth = _scene()
+    start, observations = _start(HOMOGRAPHY, truth), Observations.from_links(truth.links, truth.cameras)
+    start.poses[behind] *= -1.0
+    count = len(truth.cameras)
+    free = FreeParameters.fixing(HOMOGRAPHY, count, [0], ONE_LENS)
+    found = BundleAdjuster(HOMOGRAPHY, observations, free, Priors.none(HOMOGRAPHY, count)).run(start)
+    assert np.isinf(found.squared).mean() > 0.5
+    assert not found.converged
+
+
 def test_errors_of_a_given_scatter_give_their_sigma() -> None:
     errors = np.random.default_rng(0).normal(0, 0.7, (20_000, 2))
     assert sigma_of((errors**2).sum(axis=1)) == pytest.approx(0.7, rel=0.03)

@@ -119,6 +119,18 @@ def test_attitudes_are_not_dropped_for_what_a_wrong_focal_length_makes_of_them()
     assert abs(math.log(found.cameras[0].focal / true)) < 4.0 * found.length_std
 
 
+def test_wrong_attitudes_and_a_wrong_focal_length_are_both_named() -> None:
+    rng = np.random.default_rng(2)
+    poses = jittered(grid(4, 3, (0.4, 0.3), 0.25, rng), 0.1, math.radians(6.0), rng)
+    given = scene(poses, focal_source="exif", rng=rng, per_link=80)
+    true = given.cameras[0].with_focal().focal
+    told = [camera.with_focal(1.2 * true, "option") for camera in given.cameras]
+    options = AlignmentOptions(lens="division", attitudes=-poses[:, [PSI, THETA]], attitudes_std=math.radians(0.1))
+    found = align(told, given.links, options)
+    assert {message.code for message in found.messages} == {"attitudes-contradicted", "focal-contradicted"}
+    assert abs(math.log(found.cameras[0].focal / true)) < 4.0 * found.length_std
+
+
 @pytest.mark.parametrize("late", [0.04, 0.0])
 def test_attitudes_that_are_late_are_taken_for_when_they_were(late: float) -> None:
     rng = np.random.default_rng(2)

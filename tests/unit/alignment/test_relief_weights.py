@@ -5,12 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import Scene, aligned, grid, scene
-from rdstitch.alignment import AlignmentOptions
-from rdstitch.alignment.adjustment_problem import Fit, Problem
+from examples.worlds.alignment_scenes import Scene, aligned, fitted, grid, scene
 from rdstitch.alignment.align import from_another_start
 from rdstitch.alignment.motion_models import SIMILARITY
-from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.relief_field import _spectrum
 from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
 from rdstitch.alignment.select import ModelChoice, best_of
@@ -21,18 +18,6 @@ from rdstitch.geometry.radial_homography import measurement_whitening
 def _scene(relief: float, seed: int = 0) -> Scene:
     rng = np.random.default_rng(seed)
     return scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng, relief=relief)
-
-
-def _fitted(given: Scene) -> tuple[Problem, Fit]:
-    observations = Observations.from_links(given.links, given.cameras)
-    count = len(given.cameras)
-    known = AlignmentOptions().camera_priors(given.cameras)
-    homographies = np.stack([link.relation.homography for link in given.links])
-    free = np.arange(5) == 0
-    trust = np.ones(len(given.links))
-    lens = np.array([given.distortion, 0.0, 0.0, 0.0, 0.0])
-    problem = Problem(observations, homographies, trust, count, 0, lens, free, known)
-    return problem, problem.fit(SIMILARITY)
 
 
 @pytest.mark.slow
@@ -52,19 +37,19 @@ def test_hills_hardly_move_the_lens(relief: float) -> None:
 
 def test_over_a_plane_and_of_two_images_nothing_changes() -> None:
     """Of two images tilts do what heights do."""
-    problem, fit = _fitted(_scene(0.0))
+    problem, fit = fitted(_scene(0.0))
     choice = ModelChoice(fit, "")
     assert weighted_by_relief(problem, fit) is problem
     assert choose_over_relief(problem, choice, ["similarity", "tilting"], Purpose.MOSAIC) is choice
     given = _scene(0.08)
     pair = replace(given, cameras=given.cameras[:2], links=[k for k in given.links if max(k.image1, k.image2) == 1])
-    problem, fit = _fitted(pair)
+    problem, fit = fitted(pair)
     assert weighted_by_relief(problem, fit) is problem
 
 
 def test_heights_are_found_as_they_scatter() -> None:
     """Of ``sin sin`` hills they scatter by half of the amplitude, which moves points by that share of the parallax."""
-    problem, fit = _fitted(_scene(0.08))
+    problem, fit = fitted(_scene(0.08))
     choice = choose_over_relief(problem, ModelChoice(fit, ""), ["similarity"], Purpose.MOSAIC)
     weighted = weighted_by_relief(problem, choice.fit)
     relief = weighted.observations.relief
@@ -91,7 +76,7 @@ def test_a_common_displacement_adds_its_square_to_the_covariance() -> None:
 
 
 def test_nothing_is_the_best_of_layouts_that_nobody_would_keep() -> None:
-    problem, fit = _fitted(_scene(0.0))
+    problem, fit = fitted(_scene(0.0))
     steep = replace(fit.adjusted.parameters, shared=SIMILARITY.shared_from_physical(np.array([1.2, 0.0, 0.3])))
     leaning = replace(fit, adjusted=replace(fit.adjusted, parameters=steep))
     for fits, purpose, found in (
@@ -106,14 +91,14 @@ def test_nothing_is_the_best_of_layouts_that_nobody_would_keep() -> None:
 
 
 def test_the_error_of_the_reason_is_that_of_the_fit() -> None:
-    _, fit = _fitted(_scene(0.0))
+    _, fit = fitted(_scene(0.0))
     choice = ModelChoice(fit, "; as requested")
     later = replace(choice, fit=replace(fit, adjusted=replace(fit.adjusted, sigma=7.25)))
     assert "7.25 pixels; as requested" in later.reason
 
 
 def test_what_did_not_converge_is_tried_from_another_start() -> None:
-    problem, fit = _fitted(_scene(0.0))
+    problem, fit = fitted(_scene(0.0))
     astray = replace(fit.adjusted.parameters, shared=SIMILARITY.shared_from_physical(np.array([-1.4, 0.5, 3.0])))
     lost = replace(fit, adjusted=replace(fit.adjusted, parameters=astray, sigma=25.0, converged=False))
     found = from_another_start(problem, lost)

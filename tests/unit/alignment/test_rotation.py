@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from examples.worlds.alignment_scenes import aligned, scene
+from examples.worlds.turns import camera_rotations, panorama_rotations
 from rdstitch.alignment import Alignment, align
 from rdstitch.alignment.frames import frontal_reference, in_frame_of, level_frame
 from rdstitch.alignment.motion_models import POSE, PSI, X
@@ -15,7 +16,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
-from rdstitch.synthetic.panorama import camera_rotations, panorama_rotations
 
 LENS = Camera((640, 480), -0.2, focal=554.0, focal_source="guess")
 

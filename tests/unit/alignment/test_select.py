@@ -3,13 +3,12 @@
 import math
 from dataclasses import replace
 from importlib import import_module
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import aligned, grid, scene
+from examples.worlds.alignment_scenes import aligned, fitted, grid, scene
+from examples.worlds.turns import camera_rotations
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, RIGID, ROTATION, MotionModel
@@ -19,7 +18,6 @@ from rdstitch.choices import Purpose
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
-from rdstitch.synthetic.panorama import camera_rotations
 
 SIZE, FOCAL = (640, 480), 520.0
 
@@ -135,14 +133,14 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
     ],
 )
 def test_a_turn_may_leave_what_seams_hide(stretch: float, turn: float, chosen: str) -> None:
-    problem: Any = SimpleNamespace(count=3)
+    problem, fit = fitted(scene(grid(3, 1, (0.4, 0.3), 0.2, np.random.default_rng(0)), rng=np.random.default_rng(0)))
     posterior = Posterior(problem)
     # A quarter of 4 px, and the noise: 1.17 px.
-    vars(posterior)["evidence"] = SimpleNamespace(farthest=np.array([4.0]), noise=np.array([0.6]))
+    known = replace(posterior.evidence, farthest=np.array([4.0]), noise=np.array([0.6]))
+    vars(posterior)["evidence"] = known
 
     def hypothesis(model: MotionModel, score: float, field: float) -> Hypothesis:
-        fit: Any = SimpleNamespace(model=model)
-        return Hypothesis(fit, score, field, stretch if model is RIGID else 1.0)
+        return Hypothesis(replace(fit, model=model), score, field, stretch if model is RIGID else 1.0)
 
     tried = [hypothesis(ROTATION, 60.0, turn), hypothesis(RIGID, 0.0, 0.9), hypothesis(HOMOGRAPHY, -30.0, 0.2)]
     assert _best(posterior, tried).fit.model.name == chosen

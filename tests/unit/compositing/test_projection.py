@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from examples.worlds.compositing_scenes import as_image, gradient, grey, place_images
+from examples.worlds.turns import TurningSequence, camera_rotations, turning_sequence
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
 from rdstitch.compositing.canvas import NearPart, near_parts, plan_canvas
@@ -26,7 +27,6 @@ from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage
 from rdstitch.pipeline.straighten import view_rotation
-from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 
 LENS = Camera((160, 120), -0.2, focal=110.0, focal_source="option")

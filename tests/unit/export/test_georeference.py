@@ -1,6 +1,5 @@
 """The place of a mosaic on the Earth, from made-up positions."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,9 @@ from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.georeference import Georeference, Located, georeference, world_file_paths
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs, NamedSystem
+from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import from_plane, to_plane
-from rdstitch.io import Layout, write_strips
-from rdstitch.io.metadata import GpsPosition, GroundControl
+from rdstitch.io import ImageSpec, write_strips
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import mosaic
@@ -29,7 +28,7 @@ from rdstitch.report import report_page
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.robust.similarity_fit import fit_similarity
 from rdstitch.synthetic.poses import Poses
-from tests.cli.running import DISTORTION, flight, transfers
+from tests.cli.running import DISTORTION, flight, sidecar_of, transfers
 
 
 def _degrees(value: float) -> tuple[float, float, float]:
@@ -69,8 +68,7 @@ def cached(tmp_path_factory: pytest.TempPathFactory) -> StitchOptions:
 
 def _middles(output: Path) -> FloatArray:
     """Px of the output where the images' middles are, by the sidecar."""
-    record = json.loads(output.with_name(output.name + ".json").read_text(encoding="utf-8"))
-    found = transfers(record)
+    found = transfers(sidecar_of(output))
     return np.concatenate([found[k](np.array([[199.5, 149.5]])) for k in sorted(found)])
 
 
@@ -90,7 +88,7 @@ def test_a_tiff_lies_in_the_right_place_and_north_is_up(
     error = np.hypot(*(np.stack(transform @ (x + 0.5, y + 0.5), axis=1) - truth).T)
     assert error.max() < 4 * METRES_PER_TEXEL
     assert transform.a == pytest.approx(METRES_PER_TEXEL / 0.7, rel=0.25)
-    record = json.loads((tmp_path / "a.tif.json").read_text(encoding="utf-8"))["output"]["georeference"]
+    record = sidecar_of(tmp_path / "a.tif")["output"]["georeference"]
     assert (record["crs"], record["north_up"]) == ("EPSG:32734", True)
     assert (record["positions"], record["positions_used"]) == (6, 6)
     assert record["gsd_m"] == pytest.approx(transform.a)
@@ -377,7 +375,7 @@ def test_positions_and_gcp_of_files(
     result = mosaic(plain, tmp_path / "a.tif", options)
     assert by_positions.used == 6
     np.testing.assert_allclose(result.georeference.pixel_to_map, by_positions.pixel_to_map, atol=0.1)
-    record = json.loads((tmp_path / "a.tif.json").read_text(encoding="utf-8"))["output"]["georeference"]
+    record = sidecar_of(tmp_path / "a.tif")["output"]["georeference"]
     assert record["source"] == "ground control points"
     away = {r["name"]: np.hypot(r["east_m"], r["north_m"]) for r in record["residuals"]}
     assert away.keys() == {path.stem for path in plain}
@@ -417,7 +415,7 @@ def test_images_without_positions_leave_no_world_file(cached: StitchOptions, tmp
 
 def test_gdal_sees_what_was_meant(tmp_path: Path) -> None:
     place = Georeference(Crs(32734), 0.05 * np.exp(0.3j), complex(268_832.3, 6_246_117.8), 0.1)
-    layout = Layout((900, 600), 3, np.dtype(np.uint8))
+    layout = ImageSpec((900, 600), 3, np.dtype(np.uint8))
     write_strips(tmp_path / "a.tif", layout, [(np.full((600, 900, 3), 9, np.uint8), None)], place.tiff_tags())
     with rasterio.open(tmp_path / "a.tif") as opened:
         assert opened.crs.to_epsg() == place.crs.epsg

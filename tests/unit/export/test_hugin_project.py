@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from examples.worlds.turns import panorama_rotations, turning_sequence
 from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import read_camera_file
 from rdstitch.errors import ArgumentError
@@ -15,7 +16,6 @@ from rdstitch.export.hugin_project import project_of_hugin
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.synthetic.panorama import panorama_rotations, turning_sequence
 from tests.cli.running import flight
 
 _VALUE = re.compile(r"([A-Za-z]+)(-?[\d.]+(?:e-?\d+)?|=\d+|\"[^\"]*\")")

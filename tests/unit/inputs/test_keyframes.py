@@ -37,6 +37,8 @@ def test_frames_in_a_row_share_enough_and_no_more_are_taken_than_that_needs() ->
     assert found[0] == 0
     assert 0.62 < min(_share(found, places)) <= max(_share(found, places)[:-1]) < 0.75
     assert places[-1] - places[found[-1]] <= 0.05 * _WIDTH
+    large = [frame.repeat(4, axis=0).repeat(4, axis=1) for frame in _film(places[:30])]
+    assert choose(tracked(large), 0.65)[:3] == pytest.approx(found[:3], abs=1)
 
 
 def test_where_the_camera_turns_back_the_outermost_frame_is_taken() -> None:

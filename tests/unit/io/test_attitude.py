@@ -8,12 +8,12 @@ import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from examples.worlds.drone_xmp import DIALECTS, euler_angles, xmp_of
 from rdstitch.geometry.exif_orientation import turned, turning_matrix
 from rdstitch.geometry.planar_motion import tilt_from_normal
 from rdstitch.io import Attitude, Metadata, read_metadata
 from rdstitch.io.attitude import read_attitude
 from rdstitch.synthetic import Poses
-from tests.drone_xmp import DIALECTS, euler_angles, xmp_of
 
 
 @pytest.mark.parametrize("source", DIALECTS)
@@ -28,20 +28,14 @@ def test_the_tilt_of_a_known_camera(source: str, element: bool) -> None:
         np.testing.assert_allclose(tilt_from_normal(found.nadir), tilt, atol=1e-6)
 
 
-@pytest.mark.parametrize(("yaw", "roll"), [(0.0, 0.0), (77.0, 0.0), (-120.0, 35.0), (10.0, 180.0)])
-def test_a_gimbal_that_points_straight_down_has_no_tilt(yaw: float, roll: float) -> None:
-    np.testing.assert_allclose(Attitude(yaw, -90.0, roll, "dji-gimbal").nadir, (0.0, 0.0, 1.0), atol=1e-12)
-
-
-def test_a_gimbal_past_straight_down() -> None:
-    """DJI writes pitch -90.1 as -89.9, turned about: yaw and roll half a turn on."""
+def test_signs_and_what_points_straight_down_or_past_it() -> None:
+    """Who looks a little ahead has the ground below him towards the bottom of the image."""
+    for yaw, roll in ((0.0, 0.0), (77.0, 0.0), (-120.0, 35.0), (10.0, 180.0)):
+        np.testing.assert_allclose(Attitude(yaw, -90.0, roll, "dji-gimbal").nadir, (0.0, 0.0, 1.0), atol=1e-12)
+    # DJI writes pitch -90.1 as -89.9, turned about: yaw and roll half a turn on.
     past, written = Attitude(14.4, -90.1, 0.0, "dji-gimbal"), Attitude(-165.6, -89.9, 180.0, "dji-gimbal")
     np.testing.assert_allclose(written.nadir, past.nadir, atol=1e-12)
     assert written.nadir[1] < 0.0
-
-
-def test_signs() -> None:
-    """Who looks a little ahead has the ground below him towards the bottom of the image."""
     c, s = np.cos(np.radians(10.0)), np.sin(np.radians(10.0))
     for ahead in (Attitude(50.0, -80.0, 0.0, "dji-gimbal"), Attitude(50.0, 10.0, 0.0, "pix4d-camera")):
         np.testing.assert_allclose(ahead.nadir, (0.0, s, c), atol=1e-12)

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.io import Layout, Metadata, write_image, write_strips
+from rdstitch.io import ImageSpec, Metadata, write_image, write_strips
 from rdstitch.io.deepzoom import read_deep_zoom
 
 NAMESPACE = "{http://schemas.microsoft.com/deepzoom/2008}"
@@ -68,7 +68,7 @@ def test_tiles_are_the_image(tmp_path: Path) -> None:
 def test_strips_do_not_matter(tmp_path: Path, channels: int) -> None:
     pixels = _smooth(1100, 300, channels)
     alpha = np.where(pixels[..., 0] > 60, 255, 0).astype(np.uint8)
-    layout = Layout((300, 1100), channels, np.dtype(np.uint8), metadata=Metadata((300, 1100)), background=200)
+    layout = ImageSpec((300, 1100), channels, np.dtype(np.uint8), metadata=Metadata((300, 1100)), background=200)
     for name, step in (("whole", 1280), ("strips", 256)):
         strips = [(pixels[k : k + step], alpha[k : k + step]) for k in range(0, 1100, step)]
         write_strips(tmp_path / f"{name}.dzi", layout, strips)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
-from rdstitch.io import Layout, Metadata, read_image, write_image, write_strips
+from rdstitch.io import ImageSpec, Metadata, read_image, write_image, write_strips
 
 Pixels = NDArray[Any]
 
@@ -73,7 +73,7 @@ def test_strips_do_not_matter(tmp_path_factory: pytest.TempPathFactory, suffix: 
     pixels = _image(height, width, 3, np.uint8)
     alpha = np.where(pixels[..., 0] > 60, 255, 0).astype(np.uint8)
     write_image(folder / f"whole.{suffix}", pixels, alpha)
-    layout = Layout((width, height), 3, np.dtype(np.uint8), transparent=True, metadata=Metadata((width, height)))
+    layout = ImageSpec((width, height), 3, np.dtype(np.uint8), transparent=True, metadata=Metadata((width, height)))
     starts = [0]
     while starts[-1] < height:
         starts.append(starts[-1] + 256 * data.draw(st.integers(1, 3)))
@@ -174,7 +174,7 @@ def test_wrong_arguments(tmp_path: Path) -> None:
         write_image(tmp_path / "a.png", np.zeros((4, 4), np.uint8), np.zeros((4, 5), np.uint8))
     with pytest.raises(OutputError):
         write_image(tmp_path / "a.xyz", np.zeros((4, 4), np.uint8))
-    layout = Layout((4, 10), 1, np.dtype(np.uint8), metadata=Metadata((4, 10)))
+    layout = ImageSpec((4, 10), 1, np.dtype(np.uint8), metadata=Metadata((4, 10)))
     with pytest.raises(ArgumentError, match="rows"):
         write_strips(tmp_path / "a.png", layout, [(np.zeros((9, 4, 1), np.uint8), None)])
     assert list(tmp_path.iterdir()) == []

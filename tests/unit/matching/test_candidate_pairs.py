@@ -153,13 +153,8 @@ def test_of_many_overlapping_pairs_each_image_keeps_a_few_all_around_it() -> Non
     assert degree.min() >= 6
     assert degree.mean() < 10
     middle = side**2 // 2
-    directions = {
-        (int(np.sign(other % side - middle % side)), int(np.sign(other // side - middle // side)))
-        for pair in chosen
-        if middle in pair
-        for other in pair
-        if other != middle
-    }
+    beside = {other for pair in chosen if middle in pair for other in pair}
+    directions = {(int(np.sign(k % side - middle % side)), int(np.sign(k // side - middle // side))) for k in beside}
     assert {(1, 0), (-1, 0), (0, 1), (0, -1)} <= directions
 
 
@@ -168,9 +163,8 @@ def test_a_weak_partner_on_the_other_side_is_kept_before_a_strong_one_on_the_sam
     right, left = rng.uniform((200, 0), (400, 400), (60, 2)), rng.uniform((0, 0), (100, 400), (25, 2))
     shared = {(0, other): stored(right, right) for other in range(1, 12)}
     # The others have partners enough among themselves.
-    shared |= {
-        (i, j): stored(np.tile(right, (4, 1)), np.tile(right, (4, 1))) for i in range(1, 12) for j in range(i + 1, 12)
-    }
+    many = np.tile(right, (4, 1))
+    shared |= {(i, j): stored(many, many) for i in range(1, 12) for j in range(i + 1, 12)}
     shared[0, 12] = stored(left, left)
     chosen = pairs_that_matter(shared, [Camera((400, 400))] * 13)
     assert (0, 12) in chosen
@@ -221,7 +215,7 @@ def test_features_are_read_in_the_pixels_that_are_wanted() -> None:
     np.testing.assert_array_equal(smaller.descriptors, features.descriptors)
 
 
-def test_chosen_features_keep_their_order_and_the_strongest_come_first() -> None:
+def test_chosen_features_keep_their_order_and_the_strongest_come_first(tmp_path: Path) -> None:
     store = FeatureStore.of([_some_features(30, (640, 480))])
     chosen = FeatureStore((store.items[0].take(np.array([7, 3, 20])),))
     assert chosen[0].scale.tolist() == [7, 3, 20]
@@ -230,10 +224,8 @@ def test_chosen_features_keep_their_order_and_the_strongest_come_first() -> None
     assert chosen.strongest(2).counts.tolist() == [2]
     assert chosen.strongest(5).counts.tolist() == [3]
     assert store.strongest(4)[0].scale.tolist() == [0, 1, 2, 3]
-
-
-def test_what_is_chosen_is_part_of_the_key(tmp_path: Path) -> None:
-    item, cache = FeatureStore.of([_some_features(30, (640, 480))]).items[0], Cache(tmp_path)
+    # What is chosen is part of the key.
+    item, cache = store.items[0], Cache(tmp_path)
     others = [item.take(np.arange(5)), item.take(np.arange(6))]
     assert len({entry.key(cache) for entry in (item, *others)}) == 3
     assert item.key(cache) == FeatureStore.of([_some_features(30, (640, 480))]).items[0].key(cache)

@@ -37,12 +37,9 @@ def test_every_other_link_of_a_sequence_is_reversed_however_far_apart_its_images
         assert all(first is not second for first, second in itertools.pairwise(backward))
 
 
-def test_components_come_largest_first() -> None:
+def test_components_come_largest_first_and_trees_take_the_links_of_most_weight() -> None:
     assert connected_components(7, [5, 1, 2], [6, 2, 4]) == [[1, 2, 4], [5, 6], [0], [3]]
     assert connected_components(2, [], []) == [[0], [1]]
-
-
-def test_spanning_tree_takes_the_links_of_most_weight() -> None:
     i, j = np.array([0, 1, 0, 2]), np.array([1, 2, 2, 3])
     tree = spanning_tree(4, i, j, np.array([5.0, 1.0, 4.0, 3.0]))
     assert sorted(tree.link.tolist()) == [0, 2, 3]
@@ -59,6 +56,11 @@ def test_the_root_is_the_middle_of_the_longest_path_wherever_the_numbers_begin()
     path = np.array([5, 3, 0, 1, 6, 4, 2])
     i, j = np.append(path[:-1], 0), np.append(path[1:], 7)
     assert spanning_tree(8, i, j, np.ones(7)).root == 1
+    # Of two middles the one with more matches.
+    weight = np.array([5.0, 4.0, 3.0])
+    for chain in ([0, 1, 2, 3], [3, 2, 1, 0], [2, 0, 3, 1]):
+        i, j = np.array(chain[:-1], dtype=np.intp), np.array(chain[1:], dtype=np.intp)
+        assert spanning_tree(4, i, j, weight).root == chain[1]
 
 
 def test_chaining_goes_along_links_in_either_direction() -> None:
@@ -89,13 +91,6 @@ def test_a_spanning_forest_of_many_links_is_that_of_kruskal() -> None:
     assert spanning_forest(count, i, j, weight).tolist() == sorted(expected)
 
 
-def test_of_two_centres_the_one_with_more_matches_is_the_root_whatever_the_numbers() -> None:
-    weight = np.array([5.0, 4.0, 3.0])
-    for chain in ([0, 1, 2, 3], [3, 2, 1, 0], [2, 0, 3, 1]):
-        i, j = np.array(chain[:-1], dtype=np.intp), np.array(chain[1:], dtype=np.intp)
-        assert spanning_tree(4, i, j, weight).root == chain[1]
-
-
 def test_thinning_keeps_the_overlap_covered() -> None:
     rng = np.random.default_rng(0)
     crowd = rng.normal(0.2, 0.01, (900, 2))
@@ -106,10 +101,6 @@ def test_thinning_keeps_the_overlap_covered() -> None:
     assert len(np.unique(kept)) == 100
     assert (kept >= 900).sum() > 60
     assert (spread_choice(points[:7], 100) == np.arange(7)).all()
-
-
-def test_each_cell_gives_one_before_any_gives_two() -> None:
-    rng = np.random.default_rng(1)
     # Ten in each of the nine cells of a grid of three by three, but two in the last.
     cells = np.repeat(np.stack(np.meshgrid(range(3), range(3)), axis=-1).reshape(-1, 2), 10, axis=0)[:82]
     points = (cells + rng.uniform(0.2, 0.8, cells.shape)) / 3.0

@@ -136,14 +136,11 @@ def test_a_few_wrong_votes_are_no_lens() -> None:
     assert two_lenses([Camera((640, 480))] * 6, Votes(i, j, votes, np.tile(0.002**2 * np.eye(2), (15, 1, 1)))) is None
 
 
-def test_lenses_that_differ_by_less_than_a_result_shows_are_one() -> None:
-    assert _divided(_CHAIN, [-0.2] * 4 + [-0.185], 1e-4, size=(320, 240)) is None
-    assert _divided(_CHAIN, [-0.2] * 4 + [-0.185], 1e-4, size=(640, 480)) is not None
-
-
-def test_pairs_that_see_nothing_say_nothing() -> None:
+def test_lenses_that_differ_by_less_than_a_result_shows_are_one_and_pairs_that_see_nothing_say_nothing() -> None:
     assert two_lenses([Camera((640, 480))] * 3, Votes.of([], 3.0)) is None
     assert _divided(_CHAIN[:1], [-0.2, -0.1], std=0.05) is None
+    assert _divided(_CHAIN, [-0.2] * 4 + [-0.185], 1e-4, size=(320, 240)) is None
+    assert _divided(_CHAIN, [-0.2] * 4 + [-0.185], 1e-4, size=(640, 480)) is not None
 
 
 def test_agreement_of_votes_of_different_weight() -> None:
@@ -154,9 +151,7 @@ def test_agreement_of_votes_of_different_weight() -> None:
     assert found.agreeing >= 55
     assert found.histogram.sum() == pytest.approx(1.0)
     assert len(found.edges) == len(found.histogram) + 1
-
-
-def test_bad_pairs_do_not_move_the_consensus() -> None:
+    # Bad pairs do not move the consensus.
     rng = np.random.default_rng(1)
     votes = np.concatenate([-0.2 + 0.003 * rng.normal(size=40), rng.uniform(-0.9, 0.3, 12)])
     found = vote(votes, np.full(52, 0.003))
@@ -181,13 +176,10 @@ def test_pairs_that_cannot_see_it_have_no_vote() -> None:
     assert "none of 2 pairs" in none.reason
 
 
-@pytest.mark.parametrize(("offset", "agreeing", "distortion"), [(0.029, 2, -0.1855), (0.031, 1, -0.2)])
-def test_votes_agree_within_three_standard_deviations(offset: float, agreeing: int, distortion: float) -> None:
-    found = vote([-0.2, -0.2 + offset], [0.01, 0.01])
-    assert found.agreeing == agreeing
-    assert found.distortion == pytest.approx(distortion)
-
-
-def test_the_middle_of_votes_that_do_not_agree_is_their_median() -> None:
+def test_votes_agree_within_three_standard_deviations_and_others_have_their_median() -> None:
+    for offset, agreeing, distortion in ((0.029, 2, -0.1855), (0.031, 1, -0.2)):
+        found = vote([-0.2, -0.2 + offset], [0.01, 0.01])
+        assert found.agreeing == agreeing
+        assert found.distortion == pytest.approx(distortion)
     assert vote([-0.5, -0.2, 0.1], [0.001] * 3).distortion == pytest.approx(-0.2, abs=0.01)
     assert vote([0.1, -0.6, -0.2, -0.5, 0.2], [0.001] * 5).distortion == pytest.approx(-0.2, abs=0.01)

@@ -5,13 +5,15 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.features import Correspondences, Features, match
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.candidate_pairs import neighbours
 from rdstitch.matching.feature_store import FeatureStore
-from rdstitch.matching.static_background import is_static_pair, moving_features
+from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features
+from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.robust import EstimationOptions
 from rdstitch.system.progress import silent
@@ -71,6 +73,21 @@ def test_a_moving_board_is_found_before_a_static_background() -> None:
     assert all(pair.relation and not is_static_pair(pair, 3.0) for pair in moving[1])
     distortion = np.median([pair.relation.distortion for pair in moving[1]])
     assert abs(distortion - LENS.distortion) < 0.02
+
+
+def test_matches_of_a_pair_are_read_once_to_find_what_is_static(monkeypatch: pytest.MonkeyPatch) -> None:
+    pairing = _pairing(400, 150)
+    pairs, read, loaded = pairing.estimate(ALL), list[PairRegistration](), PairRegistration.correspondences
+
+    def noted(pair: PairRegistration) -> Correspondences:
+        read.append(pair)
+        return loaded.__get__(pair)  # type: ignore[no-any-return]
+
+    monkeypatch.setattr(PairRegistration, "correspondences", property(noted))
+    has_static_background(pairs, 3.0)
+    assert len(read) == len(pairs)
+    moving_features(pairing.features, pairs, 3.0)
+    assert len(read) == 2 * len(pairs)
 
 
 def test_images_that_are_really_static_stay_together() -> None:

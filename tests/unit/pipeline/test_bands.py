@@ -1,6 +1,5 @@
 """Another band by the registration of a first one: which image belongs where, and what its lens is."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.bands import mosaic_bands
 from rdstitch.pipeline.recipes import mosaic
-from tests.cli.running import flight
+from tests.cli.running import flight, sidecar_of
 
 _SHIFT = np.array([-7.0, 9.0])
 _NAMES = [f"IMG_{k:04d}_{{}}.png" for k in (3, 4, 7, 8, 11, 12)]
@@ -79,8 +78,7 @@ def test_a_band_by_another_lens_is_registered(rig: Path, tmp_path: Path) -> None
 def test_seams_of_a_sidecar_are_those_of_its_image(rig: Path, tmp_path: Path) -> None:
     smaller = CompositeOptions(scale=0.3)
     result = apply(rig / "red.tif.json", [rig / "red"], tmp_path / "small.tif", smaller, workers=1)
-    told = json.loads((tmp_path / "small.tif.json").read_text(encoding="utf-8"))["seams"]
-    assert told["places"] == len(result.seams.places) > 0
+    assert sidecar_of(tmp_path / "small.tif")["seams"]["places"] == len(result.seams.places) > 0
 
 
 @pytest.mark.parametrize("kind", ["size", "depth"])

@@ -12,7 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 import rdstitch
+from examples.benchmarks.robot import HEIGHT as DRIVE_HEIGHT
+from examples.benchmarks.robot import swaying
 from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
+from examples.worlds.paths import drive_poses
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ImpossibleCameraError, InputError
@@ -20,7 +23,7 @@ from rdstitch.features import detect, match
 from rdstitch.features.prepared_image import View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.robust import EstimationOptions
-from rdstitch.synthetic import Sequence, drive_poses, ground, sequence_over
+from rdstitch.synthetic import Sequence, ground, sequence_over
 from rdstitch.tracking import Tracker as FrameTracker
 from rdstitch.tracking import TrackingOptions
 from rdstitch.tracking import tracker as tracker_module
@@ -109,7 +112,7 @@ def test_with_lens_and_tilt_the_second_frame_has_a_pose_and_errors_are_as_large_
     # Lengths are as good as the focal length, whose standard deviation is 1 %.
     far = max(float(np.hypot(*pose.position[:2])) for pose in poses.values())
     assert np.abs(_errors(poses, drive)).max() < 0.005 * HEIGHT + 0.01 * far
-    for pose in poses.values():
+    for pose in [pose for pose in poses.values() if pose.number]:  # the first is matched with none
         assert pose.covariance.shape == (4, 4)
         assert (np.linalg.eigvalsh(pose.covariance)[1:] > 0.0).all()
         assert pose.ros_covariance[5, 5] == pytest.approx(pose.covariance[3, 3])
@@ -150,6 +153,22 @@ def test_measured_attitudes_are_used(tmp_path: Path) -> None:
     assert "attitude.csv" in late.add(images[0], 5.0).reason
     with pytest.raises(InputError, match="no such file"):
         rdstitch.Tracker(rdstitch.StitchOptions(attitude=tmp_path / "missing.csv"))
+
+
+def test_late_attitudes_are_found_and_positions_are_as_uncertain_as_they_say(tmp_path: Path) -> None:
+    drive = swaying(CAMERA, replace(CAMERA, focal_std=0.002 * CAMERA.focal), 16, seed=5)
+    files = {name: tmp_path / f"{name}.csv" for name in drive.files}
+    for name, content in drive.files.items():
+        files[name].write_text(content, encoding="utf-8")
+    options = rdstitch.StitchOptions(**(drive.told | files))
+    tracker = rdstitch.Tracker(options, rdstitch.FollowedPoses(DRIVE_HEIGHT, "camera"), patient=True)
+    last = _rows(tracker, drive.images)
+    assert [message.code for message in tracker.messages] == ["attitudes-late"]
+    np.testing.assert_allclose(last[0].position[:2], 0.0, atol=1e-9)
+    for number, pose in enumerate(last[1:], start=1):
+        off = complex(*pose.position[:2]) - drive.places[number]
+        error = np.array([off.real, off.imag])
+        assert error @ np.linalg.solve(pose.covariance[:2, :2], error) < 3.5**2
 
 
 def _rows(tracker: rdstitch.Tracker, images: Iterable[NDArray[np.uint8]]) -> list[rdstitch.Pose]:

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from examples.worlds.correspondences import correspondences
+from examples.worlds.turns import panorama_rotations
 from rdstitch.choices import SOLVERS, SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
-from rdstitch.synthetic import panorama_rotations
 
 MATCHES = correspondences(150, seed=4, outliers=0.3)
 LENS = MATCHES.truth.camera
@@ -81,8 +81,10 @@ def test_too_few_matches_are_no_result_but_a_reason() -> None:
     found = estimate_radial_homography(MATCHES.points1[:5], MATCHES.points2[:5], LENS.image_size)
     assert not found
     assert "only 5 matches" in found.reason
-    first, second = np.random.default_rng(0).uniform((0, 0), (999, 799), (2, 100, 2))
-    assert not estimate_radial_homography(first, second, LENS.image_size)
+    for count in (8, 30, 400):
+        first, second = np.random.default_rng(0).uniform((0, 0), (999, 799), (2, count, 2))
+        none = estimate_radial_homography(first, second, LENS.image_size)
+        assert (bool(none), bool(none.reason)) == (False, True)
 
 
 def test_the_best_matches_are_sampled_first() -> None:

@@ -257,5 +257,12 @@ def test_fisheyes_are_possible_and_strong_pincushion_is_not() -> None:
 
 
 @pytest.mark.parametrize(("value", "std", "found"), [(-0.3, 0.001, -0.3), (0.08, 0.04, 0.04), (-0.3, 0.12, -0.325)])
-def test_a_measurement_and_the_likeliest_part_of_a_prior_meet(value: float, std: float, found: float) -> None:
+def test_a_measurement_and_a_prior_meet_by_their_variances(value: float, std: float, found: float) -> None:
     assert LENS[0].combined(value, std) == pytest.approx(found, abs=1e-4)
+
+
+@pytest.mark.parametrize("std", [0.01, 0.03, 0.08])
+@pytest.mark.parametrize("value", [-0.14, -0.125, -0.12])
+def test_near_the_crossing_of_two_parts_they_meet_where_both_together_put_them(value: float, std: float) -> None:
+    found = LENS[0].combined(value, std)
+    assert LENS[0].slope(found) + (found - value) / std**2 == pytest.approx(0.0, abs=1e-6)

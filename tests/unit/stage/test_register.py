@@ -16,7 +16,7 @@ from rdstitch.inputs.source import read_sources
 from rdstitch.io.flat_field import FlatField, read_flat_field
 from rdstitch.io.stored_tiles import stored_tiles
 from rdstitch.pipeline.read_inputs import with_flat_field
-from rdstitch.stage import TileRegistration, register_tiles
+from rdstitch.stage import SearchPlan, TileRegistration, register_tiles
 from rdstitch.stage.axes import with_axes_shown
 from rdstitch.stage.correlation import Overlap, coarse_tile, correlate
 from rdstitch.stage.estimate_flat_field import estimate_illumination
@@ -160,7 +160,7 @@ def test_tiles_of_a_pattern_without_anything_unique_stay_where_the_stage_was_sen
     nominal = np.array([(270.0 * c, 220.0 * r) for r in range(2) for c in range(3)])
     grid = TileGrid(nominal, (320, 256))
     assert with_axes_shown(grid, lambda index: coarse_tile(tiles[index], 1), 1, 16.0)[1] == ""
-    found = register_tiles(grid, tiles.__getitem__)
+    found = register_tiles(SearchPlan.of(grid), tiles.__getitem__)
     off = found.adjustment.places - places
     assert np.abs(off - np.median(off, axis=0)).max() < 5.0
     assert (
@@ -173,7 +173,7 @@ def test_a_tile_that_lies_elsewhere_is_found_there() -> None:
     nominal = stage.nominal.copy()
     nominal[4] += (45.0, -20.0)
     tiles = [stage.render(index).astype(np.float32) for index in range(9)]
-    found = register_tiles(TileGrid(nominal, (256, 256)), tiles.__getitem__)
+    found = register_tiles(SearchPlan.of(TileGrid(nominal, (256, 256))), tiles.__getitem__)
     off = found.adjustment.places - stage.places
     assert np.abs(off - np.median(off, axis=0)).max() < 0.5
     assert int(found.off_stage.argmax()) == 4
@@ -193,7 +193,7 @@ def test_errors_are_what_they_are_said_to_be() -> None:
 def _registered(stage: StageGrid) -> TileRegistration:
     tiles = [stage.render(index).astype(np.float32) for index in range(len(stage))]
     planes = [tile if tile.ndim == 2 else tile.mean(axis=2) for tile in tiles]
-    return register_tiles(TileGrid(stage.nominal, (stage.tile, stage.tile)), planes.__getitem__)
+    return register_tiles(SearchPlan.of(TileGrid(stage.nominal, (stage.tile, stage.tile))), planes.__getitem__)
 
 
 def _pair_errors(stage: StageGrid, found: TileRegistration) -> FloatArray:
@@ -229,7 +229,7 @@ def test_the_lens_is_found_where_half_of_the_tiles_have_content() -> None:
 def test_nothing_but_noise_leaves_all_places_as_they_were() -> None:
     noise = np.random.default_rng(1).normal(100.0, 3.0, size=(6, 200, 200)).astype(np.float32)
     places = np.array([(x, y) for y in (0.0, 180.0) for x in (0.0, 180.0, 360.0)])
-    found = register_tiles(TileGrid(places, (200, 200)), noise.__getitem__)
+    found = register_tiles(SearchPlan.of(TileGrid(places, (200, 200))), noise.__getitem__)
     assert not found.linked.any()
     np.testing.assert_allclose(found.adjustment.places, places, atol=1e-6)
     assert np.isinf(found.adjustment.distortion_std)
@@ -249,5 +249,5 @@ def test_a_wrong_period_of_a_pattern_does_not_win_by_the_height_of_its_peak(seed
     highest = np.unravel_index(int(surface.argmax()), surface.shape)
     assert np.abs(np.array(highest) - (33, 33)).max() > 5
     grid = TileGrid(np.array([[0.0, 0.0], [212.0, 0.0]]), (256, 256))
-    places = register_tiles(grid, tiles.__getitem__, search=30.0, distortion=0.0).adjustment.places
+    places = register_tiles(SearchPlan.of(grid, 30.0), tiles.__getitem__, distortion=0.0).adjustment.places
     np.testing.assert_allclose(places[1] - places[0], (215.0, 3.0), atol=0.3)

@@ -21,14 +21,11 @@ from rdstitch.synthetic import (
     Relief,
     Sequence,
     blank,
-    drive_poses,
     fit_to_plane,
-    gradient,
     grid_poses,
     ground,
     hills,
     pair_poses,
-    repeated,
     sequence_over,
 )
 
@@ -191,15 +188,6 @@ def test_motion_between_poses_is_the_homography_between_images() -> None:
         poses.shaken(seed=1, tilt=0.1).motion(0, 1)
 
 
-def test_parking_ends_parallel_and_aside() -> None:
-    poses = drive_poses(LENS, "parking", 101)
-    assert poses.yaw[-1] == pytest.approx(poses.yaw[0])
-    assert np.ptp(poses.yaw) == pytest.approx(0.7)
-    step = np.linalg.norm(np.diff(poses.position[:2], axis=0))
-    assert abs(poses.position[-1, 1]) > 5.0 * step
-    assert (np.diff(poses.position[:, 0]) < 0.0).sum() == 50
-
-
 def test_endless_ground_is_the_same_wherever_it_is_cut() -> None:
     texture = EndlessTexture((100_000, 50_000), seed=5, channels=1)
     whole = texture.region(70_000, 30_000, 70_300, 30_200)
@@ -210,13 +198,6 @@ def test_endless_ground_is_the_same_wherever_it_is_cut() -> None:
     seam = texture.region(2039 - 8, 0, 2039 + 8, 2000).mean(axis=2)
     steps = np.abs(np.diff(seam, axis=1)).mean(axis=0)
     assert steps[7] < 2.0 * np.median(steps)
-
-
-def test_hopeless_textures_are_hopeless() -> None:
-    assert np.ptp(blank((50, 40)).region(0, 0, 50, 40)) == 0.0
-    assert np.abs(np.diff(gradient((500, 400)).region(0, 0, 500, 400), n=2, axis=0)).max() < 1e-6
-    tiles = repeated((500, 400), 1, period=96).region(0, 0, 500, 400)
-    np.testing.assert_array_equal(tiles[:, 96:192], tiles[:, :96])
 
 
 DOWNWARDS = Camera((320, 240), -0.2, focal=260.0)

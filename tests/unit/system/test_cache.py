@@ -33,12 +33,9 @@ def _forget_software() -> Iterator[None]:
     cache.software.cache_clear()
 
 
-def test_results_depend_on_the_sources_of_the_whole_package() -> None:
-    assert Path(rdstitch.__file__).parent == cache._PACKAGE
-
-
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    assert Path(rdstitch.__file__).parent == cache._PACKAGE
     folder = tmp_path / "package"
     (folder / "robust").mkdir(parents=True)
     (folder / "robust" / "ransac.py").write_text("LIMIT = 1\n", encoding="utf-8")
@@ -253,20 +250,15 @@ def test_dataclasses_come_back() -> None:
     assert turned.flags.writeable
 
 
-def test_what_has_no_digest_is_refused() -> None:
+def test_what_has_no_digest_is_refused_and_values_of_other_types_or_limits_have_other_ones() -> None:
     for value in (object(), {1: 2}, np.array(["text"]), {3}, b"bytes"):
         with pytest.raises(ArgumentError):
             digest(value)
-
-
-def test_values_of_other_types_or_limits_have_other_digests() -> None:
     values: list[Any] = [0, 0.0, False, "", "0", [], (), {}, ["a", "b"], ["ab"], [["a"], "b"], ["a", ["b"]], None]
     values += [np.zeros(2), np.zeros((2, 1)), np.zeros(2, np.float32), np.zeros((2, 2)), np.asfortranarray(np.eye(2))]
     values += ["None", np.eye(2), Path("a"), "a", Camera((4, 3)), Camera((3, 4)), (Camera((4, 3)),)]
     assert len({digest(value) for value in values}) == len(values)
-
-
-def test_dictionaries_are_equal_in_any_order() -> None:
+    # Dictionaries are equal in any order.
     first, second = {"a": np.zeros(2), "b": np.ones(2)}, {"b": np.ones(2), "a": np.zeros(2)}
     assert digest(first) == digest(second)
     assert digest(first) != digest({"a": np.ones(2), "b": np.zeros(2)})

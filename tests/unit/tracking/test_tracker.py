@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from examples.judging.trajectories import compare_trajectories
 from examples.worlds.floor_drives import floor_drive, true_path
+from examples.worlds.paths import drive_poses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.features import FeatureOptions, Features, detect, match
 from rdstitch.features.corner_flow import CornerFlow, corners_of, fitted_affine, matched_corners
@@ -18,7 +19,7 @@ from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.robust import EstimationOptions
-from rdstitch.synthetic import Sequence, blank, drive_poses, sequence_over
+from rdstitch.synthetic import Sequence, blank, sequence_over
 from rdstitch.tracking import CameraPose, Placement, PlaneSimilarity, Preview, Tracked, Tracker, TrackingOptions
 from rdstitch.tracking import tracker as module
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from examples.worlds.turns import camera_rotations, turning_sequence
 from rdstitch.alignment.result import LinkFit
 from rdstitch.choices import Purpose
 from rdstitch.executors import open_executor
@@ -19,7 +20,7 @@ from rdstitch.pipeline.recipes import pano
 from rdstitch.pipeline.register import register
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
-from rdstitch.synthetic import Photometry, camera_rotations, turning_sequence
+from rdstitch.synthetic import Photometry
 from rdstitch.verification import evidence, verdict
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding, Kind, messages_of

@@ -67,7 +67,7 @@ class _Around:
         return rows.take(np.arange(left, right) % width, axis=1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TurningSequence(Sequence):
     """Images of a camera that turns about its centre; made by :func:`turning_sequence`.
 
