@@ -107,7 +107,7 @@ class Elimination:
             for one, number in zip(matrix, fronts.number.tolist(), strict=True):
                 for places, update in waiting.pop(number, ()):
                     one[np.ix_(places, places)] += update
-            lower: FloatArray = np.linalg.cholesky(matrix[:, :edge, :edge])
+            lower = np.asarray(np.linalg.cholesky(matrix[:, :edge, :edge]), dtype=np.float64)
             inverse = _lower_inverse(lower)
             across = matrix[:, edge:, :edge] @ inverse.swapaxes(1, 2)
             factors.append((inverse, across))
@@ -173,8 +173,7 @@ def _lower_inverse(lower: FloatArray) -> FloatArray:
     """Of lower triangular matrices (B, K, K): of halves, where that takes fewer operations than a general inverse."""
     half = lower.shape[1] // 2
     if half < _HALVED:
-        inverse: FloatArray = np.linalg.inv(lower)
-        return inverse
+        return np.asarray(np.linalg.inv(lower), dtype=np.float64)
     first, last = _lower_inverse(lower[:, :half, :half]), _lower_inverse(lower[:, half:, half:])
     result = np.zeros_like(lower)
     result[:, :half, :half], result[:, half:, half:] = first, last

@@ -34,7 +34,7 @@ class SparseNormalEquations:
     Rows and columns of parameters that are not free are zero, and so are their steps.
     """
 
-    elimination: Elimination  # of the images by the links of the blocks
+    elimination: Elimination  # of the images by the L links between images that are not fixed
     free: BoolArray  # (N, D)
     poses: FloatArray  # (N, D, D): the blocks of A on its diagonal
     links: FloatArray  # (L, D, D): those of the links: rows of their second image, columns of their first
@@ -209,8 +209,11 @@ def chain(
         gradient_shared += gradient[:, pair:].sum(axis=0)
     poses, coupling, gradient_poses = np.split(by_image.reshape(count, size, -1), [size, size + others], axis=2)
     gradient_poses = gradient_poses[:, :, 0]
-    elimination = Elimination.of_links(count, observations.image1, observations.image2)
-    return SparseNormalEquations(elimination, free, poses, of_links, coupling, shared, gradient_poses, gradient_shared)
+    joined = free.any(axis=1)[[observations.image1, observations.image2]].all(axis=0)
+    elimination = Elimination.of_links(count, observations.image1[joined], observations.image2[joined])
+    return SparseNormalEquations(
+        elimination, free, poses, of_links[joined], coupling, shared, gradient_poses, gradient_shared
+    )
 
 
 def _incidence(count: int, images: IntArray) -> "sparse.csr_array":
