@@ -209,7 +209,8 @@ def chain(
         gradient_shared += gradient[:, pair:].sum(axis=0)
     poses, coupling, gradient_poses = np.split(by_image.reshape(count, size, -1), [size, size + others], axis=2)
     gradient_poses = gradient_poses[:, :, 0]
-    joined = free.any(axis=1)[[observations.image1, observations.image2]].all(axis=0)
+    moving = np.flatnonzero(free.any(axis=1))
+    joined = np.isin(observations.image1, moving) & np.isin(observations.image2, moving)
     elimination = Elimination.of_links(count, observations.image1[joined], observations.image2[joined])
     return SparseNormalEquations(
         elimination, free, poses, of_links[joined], coupling, shared, gradient_poses, gradient_shared

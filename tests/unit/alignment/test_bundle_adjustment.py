@@ -35,7 +35,7 @@ def _dense(normal: SparseNormalEquations, observations: Observations) -> np.ndar
     poses, images = np.zeros((count, count, size, size)), np.arange(count)
     poses[images, images] = normal.poses
     image1, image2 = observations.image1, observations.image2
-    joined = normal.free.any(axis=1)[image1] & normal.free.any(axis=1)[image2]
+    joined = np.array([normal.free[k].any() for k in image1]) & np.array([normal.free[k].any() for k in image2])
     poses[image2[joined], image1[joined]] += normal.links
     poses[image1[joined], image2[joined]] += normal.links.swapaxes(1, 2)
     rows, coupling = poses.swapaxes(1, 2).reshape(count * size, -1), normal.coupling.reshape(-1, shared)
