@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rdstitch.options.tile_options import TileOptions as TileOptions
     from rdstitch.pipeline.apply_sidecar import Recomposition as Recomposition
     from rdstitch.pipeline.apply_sidecar import apply as apply
+    from rdstitch.pipeline.blocks import mosaic_blocks as mosaic_blocks
     from rdstitch.pipeline.composer import Composer as Composer
     from rdstitch.pipeline.doctor import Examination as Examination
     from rdstitch.pipeline.doctor import examine as examine
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from rdstitch.pipeline.follow import Tracker as Tracker
     from rdstitch.pipeline.recipes import calibrate as calibrate
     from rdstitch.pipeline.recipes import mosaic as mosaic
-    from rdstitch.pipeline.recipes import mosaic_blocks as mosaic_blocks
     from rdstitch.pipeline.recipes import pano as pano
     from rdstitch.pipeline.recipes import trajectory as trajectory
     from rdstitch.pipeline.result_files import write_layers as write_layers
@@ -67,7 +67,8 @@ _HOMES = {
         "rdstitch.pipeline.follow": "FollowedPoses Pose Tracker",
         "rdstitch.options.files_beside": "FilesBeside",
         "rdstitch.pipeline.result_files": "write_layers",
-        "rdstitch.pipeline.recipes": "calibrate mosaic mosaic_blocks pano trajectory",
+        "rdstitch.pipeline.blocks": "mosaic_blocks",
+        "rdstitch.pipeline.recipes": "calibrate mosaic pano trajectory",
         "rdstitch.pipeline.stage_tiles": "place_tiles tiles",
         "rdstitch.pipeline.undistort_images": "undistort",
         "rdstitch.geometry.radial_homography": "RadialHomography",

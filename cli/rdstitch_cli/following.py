@@ -73,7 +73,8 @@ def followed(
     from rdstitch.pipeline.follow import follow as follow_frames
     from rdstitch.pipeline.output_plan import files_beside
     from rdstitch.system.file_access import file_state
-    from rdstitch.system.outputs import TemporaryFolder, check_outputs, check_suffix
+    from rdstitch.system.outputs import check_outputs, check_suffix
+    from rdstitch.system.temporary_folder import TemporaryFolder
 
     if len(inputs) != 1:
         raise click.UsageError("--follow takes one input: a folder, a video, the index of a camera, a stream or -")

@@ -16,7 +16,6 @@ from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.option import Option
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import bytes_in_words, seconds_in_words
-from rdstitch.system.progress import StageTimer
 from rdstitch_cli.config import CONFIG_FILE
 from rdstitch_cli.flags import flags, flags_of, is_given, values_of
 from rdstitch_cli.terminal import Reporter
@@ -122,11 +121,9 @@ def _check_written(read: Iterable[Path | None]) -> None:
     check_not_read(written, files)
 
 
-def files_beside(reporter: Reporter, given: Mapping[str, Any]) -> FilesBeside:
+def files_beside(given: Mapping[str, Any]) -> FilesBeside:
     """What is written beside a result, from a command's flags."""
-    return FilesBeside(
-        **values_of(FilesBeside, given), command=shlex.join(["rdstitch", *sys.argv[1:]]), timer=StageTimer(reporter)
-    )
+    return FilesBeside(**values_of(FilesBeside, given), command=shlex.join(["rdstitch", *sys.argv[1:]]))
 
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.panorama_canvas import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
-from rdstitch.compositing.preparation import Decisions, prepare_composite
+from rdstitch.compositing.preparation import Decisions, decide, prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.tiles import BlockRunner
@@ -52,20 +52,19 @@ class FileComposite:
     origin: tuple[int, int]  # where the output begins in that canvas, pixels
 
 
-def compose(
-    images: Sequence[PlacedImage],
-    canvas: Canvas,
-    options: CompositeOptions | None = None,
-    progress: ShareProgress = unheard,
-    elsewhere: BlockRunner | None = None,
-    decisions: Decisions | None = None,
-) -> Composite:
-    """Put images together on a canvas, in memory.
+def compose(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions | None = None) -> Composite:
+    """Put images together on a canvas that was planned for them, in memory."""
+    return compose_decided(decide(images, canvas, options or CompositeOptions()))
 
-    The canvas is planned, and the ``decisions`` are made, with the same images. ``elsewhere`` computes the pixels in
-    blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
+
+def compose_decided(
+    decisions: Decisions, progress: ShareProgress = unheard, elsewhere: BlockRunner | None = None
+) -> Composite:
+    """The same once exposure and seams are decided.
+
+    ``elsewhere`` computes the pixels in blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
     """
-    with prepare_composite(images, canvas, options, elsewhere, decisions) as prepared:
+    with prepare_composite(decisions, elsewhere) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
@@ -80,23 +79,20 @@ def compose(
 
 def compose_to_file(
     path: str | Path,
-    images: Sequence[PlacedImage],
-    canvas: Canvas,
-    options: CompositeOptions | None = None,
+    decisions: Decisions,
     progress: ShareProgress = unheard,
     elsewhere: BlockRunner | None = None,
-    decisions: Decisions | None = None,
     *,
     metadata: Metadata | None = None,
     extra_tags: Callable[[Canvas], Iterable[ExtraTag]] = lambda canvas: (),
     outputs: Outputs | None = None,
 ) -> FileComposite:
-    """Put images together straight into a file, whatever its size: memory is that of a strip of tiles.
+    """As :func:`compose_decided`, straight into a file, whatever its size: memory is that of a strip of tiles.
 
-    As :func:`compose`. ``extra_tags`` gives further tags of a TIFF file for the canvas after cropping; without
-    ``outputs`` the file replaces what is there.
+    ``extra_tags`` gives further tags of a TIFF file for the canvas after cropping; without ``outputs`` the file
+    replaces what is there.
     """
-    with prepare_composite(images, canvas, options, elsewhere, decisions) as prepared:
+    with prepare_composite(decisions, elsewhere) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
         layout = ImageSpec(
             size,

@@ -7,7 +7,7 @@ from contextlib import suppress
 from threading import Lock
 
 from rdstitch.compositing.source_images import ImageOnDisk, ImageReader, LoadedImage
-from rdstitch.system.outputs import TemporaryFolder
+from rdstitch.system.temporary_folder import TemporaryFolder
 
 
 class ImageCache:

@@ -49,17 +49,6 @@ class Prepared:
 
 
 @dataclass(frozen=True)
-class Decisions:
-    """What is decided on small versions of the images, and what the seams are like."""
-
-    exposure: Exposure
-    seams: SeamMap | None  # None without
-    box: Box  # of the output on the canvas, which is widened where it goes all the way round
-    messages: tuple[Message, ...] = ()
-    quality: SeamQuality = field(default_factory=SeamQuality)  # of the seams, in pixels of the output
-
-
-@dataclass(frozen=True)
 class _Task:
     """Images and where they lie, before anything is decided."""
 
@@ -71,8 +60,7 @@ class _Task:
     turn: Box | None  # the middle of a canvas that was widened
 
     @classmethod
-    def of(cls, images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions | None) -> Self:
-        options = options or CompositeOptions()
+    def of(cls, images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions) -> Self:
         if len(images) != len(canvas.footprints):
             raise ArgumentError(f"the canvas is for {len(canvas.footprints)} images, not for {len(images)}")
         reader = ImageReader(images)
@@ -83,31 +71,43 @@ class _Task:
             canvas = canvas.widened(_wrap_margin(canvas, plan.bands))
         return cls(images, canvas, options, reader, plan, _unwidened(canvas))
 
-    def cropped(self, box: Box) -> Canvas:
-        """The canvas of the output."""
-        return self.canvas if box == (0, 0, *self.canvas.size) else self.canvas.cropped(box)
+
+@dataclass(frozen=True)
+class Decisions:
+    """Images on a canvas with what is decided on small versions of them, and what their seams are like."""
+
+    task: _Task
+    exposure: Exposure
+    seams: SeamMap | None  # None without
+    box: Box  # of the output on the canvas, which is widened where it goes all the way round
+    messages: tuple[Message, ...] = ()
+    quality: SeamQuality = field(default_factory=SeamQuality)  # of the seams, in pixels of the output
+
+    @property
+    def canvas(self) -> Canvas:
+        """Of the output."""
+        canvas = self.task.canvas
+        return canvas if self.box == (0, 0, *canvas.size) else canvas.cropped(self.box)
 
 
 def decide(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions) -> Decisions:
-    """Decide on exposure, seams and cropping, from a small version of each image; see :func:`compose`."""
+    """Decide on exposure, seams and cropping, from a small version of each image; the canvas was planned for them."""
     return _decided(_Task.of(images, canvas, options))
 
 
+def planned(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions) -> CompositePlan:
+    """What compositing would take; a small version of the first image is read."""
+    return _Task.of(images, canvas, options).plan
+
+
 @contextmanager
-def prepare_composite(
-    images: Sequence[PlacedImage],
-    canvas: Canvas,
-    options: CompositeOptions | None = None,
-    elsewhere: BlockRunner | None = None,
-    decisions: Decisions | None = None,
-) -> Iterator[Prepared]:
-    """Everything that is needed to compute the output; see :func:`compose`.
+def prepare_composite(decisions: Decisions, elsewhere: BlockRunner | None = None) -> Iterator[Prepared]:
+    """Everything that is needed to compute the output; see :func:`rdstitch.compositing.compositor.compose_decided`.
 
     Images are read ahead as long as it lasts, if they are needed here.
     """
-    task = _Task.of(images, canvas, options)
-    decided = decisions or _decided(task)
-    plan, warps, (channels, dtype) = task.plan, plan_warps(images, task.canvas), task.reader.samples
+    task, plan = decisions.task, decisions.task.plan
+    warps, (channels, dtype) = plan_warps(task.images, task.canvas), task.reader.samples
     cache = ImageCache(
         task.reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1 and elsewhere is None
     )
@@ -116,9 +116,11 @@ def prepare_composite(
         # The first tiles need most of them, however the seams run.
         topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
         cache.prefetch(sorted(topmost, key=lambda index: warps[index].box))
-        renderer = Renderer(warps, cache, decided.exposure, decided.seams, task.options, plan.bands, channels, dtype)
-        tiles = TiledOutput(renderer, decided.box, plan.tile_size, plan.workers)
-        yield Prepared(renderer, task.cropped(decided.box), tiles, decided.messages, elsewhere)
+        renderer = Renderer(
+            warps, cache, decisions.exposure, decisions.seams, task.options, plan.bands, channels, dtype
+        )
+        tiles = TiledOutput(renderer, decisions.box, plan.tile_size, plan.workers)
+        yield Prepared(renderer, decisions.canvas, tiles, decisions.messages, elsewhere)
 
 
 def _decided(task: _Task) -> Decisions:
@@ -132,7 +134,7 @@ def _decided(task: _Task) -> Decisions:
     joined = len(images) > 1 and (options.exposure != "none" or options.seam != "none")
     whole = task.turn or (0, 0, *canvas.size)
     if not joined and options.crop != "auto":
-        return Decisions(exposure, None, whole)
+        return Decisions(task, exposure, None, whole)
     survey = survey_images(task.reader, images, canvas, min(plan.workers, _READERS))
     if joined and method == "exif":
         exposure, said = exposure_by_metadata(images, task.reader.samples[0])
@@ -153,7 +155,8 @@ def _decided(task: _Task) -> Decisions:
         find = crop_box if task.turn is None else partial(crop_rows, whole=task.turn)
         cropped_box, note = find(covered_pixels(survey), survey.factor, canvas.size)
         box = cropped_box or box
-    return Decisions(exposure, seams, box, (*messages, *([Message(note)] if note else [])), quality.cropped(box))
+    messages += [Message(note)] if note else []
+    return Decisions(task, exposure, seams, box, tuple(messages), quality.cropped(box))
 
 
 def _wrap_margin(canvas: Canvas, bands: int) -> int:

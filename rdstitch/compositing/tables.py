@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rdstitch.compositing.boxes import Box, Float32Array, cut
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.photometric import DEPTHS, full_scale
-from rdstitch.compositing.preparation import prepare_composite
+from rdstitch.compositing.preparation import decide, prepare_composite
 from rdstitch.compositing.render import Layer
 from rdstitch.compositing.source_images import LoadedImage, PlacedImage, smoothed
 from rdstitch.compositing.warp import INTERPOLATION, remap, sample_places
@@ -54,7 +54,7 @@ class CompositeTables:
         """
         blend = "feather" if options.blend == "multiband" else options.blend
         options = replace(options, blend=blend, crop="none")
-        with prepare_composite(images, canvas, options) as prepared:
+        with prepare_composite(decide(images, canvas, options)) as prepared:
             renderer, box = prepared.renderer, prepared.tiles.box
             covered = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.uint8)
             exposure, channels = renderer.exposure, renderer.channels

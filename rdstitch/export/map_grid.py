@@ -72,7 +72,7 @@ def read_grid(file: str | Path) -> MapGrid:
         scale
     )
     if not (0 < epsg < 32767 and square):
-        raise InputError(f"{file}: is no GeoTIFF with square pixels on a map whose coordinate system has an EPSG code")
+        raise InputError(f"{file}: is not a GeoTIFF with square pixels in a coordinate system that has an EPSG code")
     try:
         crs = Crs(epsg)
     except NotMetricError as error:

@@ -15,7 +15,8 @@ from rdstitch.export.trajectory_files import (
     positions_in_frame,
     ros_covariance,
 )
-from rdstitch.system.outputs import TemporaryFolder, naming
+from rdstitch.system.outputs import naming
+from rdstitch.system.temporary_folder import TemporaryFolder
 
 
 def check_bag(file: Path, *, overwrite: bool) -> None:
@@ -27,7 +28,7 @@ def check_bag(file: Path, *, overwrite: bool) -> None:
     if file.is_dir() and overwrite:
         others = [item.name for item in file.iterdir() if item.suffix not in (".mcap", ".db3", ".yaml")]
         if others or not (file / "metadata.yaml").is_file():
-            raise OutputError(f"{file}: is a folder that is no ROS bag; choose another name")
+            raise OutputError(f"{file}: is a folder, and not a ROS bag; choose another name")
 
 
 def write_bag_folder(path: Trajectory, folder: Path, frame: TrajectoryFrame) -> None:

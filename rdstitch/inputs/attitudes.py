@@ -133,7 +133,7 @@ def _tilt_of(row: Row) -> tuple[float, float]:
         return math.radians(row.needed("psi")), math.radians(row.needed("theta"))
     x, y, z, w = (row.needed(name) for name in ("qx", "qy", "qz", "qw"))
     if not 0.99 < math.hypot(x, y, z, w) < 1.01:
-        raise InputError(f"{row.where}: qx, qy, qz, qw are no unit quaternion")
+        raise InputError(f"{row.where}: qx, qy, qz, qw are not a unit quaternion")
     # Down in the body's axes, then in the camera's: right, towards the bottom of the image, ahead of the lens.
     ahead, left, up = -2.0 * (x * z - w * y), -2.0 * (y * z + w * x), -(1.0 - 2.0 * (x * x + y * y))
     psi, theta = tilt_from_normal((-left, -ahead, -up)).tolist()

@@ -28,7 +28,7 @@ from rdstitch.system.file_access import (
     read_text,
     remote_names,
 )
-from rdstitch.system.outputs import TemporaryFolder
+from rdstitch.system.temporary_folder import TemporaryFolder
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
 READABLE_SUFFIXES = frozenset(

@@ -117,7 +117,7 @@ def csv_rows(
     meaning the last counts that is not empty. ``file`` is what messages call it.
     """
     if "\0" in text:
-        raise InputError(f"{file}: is no UTF-8 text; save it as CSV in UTF-8")
+        raise InputError(f"{file}: is not UTF-8 text; save it as CSV in UTF-8")
     known = _finder(file, columns, units)
     lines = list(io.StringIO(text, newline=None))
     start = next((n for n, line in enumerate(lines) if _is_heading(line, known)), 0)

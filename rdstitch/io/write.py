@@ -25,7 +25,7 @@ from rdstitch.system.outputs import (
     WRITABLE_SUFFIXES,
     Fingerprint,
     Outputs,
-    check_tiles_folder,
+    check_folder,
     fingerprint,
     is_zarr,
     naming,
@@ -91,7 +91,7 @@ def write_strips(
     tiles = None
     if suffix == ".dzi":
         folder = tiles_folder(Path(os.path.realpath(file)))
-        check_tiles_folder(folder, overwrite=True)
+        check_folder(folder, overwrite=True)
         with outputs.writing(folder, is_folder=True) as tiles, outputs.writing(file) as staged:
             write_deep_zoom(staged, tiles, spec, checked)
     elif is_zarr(file):

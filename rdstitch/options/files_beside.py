@@ -1,13 +1,12 @@
 """What is written beside an image."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from rdstitch.choices import PosesFrame
 from rdstitch.errors import ArgumentError
 from rdstitch.options.option import check_options, documented, option
 from rdstitch.options.shared_options import Height
-from rdstitch.system.progress import StageTimer
 
 _REPORT_SUFFIXES = (".html", ".htm")
 
@@ -42,7 +41,6 @@ class FilesBeside:
     )
     height: Height = None
     command: str = ""  # the command line, for the report
-    timer: StageTimer = field(default_factory=StageTimer)  # the ``progress`` of the recipe, for the report
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -56,7 +56,9 @@ def impossible_estimates_fail() -> Iterator[None]:
     try:
         yield
     except np.linalg.LinAlgError as error:
-        raise RegistrationError(f"no reliable result: the images determine nothing ({error})") from error
+        raise RegistrationError(
+            f"no reliable result: the matches are too few to fix the camera ({error}); take images that overlap more"
+        ) from error
     except ImpossibleCameraError as error:
         raise RegistrationError(
             f"no reliable result: the images agree best on a lens that cannot be ({error}); "

@@ -40,7 +40,7 @@ from rdstitch.sidecar.write import output_record, seams_record, to_output, versi
 from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
-from rdstitch.system.progress import Progress, silent
+from rdstitch.system.progress import Progress, StageTimer, silent
 from rdstitch.system.records import to_jsonable
 
 
@@ -99,6 +99,7 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
     now = replace_fields(
         then,
         version=VERSION,
+        lambda_=source.camera.distortion,
         lambda_px=camera.lambda_px,
         lambda_focal=camera.lambda_focal,
         camera=camera,
@@ -260,7 +261,7 @@ def apply(
         settings = StitchOptions(
             composite=options, reference=reference, channel_order=channel_order, workers=workers, dry_run=dry_run
         )
-        run = Run(settings, output, progress=progress)
+        run = Run(settings, output, progress=StageTimer(progress))
         composed, said = compose_images(Layout.of(placed, options), run, outputs)
         result = Recomposition(
             saved=saved,

@@ -194,5 +194,5 @@ def _refuse_other_places(
         registered, given = compared[worst]
         raise InputError(
             f"{given.path}: shows what {registered.name} does {off[worst]:.0f} pixels further off than the "
-            "others do: it was not taken from the same place; register these images of their own"
+            "others do: it was not taken from the same place; stitch these images separately"
         )

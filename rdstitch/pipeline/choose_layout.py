@@ -14,6 +14,7 @@ import numpy as np
 
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import Purpose
 from rdstitch.compositing.projection import PLANE
 from rdstitch.compositing.seam_quality import DIAGONAL
 from rdstitch.errors import ArgumentError, LimitError, RdstitchError
@@ -94,11 +95,12 @@ def lay_out(registration: Registration, local: LocalAlignment, options: Composit
     return LaidOut(registration, local, Layout.of(placed, options), tuple(said))
 
 
-def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner, *, pano: bool) -> LaidOut:
-    """The layout whose seams hold, or break the least.
+def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner) -> LaidOut:
+    """The layout whose seams hold, or break the least; of a panorama always in the frame of an image.
 
-    Pixels are those of the working size; with ``pano`` the output is always in the frame of an image.
+    Pixels are those of the working size.
     """
+    pano = aligner.options.purpose is Purpose.PANO
 
     @cache
     def edges(image: int) -> FloatArray:

@@ -15,15 +15,14 @@ from rdstitch.compositing import (
     Canvas,
     Composite,
     CompositeOptions,
-    CompositePlan,
     Decisions,
     FileComposite,
     PlacedImage,
     SeamQuality,
-    compose,
+    compose_decided,
     compose_to_file,
     decide,
-    plan_composite,
+    planned,
 )
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.projection import PLANE
@@ -48,8 +47,6 @@ from rdstitch.system.outputs import Outputs, check_outputs, text_bytes
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
 
-# Reduction of an image of which only the kind of its samples is wanted.
-_PROBE_REDUCTION = 8
 _VISIBLE_CUT = 0.02  # share of the images that is cut away, from which on it is said
 
 
@@ -89,8 +86,8 @@ def compose_images(
     """See whether a file can hold the canvas, and put the images on it; of a dry run the plan alone.
 
     Without an output the image is made in memory; a file has colour profile and EXIF of the first image, and its place
-    on the Earth. ``elsewhere``: see :func:`rdstitch.compositing.compose`. With it comes what the user should know, such
-    as why nothing was cropped.
+    on the Earth. ``elsewhere``: see :func:`rdstitch.compositing.compose_decided`. With it comes what the user should
+    know, such as why nothing was cropped.
     """
     return_freed_memory()
     threads = run.options.threads
@@ -113,8 +110,9 @@ def compose_images(
         not_georeferenced=layout.not_georeferenced,
     )
     if run.options.dry_run:
-        return replace(composed, plan=_planned(placed, canvas, options)), messages
+        return replace(composed, plan=planned(layout.images, canvas, options)), messages
     layout = layout if layout.decisions is not None else layout.decided(options, threads)
+    assert layout.decisions is not None
     if layout.photographs:
         messages += seam_messages(layout.seams, [str(source.path) for source in placed.sources])
 
@@ -125,14 +123,15 @@ def compose_images(
         on_final = moved(place, canvas, final)
         return [] if on_final is None else on_final.tiff_tags()
 
-    how = (layout.images, canvas, options, report, elsewhere, layout.decisions)
     made: Composite | FileComposite
     if output is None:
-        made = composite = compose(*how)
+        made = composite = compose_decided(layout.decisions, report, elsewhere)
         composed = replace(composed, composite=composite)
     else:
         metadata = _metadata(placed.sources[0], options)
-        made = written = compose_to_file(output, *how, metadata=metadata, extra_tags=tags, outputs=outputs)
+        made = written = compose_to_file(
+            output, layout.decisions, report, elsewhere, metadata=metadata, extra_tags=tags, outputs=outputs
+        )
         composed = replace(composed, written=written)
     place = moved(place, canvas, made.canvas)
     messages += made.messages
@@ -168,8 +167,8 @@ def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
         images = tuple(paths[k] for k in seams.least_alike)
         text = (
             f"only {seams.alike:.0%} of what the images share looks alike, the least between "
-            f"{' and '.join(names_of(images))}: something that fills a part of them (a vehicle, a mount) may be what "
-            "was put together; a mask keeps it out"
+            f"{' and '.join(names_of(images))}: something that fills a part of them (a vehicle, a mount) may have been "
+            "registered instead of the scene; mask it"
         )
         return [Message(text, images, code="rival-motion")]
     if not seams.breaks:
@@ -183,16 +182,6 @@ def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
     text = f"{'; '.join(told)}{more}: something moved, or is nearer than the rest; leave one of the two out, or mask it"
     images = tuple(dict.fromkeys(paths[k] for one in worst for k in one.images))
     return [Message(text, images, "warning" if seams.seen else "detail", code="seam-break")]
-
-
-def _planned(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> CompositePlan:
-    """What compositing would take."""
-    preview = placed.images(canvas.near)[0].preview
-    assert preview is not None
-    probe = preview(_PROBE_REDUCTION)
-    channels = 1 if probe.pixels.ndim == 2 else probe.pixels.shape[2]
-    size, masked = probe.pixels.dtype.itemsize, probe.alpha is not None
-    return plan_composite(placed.cameras, canvas, options, channels, size, masked=masked)
 
 
 def _box_of_rectangle(placed: PlacedImages, corners: Corners, canvas: Canvas) -> Box | None:

@@ -52,10 +52,8 @@ def counterparts(
     for path in files_of(frames):
         check_readable(path)
     wanted = next(image.name for image in saved.images if image.to_plane is not None)
-    by = "has a name that is in it" if match == "name" else "fits by name, time or GPS position to one in it"
-    raise InputError(
-        f"{saved.path}: none of the given images {by}, such as {wanted}; --match order takes them in order"
-    )
+    by = "has the name of a registered image" if match == "name" else "fits a registered image by name, time or GPS"
+    raise InputError(f"{saved.path}: none of the given images {by} ({wanted}, …); --match order takes them in order")
 
 
 def _without_counterpart(chosen: Chosen, frames: Sequence[Frame]) -> list[Message]:
@@ -79,8 +77,8 @@ def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[P
             alike = [frame for frame in alike if _folders(frame)[-len(folders) :] == folders]
         if len(alike) > 1 or (alike and alike[0] in chosen):
             raise InputError(
-                f"{saved.path}: several images are called {name}; give as many images as it has, in its order, with "
-                "--match order"
+                f"{saved.path}: several images are called {name}; give as many images as were registered, in the same "
+                "order, with --match order"
             )
         chosen.append(alike[0] if alike else None)
     return chosen
@@ -105,8 +103,8 @@ def _by_varying_part(saved: SavedRegistration, frames: Sequence[Frame]) -> Chose
         for image, by_name, by_place in zip(saved.images, chosen, near or chosen, strict=True):
             if by_name is not None and by_place is not None and by_name is not by_place:
                 raise InputError(
-                    f"{by_name.path}: has the number of {image.name}, but {by_place.path.name} was taken when and "
-                    "where that was; --match order takes images in order"
+                    f"{by_name.path}: has the number of {image.name}, but {by_place.path.name} was taken at the "
+                    "time or place of that; --match order takes images in order"
                 )
     return chosen
 

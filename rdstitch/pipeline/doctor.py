@@ -150,7 +150,7 @@ def examine(
         if not looks:
             raise InputError(unreadable[0] if unreadable else "there is nothing to examine")
         plan, registration, problems = _dry_run(listed.frames, progress) if len(looks) > 1 else (None, None, ())
-    chosen, (sharpness, brightness, burnt) = [sources[k] for k in looks], np.array([*looks.values()]).T
+    chosen, (sharpness, brightness, burnt_out) = [sources[k] for k in looks], np.array([*looks.values()]).T
 
     def named(which: Iterable[Any]) -> tuple[str, ...]:
         return tuple(source.name for source, is_one in zip(chosen, which, strict=True) if is_one)
@@ -161,11 +161,8 @@ def examine(
         alone, overlap = tuple(source.name for source, is_used in placed if not is_used), _overlap(registration)
     focal, zoomed = _focal(chosen)
     cameras = Counter(map(_camera, chosen)).most_common()
-    blurred, dark, faded = (
-        named(sharpness < _BLURRED * np.median(sharpness)),
-        named(brightness < _DARK),
-        named(burnt > _BURNT),
-    )
+    blurred = named(sharpness < _BLURRED * np.median(sharpness))
+    dark, burnt = named(brightness < _DARK), named(burnt_out > _BURNT)
     advice = (
         (len(chosen) < 2, "stitching needs two images or more; name another one"),
         (len(cameras) > 1, f"the images come from {len(cameras)} cameras: stitch those of each on their own"),
@@ -177,18 +174,21 @@ def examine(
             f"images overlap by about {overlap or 0.0:.0%} only: take more images, a third is the least",
         ),
         (blurred, f"leave blurred images out if their neighbours overlap without them: {shortened(blurred)}"),
-        (dark or faded, "dark or burnt-out images have few features: fix the exposure if you can take them again"),
+        (dark or burnt, "dark or burnt-out images have few features: fix the exposure if you can take them again"),
     )
     return Examination(
-        len(chosen),
-        tuple(unreadable),
-        tuple(Counter("{} x {}".format(*source.metadata.size) for source in chosen).most_common()),
-        tuple(cameras),
-        focal,
-        *(blurred, dark, faded, alone),
-        overlap,
-        plan,
-        tuple(text for applies, text in advice if applies),
+        images=len(chosen),
+        unreadable=tuple(unreadable),
+        sizes=tuple(Counter("{} x {}".format(*source.metadata.size) for source in chosen).most_common()),
+        cameras=tuple(cameras),
+        focal=focal,
+        blurred=blurred,
+        dark=dark,
+        burnt=burnt,
+        alone=alone,
+        overlap=overlap,
+        plan=plan,
+        advice=tuple(text for applies, text in advice if applies),
     )
 
 

@@ -63,7 +63,7 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
         on_grid = grid.place.in_pixels(place) @ canvas.matrix
         laid = canvas.on_grid(on_grid, grid.size)
         if not any(_overlaps(outline, grid.size) for outline in laid.footprints):
-            raise ArgumentError(f"{'like' if options.like else 'extent'}: none of the images lies there")
+            raise ArgumentError(f"none of the images lies within {options.like or 'the extent'}")
         # As in the file, without rounding.
         exact = replace(place.after(grid.place.in_pixels(place)), scale=grid.place.scale, origin=grid.place.origin)
         return laid, exact, reason

@@ -23,15 +23,16 @@ def files_beside(beside: FilesBeside, names: Iterable[str]) -> list[Path]:
     return files
 
 
-def stage_beside(beside: FilesBeside, outputs: Outputs, result: StitchResult | Registration) -> list[Message]:
+def stage_beside(run: Run, outputs: Outputs, result: StitchResult | Registration) -> list[Message]:
     """Stage the files beside a result; a warning for each that fails."""
+    beside = run.beside
     failed: list[Message] = []
 
     def attempt(place: Path | None, write: Callable[[Path], object]) -> None:
         if place is not None:
             failed.extend(outputs.attempt(place, partial(write, place)))
 
-    attempt(beside.report, lambda file: _report(beside, file, outputs, result))
+    attempt(beside.report, lambda file: _report(run, file, outputs, result))
     if isinstance(result, StitchResult) and result.plan is None:
         how = {"whole": beside.whole_layers, "overwrite": result.options.overwrite}
         attempt(beside.hugin_project, lambda file: _hugin_project(file, outputs, result))
@@ -41,18 +42,18 @@ def stage_beside(beside: FilesBeside, outputs: Outputs, result: StitchResult | R
     return failed
 
 
-def report_refused(beside: FilesBeside, refused: Registration) -> None:
+def report_refused(run: Run, refused: Registration) -> None:
     """Write the report of a result that is refused, so that one can see why."""
-    if beside.report is not None:
+    if run.beside.report is not None:
         with Outputs(overwrite=True) as outputs:
-            _report(beside, beside.report, outputs, refused)
+            _report(run, run.beside.report, outputs, refused)
 
 
-def _report(beside: FilesBeside, file: Path, outputs: Outputs, result: StitchResult | Registration) -> None:
+def _report(run: Run, file: Path, outputs: Outputs, result: StitchResult | Registration) -> None:
     # Imported late: most runs have none.
     from rdstitch.report import write_report
 
-    write_report(file, result, beside.timer.stages, beside.command, outputs=outputs)
+    write_report(file, result, run.progress.stages, run.beside.command, outputs=outputs)
 
 
 def _hugin_project(file: Path, outputs: Outputs, result: StitchResult) -> None:

@@ -87,12 +87,12 @@ def read_inputs(
 
 
 def check_size(sources: Sequence[Source]) -> None:
-    """Refuse tiles of several sizes."""
-    (w1, h1), other = sources[0].camera.image_size, None
+    """Refuse images of several sizes."""
+    w1, h1 = sources[0].camera.image_size
     other = next((source for source in sources if source.camera.image_size != (w1, h1)), None)
     if other is not None:
         w2, h2 = other.camera.image_size
-        raise InputError(f"{other.path}: has {w2} x {h2} pixels, the tiles before it have {w1} x {h1}; leave it out")
+        raise InputError(f"{other.path}: has {w2} x {h2} pixels, the images before it have {w1} x {h1}; leave it out")
 
 
 def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 from rdstitch.alignment.frames import QuarterTurns
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
-from rdstitch.errors import OutputError, RdstitchError, RegistrationError
+from rdstitch.errors import RegistrationError
 from rdstitch.export.odometry_bag import check_bag, write_bag, write_bag_folder
 from rdstitch.export.trajectory_files import WRITERS, frame_of, has_times, path_as_svg
 from rdstitch.inputs.find import FoundImages, found_images
@@ -35,8 +34,8 @@ from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.write import sidecar
 from rdstitch.system.opencv_state import one_opencv_thread
-from rdstitch.system.outputs import Outputs, TemporaryFolder, check_not_read, check_outputs, json_bytes, text_bytes
-from rdstitch.system.progress import Progress, silent
+from rdstitch.system.outputs import Outputs, check_not_read, check_outputs, json_bytes, text_bytes
+from rdstitch.system.progress import Progress, StageTimer, silent
 from rdstitch.verification.verdict import RefusedError
 
 _NO_TIMES = Message(
@@ -88,7 +87,7 @@ def pano(
     >>> result.image.shape[2], result.ok
     (3, True)
     """
-    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, progress, Purpose.PANO))
+    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, StageTimer(progress), Purpose.PANO))
 
 
 @one_opencv_thread()
@@ -132,108 +131,7 @@ def mosaic(
     >>> result.output.name, result.registration.alignment.used.all()
     ('small.tif', np.True_)
     """
-    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, progress))
-
-
-@one_opencv_thread()
-def mosaic_blocks(
-    inputs: Images,
-    output: str | Path,
-    options: StitchOptions | None = None,
-    *,
-    every: int | None = None,
-    progress: Progress = silent,
-    beside: FilesBeside = NOTHING_BESIDE,
-) -> tuple[StitchResult, ...]:
-    """Stitch every block of images that overlap: :func:`mosaic`, and again of what it left out, while that overlaps.
-
-    Parameters
-    ----------
-    inputs, options, every, progress, beside
-        As for :func:`mosaic`; ``beside``, the camera file and the reference image are for the largest block.
-    output : path
-        Of the largest block; ``field.tif`` is followed by ``field-2.tif`` and so on.
-
-    Returns
-    -------
-    tuple of StitchResult
-        The largest block first. Images that are left out are named in the first, if they are in no block.
-
-    Raises
-    ------
-    RdstitchError
-        As by :func:`mosaic`, where not even one block can be stitched.
-    """
-    options, file = options or StitchOptions(), Path(output)
-    results: list[StitchResult] = []
-    refused: list[Message] = []
-    given = as_inputs(inputs, options.channel_order)
-    options, notes = with_camera_in_bag(given, options)
-    with ExitStack() as stack:
-        listed = stack.enter_context(found_images(given, output=output, every=every, topic=options.topic))
-        if options.cache is None:
-            # What was found of images and pairs serves the next block.
-            options = replace(options, cache=stack.enter_context(TemporaryFolder()))
-        # All are published together.
-        outputs = stack.enter_context(Outputs(options.overwrite))
-        listed = replace(
-            listed, frames=list(with_times(listed.frames, options.timestamps)), notes=(*listed.notes, *notes)
-        )
-        options = replace(options, timestamps=None)
-        frames = selected(listed.frames, options.exclude, options.include_only)
-        names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
-        run = Run(options, beside=beside, progress=progress)
-        further = names[1:]
-        found = replace(listed, outputs=[], notes=())
-        while len(frames) > 1 or not results:
-            run = replace(run, output=names[len(results)])
-            try:
-                with outputs.together():
-                    result = _stitch_found(found, run, outputs, further)
-                registration = result.registration
-            except RdstitchError as error:
-                if not results or isinstance(error, OutputError):
-                    raise
-                if not isinstance(error, RefusedError):
-                    # What is left does not overlap, or cannot be read, which the first block has said.
-                    break
-                registration = error.registration
-                refused.append(Message(f"a further block of {registration.alignment.used.sum()} images: {error}"))
-            else:
-                results.append(result)
-            pairs = zip(registration.sources, registration.alignment.used, strict=True)
-            used = [source.frame or Frame(source.path) for source, used in pairs if used]
-            done = {(frame.path, frame.number) for frame in used}
-            frames = [frame for frame in frames if (frame.path, frame.number) not in done]
-            found = replace(found, frames=frames)
-            # These are of the first block, or of its reference image.
-            run, further = replace(run, options=_for_further_blocks(run.options), beside=NOTHING_BESIDE), []
-    return (_without_blocks(results[0], results[1:], [*listed.messages, *refused]), *map(_without_blocks, results[1:]))
-
-
-def _for_further_blocks(options: StitchOptions) -> StitchOptions:
-    """Without what is of the first block alone: its camera file, what its reference image shows, patterns of names."""
-    lines = options.composite.straighten if options.composite.straighten in ("off", "auto") else "off"
-    composite = replace(options.composite, rectangle=None, straighten=lines)
-    return replace(options, save_camera=None, reference=None, composite=composite, exclude=(), include_only=())
-
-
-def _without_blocks(
-    result: StitchResult, others: Sequence[StitchResult] | None = None, more: Sequence[Message] = ()
-) -> StitchResult:
-    """A block that does not name as left out what is in others; without others, nothing: the first one names it."""
-    elsewhere = {
-        str(source.path)
-        for registration in (other.registration for other in others or ())
-        for source, used in zip(registration.sources, registration.alignment.used, strict=True)
-        if used
-    }
-    kept = [
-        message
-        for message in result.registration.messages
-        if message.severity != "left out" or (others is not None and not elsewhere.issuperset(message.images))
-    ]
-    return replace(result, registration=replace(result.registration, messages=(*kept, *more)))
+    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, StageTimer(progress)))
 
 
 def _stitch(inputs: Images, every: int | None, run: Run) -> StitchResult:
@@ -245,10 +143,10 @@ def _stitch(inputs: Images, every: int | None, run: Run) -> StitchResult:
         Outputs(options.overwrite) as outputs,
     ):
         listed = replace(listed, notes=(*listed.notes, *notes))
-        return _stitch_found(listed, replace(run, options=options), outputs)
+        return stitch_found(listed, replace(run, options=options), outputs)
 
 
-def _stitch_found(listed: FoundImages, run: Run, outputs: Outputs, further: Sequence[Path] = ()) -> StitchResult:
+def stitch_found(listed: FoundImages, run: Run, outputs: Outputs, further: Sequence[Path] = ()) -> StitchResult:
     """The same of images that were found; ``further`` are images that may follow."""
     options = run.options
     frames = in_lasting_order(with_times(listed.frames, options.timestamps))
@@ -267,8 +165,7 @@ def _stitch_found(listed: FoundImages, run: Run, outputs: Outputs, further: Sequ
             run = replace(run, options=replace(options, reference=accepted.sources[first].name))
             accepted = _accepted(sources, known, run, executor)
         run.progress("laying out", 0, 1)
-        aligner = aligner_of(accepted, run.options, run.purpose)
-        chosen = choose_layout(accepted, run.options, aligner, pano=run.purpose is Purpose.PANO)
+        chosen = choose_layout(accepted, run.options, aligner_of(accepted, run.options, run.purpose))
         return compose_registration(chosen, run, outputs, executor)
 
 
@@ -301,7 +198,7 @@ def calibrate(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = options or StitchOptions()
-    run = Run(options, None, beside, progress, Purpose.CALIBRATE)
+    run = Run(options, None, beside, StageTimer(progress), Purpose.CALIBRATE)
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
         check_run(run, listed.files, ())
         sources, unread = read_inputs(with_times(listed.frames, options.timestamps), options, skip_bad=True)
@@ -309,7 +206,7 @@ def calibrate(
             result = _finished(at_full_size(_accepted(sources, [*unread, *listed.messages], run, executor)))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
-        return result.with_messages(stage_beside(beside, outputs, result))
+        return result.with_messages(stage_beside(run, outputs, result))
 
 
 @one_opencv_thread()
@@ -319,7 +216,6 @@ def trajectory(
     options: StitchOptions | None = None,
     *,
     layout: TrajectoryFormat = "csv",
-    timestamps: str | Path | None = None,
     plot: str | Path | None = None,
     height: float | None = None,
     frame: TrajectoryFrame | None = None,
@@ -337,8 +233,6 @@ def trajectory(
     layout : str
         "csv", "tum" or "kitti", see :mod:`rdstitch.export.trajectory_files`; "bag": ``nav_msgs/Odometry``, see
         :mod:`rdstitch.export.odometry_bag`.
-    timestamps : path, optional
-        As in ``options``.
     plot : path, optional
         SVG file to draw the path to.
     height : float, optional
@@ -353,7 +247,6 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = replace(options or StitchOptions(), pose_covariance=True)
-    options = options if timestamps is None else replace(options, timestamps=timestamps)
     replaced: list[Path] = []  # a bag that is a folder
     if layout == "bag" and output is not None:
         check_bag(Path(output), overwrite=options.overwrite)
@@ -368,7 +261,7 @@ def trajectory(
         # Numbered as they were named: what is left out leaves a gap.
         frames = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
         sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
-        run = Run(options, progress=progress, purpose=Purpose.TRAJECTORY)
+        run = Run(options, progress=StageTimer(progress), purpose=Purpose.TRAJECTORY)
         with run.executor(len(sources)) as executor:
             registration = at_full_size(_accepted(sources, [*unread, *listed.messages, *notes], run, executor))
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
@@ -413,7 +306,7 @@ def _accepted(sources: Sequence[Source], known: Sequence[Message], run: Run, exe
         told = [str(replace(message, code="")) for message in told_once([*unread, *sources[0].guard.complaints])]
         error.args = ("; ".join([str(error), *told]),)
         if isinstance(error, RefusedError):
-            report_refused(run.beside, error.registration)
+            report_refused(run, error.registration)
         raise
 
 
@@ -432,7 +325,7 @@ def compose_registration(chosen: LaidOut, run: Run, outputs: Outputs, executor: 
     failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, options, outputs))
     failed += write_page(result, outputs, partial(viewed_images, result))
     result = result.with_messages(failed)
-    result = result.with_messages(stage_beside(run.beside, outputs, result))
+    result = result.with_messages(stage_beside(run, outputs, result))
     if run.output is not None:
         # Last: whoever finds it finds what it belongs to.
         outputs.write(f"{run.output}.json", json_bytes(sidecar(result)))

@@ -13,7 +13,7 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import PosesFrame
 from rdstitch.compositing.boxes import intersection
-from rdstitch.compositing.preparation import prepare_composite
+from rdstitch.compositing.preparation import decide, prepare_composite
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.poses_files import geo_of_opendronemap, images_of_colmap
 from rdstitch.export.trajectory_files import as_csv
@@ -91,7 +91,7 @@ def write_layers(
     make_folder(folder)
     check_outputs(files, overwrite, [source.path for source in placed.sources])
     images = placed.images(result.canvas.near)
-    with prepare_composite(images, result.canvas, replace(options, crop="none")) as prepared:
+    with prepare_composite(decide(images, result.canvas, replace(options, crop="none"))) as prepared:
         canvas = prepared.tiles.box
         size = canvas[2] - canvas[0], canvas[3] - canvas[1]
         for index, warp in enumerate(prepared.renderer.warps):

@@ -1,24 +1,24 @@
 """What all stages of one run have in common."""
 
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rdstitch.choices import Purpose
 from rdstitch.executors import open_executor
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.system.progress import Progress, silent
+from rdstitch.system.progress import StageTimer
 
 
 @dataclass(frozen=True)
 class Run:
-    """What the user decided, and where results and progress go."""
+    """What the user decided, and where results go; the progress knows how long each stage took, for the report."""
 
     options: StitchOptions
     output: str | Path | None = None  # image to write; None for one in memory
     beside: FilesBeside = NOTHING_BESIDE
-    progress: Progress = silent
+    progress: StageTimer = field(default_factory=StageTimer)
     purpose: Purpose = Purpose.MOSAIC
 
     def executor(self, images: int) -> Executor:

@@ -63,7 +63,7 @@ from rdstitch.stage.register_tiles import (
 from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, text_bytes
-from rdstitch.system.progress import Progress, silent
+from rdstitch.system.progress import Progress, StageTimer, silent
 
 _COMPARED = 32  # overlaps by which a flat field is judged
 
@@ -102,7 +102,7 @@ def tiles(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = replace(options or TileOptions(), **fields)
-    run = Run(_stitch_options(options), output, beside, progress)
+    run = Run(_stitch_options(options), output, beside, StageTimer(progress))
     with found_images(_as_tiles(inputs), output=output, topic=options.topic) as listed:
         registration, tiled = _registered(listed, run, options, positions_file)
         with Outputs(options.overwrite) as outputs, run.executor(len(registration.sources)) as executor:
@@ -143,7 +143,7 @@ def place_tiles(
     """
     options = replace(options or TileOptions(), **fields)
     with found_images(_as_tiles(inputs), topic=options.topic) as listed:
-        run = Run(_stitch_options(options), progress=progress)
+        run = Run(_stitch_options(options), progress=StageTimer(progress))
         registration, tiled = _registered(listed, run, options, positions_file)
     with Outputs(options.overwrite) as outputs:
         _write_beside(outputs, positions_file, options, registration, tiled)

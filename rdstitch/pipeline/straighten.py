@@ -149,8 +149,7 @@ def _edges(placed: PlacedImages) -> Edges:
     assert placed.reference is not None
     to_reference = np.linalg.inv(placed.homographies[placed.reference]) @ placed.homographies
     segments, error = [], 0.0
-    count = len(placed.sources)
-    for k in evenly_spaced(count, _MAX_IMAGES).tolist():
+    for k in evenly_spaced(len(placed.sources), _MAX_IMAGES).tolist():
         camera, (ends, pixel) = placed.cameras[k], line_segments(placed.sources[k].view(MEGAPIXELS))
         flat = camera.normalize(camera.undistort(ends.reshape(-1, 2))).reshape(-1, 2, 2)
         flat = flat[np.linalg.norm(flat[:, 1] - flat[:, 0], axis=1) > _MIN_LENGTH]

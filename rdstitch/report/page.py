@@ -1,6 +1,5 @@
-"""The page: all sections in one self-contained HTML file; those of pairs and of the lens are files of their own."""
+"""The page: all sections in one self-contained HTML file; those with drawings are files of their own."""
 
-import math
 from collections.abc import Sequence
 from datetime import datetime
 from importlib.metadata import version
@@ -8,39 +7,26 @@ from pathlib import Path
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.compositing.seam_quality import SeamQuality
-from rdstitch.errors import InputError
-from rdstitch.io.preview import read_preview
 from rdstitch.report.lens import lens_curve, votes
+from rdstitch.report.mosaic import mosaic
 from rdstitch.report.pairs import match_graph, matched, residual_map
+from rdstitch.report.stage import stage
 from rdstitch.report.svg import (
-    GREEN,
-    RED,
-    YELLOW,
     Content,
     Markup,
-    counted,
-    data_address,
-    drawing,
     element,
     joined,
-    label,
     of_source,
     section,
     table,
 )
-from rdstitch.report.svg import path as outline
 from rdstitch.results.messages import of_severity
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.stage.register_tiles import TileRegistration
 from rdstitch.system.outputs import Outputs
-from rdstitch.viewer import viewer_path
 
-_THUMBNAIL, _MOSAIC_SIDE = 200, 1200  # pixels of the longer side
-_MAX_NAMES, _MAX_ROWS, _MAX_DOTS = 12, 20, 5000
-_OUTLINED = {"stroke_width": 3.0, "paint_order": "stroke"}
+_THUMBNAIL = 200  # pixels of the longer side
+_MAX_ROWS = 20
 _VIEWPORT = "width=device-width, initial-scale=1"
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 960px; margin: 2em auto; padding: 0 1em; }
@@ -207,63 +193,6 @@ def run(stages: Sequence[tuple[str, float]], command: str) -> str:
     return section("Run", f"{sum(seconds for _, seconds in stages):.1f} s on the clock." if stages else "", table(rows))
 
 
-def mosaic(result: StitchResult, staged: Path | None = None) -> str:
-    """The output, small; every outline has its image's name as title, and a few images have it written."""
-    image = _thumbnail(result, staged)
-    if image is None:
-        if result.plan is not None or result.output is None:
-            return section("Mosaic", "No image was written.")
-        tiled = result.output.suffix.lower() in (".dzi", ".zarr")
-        reason = "a folder of tiles, which is not" if tiled else "too large to be"
-        return section("Mosaic", f"It is {reason} shown here.")
-    name = "" if result.output is None else f"{result.output.name}, "
-    width, height = result.canvas.size
-    scale = _MOSAIC_SIDE / max(width, height)
-    names = result.registration.used_names
-    parts = [element("image", href=image, width=width * scale, height=height * scale)]
-    for text, borders in zip(names, result.canvas.outlines, strict=True):
-        places = [(border + 0.5) * scale for border in borders]
-        shapes = (
-            outline(place, closed=True, stroke=YELLOW, stroke_opacity=0.7, pointer_events="all") for place in places
-        )
-        parts.append(element("g", element("title", text), shapes))
-        if len(names) <= _MAX_NAMES:
-            x, y = min((place.mean(axis=0) for place in places), key=lambda middle: abs(middle[0] - width * scale / 2))
-            style = {"fill": "white", "stroke": "black", "text_anchor": "middle", "font_size": 14}
-            parts.append(label(float(x), float(y), text, **style, **_OUTLINED))
-    seams, radius = result.seams, max(0.35 * result.seams.spacing * scale, 1.5)
-    for x, y, broken in seam_dots(seams, scale, max(2.0 * radius, scale * math.sqrt(width * height / _MAX_DOTS))):
-        parts.append(element("circle", cx=x, cy=y, r=radius, fill=RED if broken else GREEN))
-    for one in seams.breaks[:_MAX_ROWS]:
-        x, y = ((value + 0.5) * scale for value in one.position)
-        parts.append(label(x + 8.0, y, f"{one.length:.0f} px", fill=RED, font_size=14, stroke="white", **_OUTLINED))
-    shown = drawing(width * scale, height * scale, parts, "the mosaic")
-    page = None if result.output is None else viewer_path(result.output)
-    more = "" if page is None else f" {page.name} beside it shows it with zoom."
-    text = f"{name}{width} x {height} pixels; outlines are those of the images in it, dots the places along the seams "
-    text += f"that have texture on both sides: green where the seam holds, red where it is broken.{more}"
-    return section("Mosaic", text, _broken_seams(result), shown)
-
-
-def seam_dots(seams: SeamQuality, scale: float, apart: float) -> list[tuple[float, float, bool]]:
-    """Places along seams, in pixels of a drawing, and whether they are broken: one in each cell of a side ``apart``, a
-    broken one where there is any.
-    """
-    at = (seams.places + 0.5) * scale
-    order = np.argsort(~seams.broken, kind="stable")
-    _, first = np.unique((at[order] // apart).astype(np.int64), axis=0, return_index=True)
-    return [(float(at[k, 0]), float(at[k, 1]), bool(seams.broken[k])) for k in np.sort(order[first])]
-
-
-def _broken_seams(result: StitchResult) -> str:
-    """Whether the seams hold, in one line."""
-    seams = result.seams
-    if not len(seams.places):
-        return ""
-    text = f"{counted(int(seams.broken.sum()), 'place')} of {len(seams.places)} along the seams broken."
-    return element("p", text, class_="bad" if seams.seen else "good")
-
-
 def place(result: StitchResult) -> str:
     """Give where the output lies on the Earth, and the largest residuals of the positions that say so."""
     if (placed := result.georeference) is None:
@@ -291,70 +220,3 @@ def local_alignment(result: StitchResult) -> str:
         f"The ground is not quite a plane, so that each image's content is moved a little, that of {name} by up to "
         f"{field.largest:.1f} pixels; {local.reason}{spread}.",
     )
-
-
-def _thumbnail(result: StitchResult, staged: Path | None = None) -> str | None:
-    """The output, or its staged file, small; None where there is none, as after a dry run, or it is huge."""
-    if result.composite is not None:
-        return data_address(result.composite.pixels, _MOSAIC_SIDE)
-    file = staged or result.output
-    if file is None or not file.exists():
-        return None
-    try:
-        return data_address(read_preview(file, result.canvas.size, _MOSAIC_SIDE)[0], _MOSAIC_SIDE)
-    except InputError:
-        return None
-
-
-def stage(registration: Registration) -> str:
-    """Backlash, and a table for rows and one for columns; nothing where the images are no tiles."""
-    tiled = registration.tiles
-    if tiled is None:
-        return ""
-    model, grid = tiled.adjustment.stage, tiled.grid
-    turn = math.degrees(math.atan2(model.matrix[1, 0] - model.matrix[0, 1], np.trace(model.matrix)))
-    x, y = backlash(model.rows)
-    stds = (("rows", model.row_std), ("columns", model.column_std), ("tiles", model.std))
-    rows = [
-        ("places", grid.source),
-        ("tiles placed by overlaps", f"{int(tiled.linked.sum())} of {len(grid)}"),
-        ("groups of tiles", str(len(tiled.groups))),
-        ("camera against the stage", f"{turn:.3f}°, scale {math.sqrt(abs(np.linalg.det(model.matrix))):.5f}"),
-        ("backlash of rows", f"{x:.2f}, {y:.2f} pixels, every other row against the rest"),
-        ("scatter", ", ".join(f"{what} {std:.2f}" for what, std in stds if std is not None) + " pixels"),
-    ]
-    if grid.pixel_size is not None:
-        rows.append(("pixel", f"{grid.pixel_size:g} µm"))
-    header = ("number", "tiles by overlap", "off in x, y (pixels)", "error of its links, median (pixels)")
-    return section(
-        "Stage",
-        f"{counted(len(grid), 'tile')}; the error of links is what overlaps disagree by after all places are adjusted.",
-        table(rows),
-        element("h3", "Rows"),
-        table([header, *_lines(tiled, grid.rows, model.rows)]),
-        element("h3", "Columns"),
-        table([header, *_lines(tiled, grid.columns, model.columns)]),
-    )
-
-
-def backlash(rows: FloatArray) -> tuple[float, float]:
-    """Give what every other row is off against the rows between, (x, y), pixels: rows (R, 2) are taken to and fro."""
-    if len(rows) < 2:
-        return 0.0, 0.0
-    x, y = (np.median(rows[1::2], axis=0) - np.median(rows[::2], axis=0)).tolist()
-    return x, y
-
-
-def _lines(tiled: TileRegistration, number: IntArray, off: FloatArray) -> list[tuple[str, ...]]:
-    """Cells of a table, a line for each row or column of the grid."""
-    links, squared = tiled.links, (tiled.adjustment.residuals**2).sum(axis=1)
-    agreeing = tiled.adjustment.weights[links.pair] > 0.25 if len(links.pair) else np.zeros(0, dtype=np.bool_)
-    first, second = (number[links.tiles[links.pair, k]] for k in (0, 1))
-    lines: list[tuple[str, ...]] = []
-    for line in range(len(off)):
-        links_of_line = agreeing & ((first == line) | (second == line))
-        rms = f"{math.sqrt(float(np.median(squared[links_of_line]))):.3f}" if links_of_line.any() else "none"
-        here = number == line
-        x, y = off[line].tolist()
-        lines.append((str(line), f"{int(tiled.linked[here].sum())} of {int(here.sum())}", f"{x:.2f}, {y:.2f}", rms))
-    return lines

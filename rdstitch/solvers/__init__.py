@@ -8,9 +8,7 @@ Which one when, with the number of matches that it needs:
 :func:`three_point_similarity`    3  planar motion whose height changes (a drone), tilt known
 :func:`four_point`                4  planar motion, tilt unknown, by a constraint on the homography
 :func:`five_point`                5  any motion and any plane; the only one without a focal length
-:func:`five_point_qep`            5  the same by Fitzgibbon's eigenvalue problem, the baseline
 :func:`rotation_two_point`        2  rotation about the camera's centre, focal length known
-:func:`rotation_three_point`      3  rotation about the camera's centre, which gives the focal length
 :func:`two_point_rigid`           2  λ known: planar motion, tilt known
 :func:`two_point_similarity`      2  λ known: planar motion whose height changes, tilt known
 :func:`four_point_dlt`            4  λ known: any motion and any plane
@@ -21,10 +19,8 @@ All take batches of samples, (B, k, 2), and return every real solution; see :cla
 """
 
 from rdstitch.solvers.five_point import five_point
-from rdstitch.solvers.five_point_qep import five_point_qep
 from rdstitch.solvers.four_point import four_point
 from rdstitch.solvers.known_distortion import four_point_dlt, two_point_rigid, two_point_similarity
-from rdstitch.solvers.rotation_three_point import rotation_three_point
 from rdstitch.solvers.rotation_two_point import rotation_two_point
 from rdstitch.solvers.rotation_two_point_focal import rotation_two_point_focal
 from rdstitch.solvers.solutions import Solutions
@@ -35,10 +31,8 @@ from rdstitch.solvers.two_point import two_point
 __all__ = [
     "Solutions",
     "five_point",
-    "five_point_qep",
     "four_point",
     "four_point_dlt",
-    "rotation_three_point",
     "rotation_two_point",
     "rotation_two_point_focal",
     "three_point",

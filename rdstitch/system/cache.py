@@ -26,7 +26,7 @@ import numpy as np
 
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.system.file_access import is_url, open_regular, read_limited, remote_status
-from rdstitch.system.outputs import TemporaryFolder
+from rdstitch.system.temporary_folder import TemporaryFolder
 
 Value = TypeVar("Value")
 

@@ -9,12 +9,7 @@ reader sees that the older sidecar is of another image.
 import hashlib
 import json
 import os
-import platform
 import re
-import shutil
-import sys
-import tempfile
-import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -25,14 +20,10 @@ from typing import Any, NamedTuple, Self
 from rdstitch.errors import OutputError, RdstitchError
 from rdstitch.results.messages import Message
 from rdstitch.system.file_access import local_file
-
-# On Windows nothing proves a process dead, and its leftovers stay.
-if sys.platform != "win32":
-    import fcntl
+from rdstitch.system.temporary_folder import TemporaryFolder
 
 WRITABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi", ".zarr")
 _LEVEL_NAME, _TILE_NAME = re.compile(r"[0-9]{1,2}"), re.compile(r"[0-9]+_[0-9]+\.jpg")
-_LOCK = "lock"
 
 
 def check_output(
@@ -77,13 +68,13 @@ def _check_place(file: Path, overwrite: bool) -> None:
     """What the file system says of one output."""
     folder = file.parent
     if is_zarr(file):
-        check_zarr_folder(file, overwrite)
+        check_folder(file, overwrite)
     elif file.is_dir():
         raise OutputError(f"{file}: is a folder; choose another name")
     if not folder.is_dir():
         raise OutputError(f"{file}: the folder {folder} does not exist; create it first")
     if file.suffix.lower() == ".dzi":
-        check_tiles_folder(tiles_folder(Path(os.path.realpath(file))), overwrite)
+        check_folder(tiles_folder(Path(os.path.realpath(file))), overwrite)
     if file.is_symlink() and not file.exists():
         raise OutputError(f"{file}: is a link to nothing; remove it, or choose another name")
     if file.exists() and not is_zarr(file):
@@ -142,28 +133,24 @@ def tiles_folder(path: Path) -> Path:
     return path.with_name(f"{path.stem}_files")
 
 
-def check_tiles_folder(folder: Path, overwrite: bool) -> None:
-    """Refuse to replace a folder that is to be kept, or in which anything is no tile."""
+def check_folder(folder: Path, overwrite: bool) -> None:
+    """Refuse to replace a folder that is to be kept, or that holds anything but Deep Zoom tiles, or an OME-Zarr image.
+
+    The latter's name says so.
+    """
     if not folder.exists():
         return
     if not overwrite:
         raise OutputError(f"{folder}: exists already; choose another name or use --overwrite")
-    if folder.is_symlink() or not folder.is_dir() or not holds_only_tiles(folder):
-        raise OutputError(f"{folder}: is a link, or holds other files than Deep Zoom tiles; choose another name")
+    chunks = is_zarr(folder)
+    holds_only, what = (_holds_only_chunks, "an OME-Zarr image") if chunks else (holds_only_tiles, "Deep Zoom tiles")
+    if folder.is_symlink() or not folder.is_dir() or not holds_only(folder):
+        raise OutputError(f"{folder}: is a link, or holds other files than {what}; choose another name")
 
 
 def is_zarr(path: str | Path) -> bool:
     """Whether an image is a folder of chunks."""
     return Path(path).suffix.lower() == ".zarr"
-
-
-def check_zarr_folder(folder: Path, overwrite: bool) -> None:
-    """Refuse to replace a folder that is to be kept, or that is no image in chunks."""
-    if folder.exists():
-        if not overwrite:
-            raise OutputError(f"{folder}: exists already; choose another name or use --overwrite")
-        if folder.is_symlink() or not folder.is_dir() or not _holds_only_chunks(folder):
-            raise OutputError(f"{folder}: is a link, or holds other files than an OME-Zarr image; choose another name")
 
 
 def _holds_only_chunks(folder: Path) -> bool:
@@ -210,102 +197,6 @@ def fingerprint(image: Path, tiles: Path | None = None) -> Fingerprint:
 def _sha256(file: Path) -> str:
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-class TemporaryFolder:
-    """A folder that is removed when it is closed, or nobody refers to it any more, or the process ends.
-
-    That of a process that was killed is removed when the next one is made in its place. Copies in other processes name
-    it, but do not own it; back in the process that made it, they are the folder itself.
-    """
-
-    def __init__(self, parent: Path | None = None, prefix: str = "rdstitch-") -> None:
-        place = Path(parent or tempfile.gettempdir())
-        _remove_dead(place, prefix)
-        made = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
-        try:
-            (made / _LOCK).write_text(f"{platform.node()}\n{os.getpid()}\n", encoding="utf-8")
-            # Only a folder of this ending is looked at by others, and it says whose it is by then. No file in it is
-            # open, or Windows would not rename it.
-            self.path = made.rename(f"{made}.part")
-        except OSError:
-            _remove(made, None)
-            raise
-        descriptor = _locked(self.path / _LOCK)
-        self.close = weakref.finalize(self, _remove, self.path, descriptor)
-        _folders[self.path] = self
-
-    def __reduce__(self) -> tuple[Callable[[Path], "TemporaryFolder"], tuple[Path]]:
-        """See the class."""
-        return _folder_at, (self.path,)
-
-    def __enter__(self) -> Path:
-        return self.path
-
-    def __exit__(self, *failure: object) -> None:
-        """Remove the folder with everything in it."""
-        self.close()
-
-
-_folders: weakref.WeakValueDictionary[Path, TemporaryFolder] = weakref.WeakValueDictionary()
-
-
-def _folder_at(path: Path) -> TemporaryFolder:
-    if (folder := _folders.get(path)) is None:
-        folder = TemporaryFolder.__new__(TemporaryFolder)
-        folder.path = path
-    return folder
-
-
-def _remove(folder: Path, descriptor: int | None) -> None:
-    if descriptor is not None:
-        os.close(descriptor)
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-def _locked(file: Path) -> int | None:
-    """A file, open and locked for this process; None where another has locked it, or there are no locks."""
-    if sys.platform != "win32":
-        with suppress(OSError):
-            descriptor = os.open(file, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                os.close(descriptor)
-                raise
-            return descriptor
-    return None
-
-
-def _remove_dead(parent: Path, prefix: str) -> None:
-    """Remove the folders of processes of this machine that were killed.
-
-    Such a process is there no more and holds no lock. On a mount of another machine locks may hold nothing; and of a
-    process in another container with this one's name the number says nothing.
-    """
-    for folder in parent.glob(f"{prefix}*.part"):
-        if (descriptor := _locked(folder / _LOCK)) is None:
-            continue
-        try:
-            host, process = (folder / _LOCK).read_text(encoding="utf-8").splitlines()
-            dead = host == platform.node() and not _is_alive(int(process))
-        except (OSError, ValueError):
-            dead = False
-        if dead:
-            _remove(folder, descriptor)
-        else:
-            os.close(descriptor)
-
-
-def _is_alive(process: int) -> bool:
-    """Whether there is a process of this number; not for Windows, where the signal 0 is another one."""
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # one that may not be asked, or a number that none has
-        return True
-    return True
 
 
 class _Item(NamedTuple):
@@ -416,7 +307,7 @@ class Outputs:
         if not item.is_folder:
             item.staged.chmod(item.place.stat().st_mode & 0o777)
         elif is_zarr(item.place):
-            check_zarr_folder(item.place, overwrite=True)
+            check_folder(item.place, overwrite=True)
         elif not holds_only_tiles(item.place):
             raise OutputError(f"{item.name}: holds other files than Deep Zoom tiles; choose another name")
 

@@ -26,7 +26,16 @@ from rdstitch.sidecar.read import json_schema
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 from rdstitch.system.records import convert
 
-SIDECAR_SCHEMA = Draft202012Validator(json_schema())
+
+def _closed(schema: dict[str, Any]) -> dict[str, Any]:
+    """The schema of sidecars that have no field besides its own; options are checked by their own rules."""
+    for name, record in schema["$defs"].items():
+        if record.get("type") == "object" and name != "OptionsRecord":
+            record["additionalProperties"] = False
+    return schema
+
+
+SIDECAR_SCHEMA = Draft202012Validator(_closed(json_schema()))
 
 # A shell ignores interrupts for what it runs in the background, these tests for one, and children inherit that.
 _PROGRAM = """

@@ -125,7 +125,7 @@ def _tables() -> list[tuple[str, int, str | tuple[str, ...], Files]]:
         ("name,psi,theta\nother.png,1,2\n", "no line for"),
         *((f"name,psi,theta\na.png,{wrong}\n", "line 2") for wrong in ("much,2", "nan,2", "95,2", "1")),
         ("name,psi,theta\na.png,1,2\na.png,1,2\n", "twice"),
-        ('name,psi,theta\n"a' + "\0" * 200_000, "is no UTF-8 text"),
+        ('name,psi,theta\n"a' + "\0" * 200_000, "is not UTF-8 text"),
     ):
         rows.append((MOSAIC + "--attitude imu.csv", 3, told, {"imu.csv": content}))
     camera = '{"format": "rdstitch camera", "version": 1, "image_size": [400, 300], "center_px": [1, 2], "lambda": 0}'

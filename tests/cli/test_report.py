@@ -22,9 +22,9 @@ from rdstitch.io.opening import MAX_IMAGE_GB
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline import accept
 from rdstitch.pipeline.recipes import calibrate, pano
-from rdstitch.report import page as report
+from rdstitch.report import mosaic as report
 from rdstitch.report import report_page, write_report
-from rdstitch.report.page import seam_dots
+from rdstitch.report.mosaic import seam_dots
 from rdstitch.report.pairs import matched
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult

@@ -84,7 +84,7 @@ def test_a_folder_that_is_no_bag_is_not_replaced(rdstitch: Run, frames: list[Pat
     (tmp_path / "notes" / "metadata.yaml").write_text("mine", encoding="utf-8")
     (tmp_path / "notes" / "thesis.txt").write_text("mine", encoding="utf-8")
     wanted = ("-o", tmp_path / "notes", "--format", "bag", "--overwrite", *CACHED)
-    rdstitch("trajectory", *frames, *wanted, status=6, told="is no ROS bag")
+    rdstitch("trajectory", *frames, *wanted, status=6, told="not a ROS bag")
     assert len(list((tmp_path / "notes").iterdir())) == 2
 
 

@@ -8,7 +8,7 @@ import tifffile
 
 from examples.worlds.stage_grid import StageGrid
 from rdstitch.io.flat_field import FlatField
-from rdstitch.report.page import backlash
+from rdstitch.report.stage import backlash
 from tests.cli.running import SIDECAR_SCHEMA, Run, rows_of, sidecar_of
 
 STAGE = StageGrid(rows=3, columns=3, tile=256, overlap=0.15, content=0.8, backlash=4.0, seed=5)

@@ -14,7 +14,7 @@ from examples.worlds.compositing_scenes import Scene, place_images, render
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.blender import MultibandBlender, margin, rounding_constant
 from rdstitch.compositing.boxes import aligned, grown
-from rdstitch.compositing.preparation import Prepared, prepare_composite
+from rdstitch.compositing.preparation import Prepared, decide, prepare_composite
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.synthetic.rendering import Photometry
 
@@ -34,7 +34,7 @@ def _prepared(blend: str, seam: str, bits: int) -> tuple[Prepared, NDArray[Any],
     """A composite, and all of it as one tile."""
     scene = _scene(bits)
     options = CompositeOptions(blend=blend, seam=seam, max_memory=2**28)  # type: ignore[arg-type]
-    with prepare_composite(scene.images, scene.canvas, options) as ready:
+    with prepare_composite(decide(scene.images, scene.canvas, options)) as ready:
         return ready, *ready.renderer.tile((0, 0, *scene.canvas.size))
 
 
@@ -59,7 +59,7 @@ def test_any_box_of_locally_aligned_images_is_a_part_of_the_whole(seam: str) -> 
     fields = [DisplacementField((240, 180), rng.normal(0.0, 1.5, (6, 8, 2))) for _ in scene.frames]
     options = CompositeOptions(seam=seam, max_memory=2**28)  # type: ignore[arg-type]
     images = place_images(scene.sources, scene.cameras, scene.homographies, displacement=fields)
-    with prepare_composite(images, scene.canvas, options) as ready:
+    with prepare_composite(decide(images, scene.canvas, options)) as ready:
         whole, covered = ready.renderer.tile((0, 0, *scene.canvas.size))
         for x, y in ((3, 7), (130, 64), (200, 90)):
             pixels, inside = ready.renderer.tile((x, y, x + 61, y + 43))
@@ -75,7 +75,7 @@ def test_any_box_of_locally_aligned_images_is_a_part_of_the_whole(seam: str) -> 
 def test_strips_are_the_whole(workers: int) -> None:
     scene = _scene(8)
     options = CompositeOptions(tile_size=256, workers=workers)
-    with prepare_composite(scene.images, scene.canvas, options) as ready:
+    with prepare_composite(decide(scene.images, scene.canvas, options)) as ready:
         pixels, alpha = (np.concatenate(parts) for parts in zip(*ready.strips(), strict=True))
     _, whole, covered = _prepared("multiband", "graphcut", 8)
     np.testing.assert_array_equal(pixels, whole)

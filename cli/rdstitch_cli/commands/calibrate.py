@@ -50,9 +50,9 @@ def calibrate(
     from rdstitch.pipeline.recipes import calibrate as recipe
 
     paths = resolve(inputs)
-    beside = files_beside(reporter, given)
+    beside = files_beside(given)
     wanted = stitch_options(reporter, given, save_camera=output)
-    registration = recipe(paths, wanted, every=every, progress=beside.timer, beside=beside)
+    registration = recipe(paths, wanted, every=every, progress=reporter, beside=beside)
     report_registration(registration, reporter, (lambda: camera_json(registration.camera)) if as_json else None)
     for line in (
         *describe_camera(registration.alignment, registration.camera),

@@ -84,9 +84,9 @@ def mosaic(
     list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
+    from rdstitch.pipeline.blocks import mosaic_blocks
     from rdstitch.pipeline.map_server import map_files, write_map
     from rdstitch.pipeline.recipes import mosaic as recipe
-    from rdstitch.pipeline.recipes import mosaic_blocks
 
     if all_blocks and (following or given["strict"]):
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
@@ -102,13 +102,13 @@ def mosaic(
     with ExitStack() as stack:
         named = list(inputs) if following else resolve(inputs)
         with_poses = given["poses"] is not None
-        beside = files_beside(reporter, given)
+        beside = files_beside(given)
         stitch = stitch_options(reporter, given, pose_covariance=with_poses)
         paths: Sequence[Named] = named
         if following:
             watched: dict[str, Any] = {"output": output, "every": every, "idle": idle, "refresh": refresh}
             paths = stack.enter_context(live.followed(inputs, stitch, reporter, **watched, beside=beside))
-        how: dict[str, Any] = {"every": every, "progress": beside.timer, "beside": beside}
+        how: dict[str, Any] = {"every": every, "progress": reporter, "beside": beside}
         others: Sequence[Recomposition] = ()
         if patterns:
             from rdstitch.pipeline.bands import mosaic_bands

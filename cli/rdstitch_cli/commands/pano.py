@@ -35,9 +35,9 @@ def pano(
     from rdstitch.pipeline.recipes import pano as recipe
 
     paths = resolve(inputs)
-    beside = files_beside(reporter, given)
+    beside = files_beside(given)
     stitch = stitch_options(reporter, given)
-    result = recipe(paths, output, stitch, every=every, progress=beside.timer, beside=beside)
+    result = recipe(paths, output, stitch, every=every, progress=reporter, beside=beside)
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:
         reporter.made(result.summary)

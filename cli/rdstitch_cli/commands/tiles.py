@@ -65,16 +65,16 @@ def tiles(
     if output is None and positions_only is None:
         raise click.UsageError("nothing to write: give --output or --positions-only")
     paths = resolve(inputs)
-    beside = files_beside(reporter, given)
+    beside = files_beside(given)
     composite = replace(measured_samples(), **values_of(CompositeOptions, given))
     chosen = TileOptions(**values_of(TileOptions, given), composite=composite)
     if output is None:
-        tiled, registration = place_tiles(paths, positions_only, chosen, progress=beside.timer)
+        tiled, registration = place_tiles(paths, positions_only, chosen, progress=reporter)
         report_registration(registration, reporter)
         reporter.made(f"{positions_only}: {registration.summary}")
         _check_placed(tiled)
         return
-    result = recipe(paths, output, chosen, positions_file=positions_only, progress=beside.timer, beside=beside)
+    result = recipe(paths, output, chosen, positions_file=positions_only, progress=reporter, beside=beside)
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:
         reporter.made(result.summary)

@@ -12,7 +12,7 @@ import pytest
 
 from examples.worlds.compositing_scenes import Scene, grey, render
 from rdstitch import Composer
-from rdstitch.compositing import PlacedImage
+from rdstitch.compositing import PlacedImage, compose_decided, decide
 from rdstitch.compositing import plan as planning
 from rdstitch.compositing.compositor import compose
 from rdstitch.compositing.plan import CompositePlan, default_memory, plan_composite
@@ -86,7 +86,7 @@ def test_blocks_give_the_same_bytes(scene: Scene, tmp_path: Path, blend: Any, se
 
     here = compose(scene.images, scene.canvas, options)
     shares: list[float] = []
-    there = compose(scene.images, scene.canvas, options, shares.append, elsewhere)
+    there = compose_decided(decide(scene.images, scene.canvas, options), shares.append, elsewhere)
     assert len(computed) > 1
     assert min(map(len, images)) < len(scene.frames)
     np.testing.assert_array_equal(there.pixels, here.pixels)
@@ -119,7 +119,8 @@ def test_no_image_is_read_for_more_than_two_blocks(columns: int, rows: int, tmp_
             yield replace(block, tiles=replace(block.tiles, renderer=renderer)).compute(Cache.at(tmp_path))
 
     images = [counted(index, placed) for index, placed in enumerate(scene.images)]
-    compose(images, scene.canvas, CompositeOptions(tile_size=256, bands=2, workers=2), elsewhere=elsewhere)
+    options = CompositeOptions(tile_size=256, bands=2, workers=2)
+    compose_decided(decide(images, scene.canvas, options), elsewhere=elsewhere)
     assert blocks > 2
     assert max(read.values()) <= 1 + 2
 

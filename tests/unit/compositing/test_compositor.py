@@ -22,7 +22,7 @@ from examples.worlds.compositing_scenes import (
     side_by_side,
 )
 from rdstitch.compositing import CompositeOptions, compose, compose_to_file
-from rdstitch.compositing.preparation import prepare_composite
+from rdstitch.compositing.preparation import decide, prepare_composite
 from rdstitch.compositing.source_images import ImageLoader
 from rdstitch.compositing.survey import largest_rectangle
 from rdstitch.errors import ArgumentError, InputError
@@ -33,7 +33,7 @@ from tests.sampled import sampled
 
 def _seams(scene: Scene, options: CompositeOptions) -> NDArray[np.bool_]:
     """Px within two of a seam."""
-    with prepare_composite(scene.images, scene.canvas, options) as ready:
+    with prepare_composite(decide(scene.images, scene.canvas, options)) as ready:
         seams = ready.renderer.seams
     box = (0, 0, *scene.canvas.size)
     shares = np.stack([seams.share(k, box) for k in range(len(scene.frames))])
@@ -243,14 +243,9 @@ def test_file_is_what_memory_is(tmp_path: Path, suffix: str) -> None:
     scene = render(3, 1)
     result = scene.composed(tile_size=256)
     told: list[float] = []
-    compose_to_file(
-        tmp_path / f"a.{suffix}",
-        scene.images,
-        scene.canvas,
-        CompositeOptions(tile_size=256),
-        told.append,
-        metadata=Metadata((1, 1), icc_profile=b"profile" * 30),
-    )
+    known, options = Metadata((1, 1), icc_profile=b"profile" * 30), CompositeOptions(tile_size=256)
+    decisions = decide(scene.images, scene.canvas, options)
+    compose_to_file(tmp_path / f"a.{suffix}", decisions, told.append, metadata=known)
     back = read_image(tmp_path / f"a.{suffix}")
     assert back.metadata.icc_profile == b"profile" * 30
     assert told == sorted(told)
@@ -280,7 +275,11 @@ def test_sixteen_bits_grey_and_mixed_sizes() -> None:
     assert len(np.unique(result.pixels)) > 1000
 
 
-def test_images_that_do_not_fit() -> None:
+def test_images_that_do_not_fit_and_wrong_options() -> None:
+    options: list[dict[str, Any]] = [{"blend": "soft"}, {"seam": ""}, {"tile_size": 300}, {"bands": 0}]
+    for wrong_option in (*options, {"scale": -1.0}, {"background": 300}):
+        with pytest.raises(ArgumentError):
+            CompositeOptions(**wrong_option)
     scene = render(2, 1)
     wrong: list[ImageLoader] = [scene.sources[0], partial(as_image, np.zeros((10, 10, 3), np.uint8))]
     with pytest.raises(InputError, match="image 2"):
@@ -290,11 +289,3 @@ def test_images_that_do_not_fit() -> None:
         compose(place_images(deep, scene.cameras, scene.homographies), scene.canvas)
     with pytest.raises(ArgumentError):
         compose(scene.images[:1], scene.canvas)
-
-
-@pytest.mark.parametrize(
-    "options", [{"blend": "soft"}, {"seam": ""}, {"tile_size": 300}, {"bands": 0}, {"scale": -1.0}, {"background": 300}]
-)
-def test_wrong_options(options: dict[str, Any]) -> None:
-    with pytest.raises(ArgumentError):
-        CompositeOptions(**options)

@@ -59,7 +59,7 @@ def test_headings_quotes_comments_and_paths() -> None:
         ("name,x (ft),y\na,1,2\n", "t.csv: the column 'x (ft)' has a unit that is not known here; give it in m"),
         ("name,x,y\n\na,48,8582,2,2945\n", "t.csv: line 3: has 5 fields, but there are 3 columns"),
         ('name,x,y\na,"1,2\n', "t.csv: line 2: is not CSV"),
-        ("n\0a\0m\0e\0", "t.csv: is no UTF-8 text"),
+        ("n\0a\0m\0e\0", "t.csv: is not UTF-8 text"),
         ("name,x,y\n,1,2\n", "t.csv: line 2: has no name"),
         ("name,x,y\nb/a,1,2\nc/a,1,2\n", "t.csv: line 3: a is here twice; remove one"),
         ("name,x,y\na,1e999,2\n", "t.csv: line 2: expected a number for x, not '1e999'"),

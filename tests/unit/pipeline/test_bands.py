@@ -150,10 +150,10 @@ def test_the_grid_of_another_file(rig: Path, tmp_path: Path) -> None:
     like = CompositeOptions(like=str(tmp_path / "part.tif"))
     apply(sidecar, files, tmp_path / "like.tif", like, workers=1)
     assert _same_pixels(tmp_path / "part.tif", tmp_path / "like.tif")
-    with pytest.raises(ArgumentError, match="none of the images lies there"):
+    with pytest.raises(ArgumentError, match="none of the images lies within"):
         apply(sidecar, files, options := None, replace(part, extent=(west + 5e3, south, west + 6e3, south + 9.0)))
     cv2.imwrite(str(tmp_path / "plain.tif"), np.zeros((9, 9), dtype=np.uint8))
-    with pytest.raises(InputError, match="is no GeoTIFF with square pixels"):
+    with pytest.raises(InputError, match="is not a GeoTIFF with square pixels"):
         apply(sidecar, files, options, CompositeOptions(like=str(tmp_path / "plain.tif")))
     keys = [(34735, 3, 5, (1, 1, 0, 1, 3072), True)]  # cut off
     tifffile.imwrite(tmp_path / "cut.tif", np.zeros((9, 9), dtype=np.uint8), extratags=keys)

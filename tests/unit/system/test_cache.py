@@ -22,7 +22,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.system import cache
 from rdstitch.system.cache import Cache, Stored, digest, pack, unpack
-from rdstitch.system.outputs import TemporaryFolder
+from rdstitch.system.temporary_folder import TemporaryFolder
 
 
 @pytest.fixture(autouse=True)

@@ -20,7 +20,8 @@ from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
 from rdstitch.system.file_access import is_url, url_of
-from rdstitch.system.outputs import Outputs, TemporaryFolder, check_output, write_bytes_atomic
+from rdstitch.system.outputs import Outputs, check_output, write_bytes_atomic
+from rdstitch.system.temporary_folder import TemporaryFolder
 from tests.faults import OPERATIONS, Operation, failing_disk
 
 _NAMES = ("a.dzi", "a.dzw", "a.dzi.json")

@@ -20,7 +20,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, sequence_over
-from rdstitch.tracking import CameraPose, Placement, PlaneSimilarity, Preview, Tracked, Tracker, TrackingOptions
+from rdstitch.tracking import Placement, PlaneSimilarity, Preview, Tracked, Tracker, TrackingOptions
 from rdstitch.tracking import tracker as module
 
 SIZE = (320, 240)
@@ -240,12 +240,10 @@ def _placed(x: float, y: float, yaw: float, height: float, tilt: tuple[float, fl
 
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0, 1.0), (1.5, -2.0, 2.5, 0.8), (-3.0, 0.2, -3.0, 1.4)])
 def test_the_pose_of_a_homography_is_the_one_it_was_made_of(pose: tuple[float, float, float, float]) -> None:
-    found = _placed(*pose).pose
+    placed = _placed(*pose)
+    found = placed.pose
     np.testing.assert_allclose([found.x, found.y, found.yaw, found.height], pose, atol=1e-9)
-
-
-def test_without_focal_length_or_homography_there_is_no_pose() -> None:
-    placed = _placed(0.0, 0.0, 0.0, 1.0)
+    # Without focal length or homography there is none.
     assert Placement(placed.camera, placed.homography, None).pose is None
     assert Placement(placed.camera, np.full((3, 3), np.nan), 1.0).pose is None
 
@@ -265,14 +263,11 @@ def test_planes_are_brought_together_by_the_images_that_both_have() -> None:
     found = PlaneSimilarity.between(placed, [move.applied(one) for one in placed])
     assert found.turn == pytest.approx(move.turn)
     assert found.shift == pytest.approx(move.shift)
-
-
-def test_a_fit_may_keep_the_size() -> None:
+    # A fit may keep the size.
     points = np.random.default_rng(0).normal(size=(20, 2))
     kept = PlaneSimilarity.fitted(points, 2.0 * points + 1.0, keep_size=True)
     assert abs(kept.turn) == pytest.approx(1.0)
     assert PlaneSimilarity.fitted(points, 2.0 * points + 1.0).turn == pytest.approx(2.0)
-    assert CameraPose(0.0, 0.0, 0.0, 1.0) == CameraPose(0.0, 0.0, 0.0, 1.0)
 
 
 _CAMERA = Camera((160, 120))

@@ -25,7 +25,7 @@ def five_point_qep(
     at one λ outside the range makes them square, and linearization gives an 18 x 18 eigenvalue problem for
     ``1 / (λ - that λ)``.
 
-    :func:`five_point` is many times faster. This solver spreads noise over all ten equations.
+    :func:`rdstitch.solvers.five_point` is many times faster. This solver spreads noise over all ten equations.
 
     Parameters
     ----------

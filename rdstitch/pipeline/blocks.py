@@ -1,0 +1,125 @@
+"""Every block of images that overlap: the largest, and again of what it left out."""
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from rdstitch.errors import OutputError, RdstitchError
+from rdstitch.inputs.find import found_images
+from rdstitch.inputs.frame import Frame, Images, as_inputs
+from rdstitch.inputs.selection import selected
+from rdstitch.inputs.times import with_times
+from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.pipeline.read_inputs import with_camera_in_bag
+from rdstitch.pipeline.recipes import stitch_found
+from rdstitch.pipeline.run import Run
+from rdstitch.results.messages import Message
+from rdstitch.results.stitch_result import StitchResult
+from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.outputs import Outputs
+from rdstitch.system.progress import Progress, StageTimer, silent
+from rdstitch.system.temporary_folder import TemporaryFolder
+from rdstitch.verification.verdict import RefusedError
+
+
+@one_opencv_thread()
+def mosaic_blocks(
+    inputs: Images,
+    output: str | Path,
+    options: StitchOptions | None = None,
+    *,
+    every: int | None = None,
+    progress: Progress = silent,
+    beside: FilesBeside = NOTHING_BESIDE,
+) -> tuple[StitchResult, ...]:
+    """Stitch every block of images that overlap: the largest, and again of what that left out, while images overlap.
+
+    Parameters
+    ----------
+    inputs, options, every, progress, beside
+        As for :func:`rdstitch.mosaic`; ``beside``, the camera file and the reference image are for the largest block.
+    output : path
+        Of the largest block; ``field.tif`` is followed by ``field-2.tif`` and so on.
+
+    Returns
+    -------
+    tuple of StitchResult
+        The largest block first. Images that are left out are named in the first, if they are in no block.
+
+    Raises
+    ------
+    RdstitchError
+        As by :func:`rdstitch.mosaic`, where not even one block can be stitched.
+    """
+    options, file = options or StitchOptions(), Path(output)
+    results: list[StitchResult] = []
+    refused: list[Message] = []
+    given = as_inputs(inputs, options.channel_order)
+    options, notes = with_camera_in_bag(given, options)
+    with ExitStack() as stack:
+        listed = stack.enter_context(found_images(given, output=output, every=every, topic=options.topic))
+        if options.cache is None:
+            # What was found of images and pairs serves the next block.
+            options = replace(options, cache=stack.enter_context(TemporaryFolder()))
+        # All are published together.
+        outputs = stack.enter_context(Outputs(options.overwrite))
+        listed = replace(
+            listed, frames=list(with_times(listed.frames, options.timestamps)), notes=(*listed.notes, *notes)
+        )
+        options = replace(options, timestamps=None)
+        frames = selected(listed.frames, options.exclude, options.include_only)
+        names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
+        run = Run(options, beside=beside, progress=StageTimer(progress))
+        further = names[1:]
+        found = replace(listed, outputs=[], notes=())
+        while len(frames) > 1 or not results:
+            run = replace(run, output=names[len(results)])
+            try:
+                with outputs.together():
+                    result = stitch_found(found, run, outputs, further)
+                registration = result.registration
+            except RdstitchError as error:
+                if not results or isinstance(error, OutputError):
+                    raise
+                if not isinstance(error, RefusedError):
+                    # What is left does not overlap, or cannot be read, which the first block has said.
+                    break
+                registration = error.registration
+                refused.append(Message(f"a further block of {registration.alignment.used.sum()} images: {error}"))
+            else:
+                results.append(result)
+            pairs = zip(registration.sources, registration.alignment.used, strict=True)
+            used = [source.frame or Frame(source.path) for source, used in pairs if used]
+            done = {(frame.path, frame.number) for frame in used}
+            frames = [frame for frame in frames if (frame.path, frame.number) not in done]
+            found = replace(found, frames=frames)
+            # These are of the first block, or of its reference image.
+            run, further = replace(run, options=_for_further_blocks(run.options), beside=NOTHING_BESIDE), []
+    return (_without_blocks(results[0], results[1:], [*listed.messages, *refused]), *map(_without_blocks, results[1:]))
+
+
+def _for_further_blocks(options: StitchOptions) -> StitchOptions:
+    """Without what is of the first block alone: its camera file, what its reference image shows, patterns of names."""
+    lines = options.composite.straighten if options.composite.straighten in ("off", "auto") else "off"
+    composite = replace(options.composite, rectangle=None, straighten=lines)
+    return replace(options, save_camera=None, reference=None, composite=composite, exclude=(), include_only=())
+
+
+def _without_blocks(
+    result: StitchResult, others: Sequence[StitchResult] | None = None, more: Sequence[Message] = ()
+) -> StitchResult:
+    """A block that does not name as left out what is in others; without others, nothing: the first one names it."""
+    elsewhere = {
+        str(source.path)
+        for registration in (other.registration for other in others or ())
+        for source, used in zip(registration.sources, registration.alignment.used, strict=True)
+        if used
+    }
+    kept = [
+        message
+        for message in result.registration.messages
+        if message.severity != "left out" or (others is not None and not elsewhere.issuperset(message.images))
+    ]
+    return replace(result, registration=replace(result.registration, messages=(*kept, *more)))
