@@ -12,11 +12,11 @@ from typing import Any, NamedTuple, TypeVar
 
 from rdstitch.camera_files import formats
 from rdstitch.camera_files.lens_models import CameraFile, LensFit
-from rdstitch.camera_files.own_format import CameraRecord, camera_json
 from rdstitch.camera_files.polynomials import hugin_project, is_hugin, lensfun_xml, read_hugin, read_lensfun
 from rdstitch.choices import CameraFormat
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera_record import CameraRecord, camera_json
 from rdstitch.system.file_access import read_text
 from rdstitch.system.outputs import json_bytes, text_bytes, write_bytes_atomic
 from rdstitch.system.records import convert, parse_json, parse_yaml

@@ -13,9 +13,9 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, Struct
 
 from rdstitch.camera_files.lens_models import CameraFile, LensFit, fitted_camera, nearest_model
-from rdstitch.camera_files.own_format import camera_json
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera_record import camera_json
 from rdstitch.geometry.lens_model import LensKind, LensModel
 from rdstitch.system.records import Count, Side, Size, convert
 

@@ -9,7 +9,7 @@ surroundings: gravel and leaves hide it.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -68,6 +68,7 @@ class SeamQuality:
     breaks: tuple[SeamBreak, ...] = ()  # the longest first
     spacing: float = math.inf  # of the places, pixels of the output
     alike: float = math.nan  # share of the overlaps that looks alike, [0, 1]; NaN where there is nothing to compare
+    fills: float = math.nan  # share of the images, over all pairs, that is not seen to look different in the other
     least_alike: tuple[int, int] | None = None  # the images whose overlap does so the least
 
     @property
@@ -148,31 +149,44 @@ def measure_seams(
     return SeamQuality((places + 0.5) * unit - 0.5, broken, breaks, _STEP * unit)
 
 
-def share_alike(
-    tiles: Sequence[SeamTile | None], pairs: IntArray, full: float = 255.0
-) -> tuple[float, tuple[int, int] | None]:
-    """Share of the overlaps of pairs (P, 2) that looks alike in place, a few pixels more or less, and the worst pair.
+class Likeness(NamedTuple):
+    """What the overlaps of images look like; NaN and None where there is nothing to compare."""
 
-    NaN and None where there is nothing to compare.
-    """
+    alike: float = math.nan
+    fills: float = math.nan
+    least_alike: tuple[int, int] | None = None
+
+
+def likeness(tiles: Sequence[SeamTile | None], pairs: IntArray, full: float = 255.0) -> Likeness:
+    """Compare the overlaps of pairs (P, 2) in place, a few pixels more or less; see :class:`SeamQuality`."""
     small = [None if tile is None else _smaller(tile) for tile in tiles]
+    textured = [0 if tile is None else int(_textured(tile.grey, tile.inside, full)[1].sum()) for tile in small]
     found: dict[tuple[int, int], tuple[int, int]] = {}
+    shown = 0
     for i, j in pairs.tolist():
         first, second = small[i], small[j]
         if first is None or second is None or (box := intersection(first.box, second.box)) is None:
             continue
-        (grey1, inside1), (grey2, inside2) = (
-            [_in_cells(cut(values, tile.box, box)) for values in (tile.grey, tile.inside)] for tile in (first, second)
+        (cells1, known1), (cells2, known2) = (
+            _textured(cut(tile.grey, tile.box, box), cut(tile.inside, tile.box, box), full) for tile in (first, second)
         )
-        known = (inside1 & inside2).all(axis=(1, 2))
-        known &= np.minimum(grey1.std(axis=(1, 2)), grey2.std(axis=(1, 2))) > _CONTRAST * full
-        alike = _correlation(grey1[known], grey2[known]) > _UNLIKE
-        found[min(i, j), max(i, j)] = len(alike), int(alike.sum())
-    cells = sum(count for count, _ in found.values())
-    shares = {pair: alike / count for pair, (count, alike) in found.items() if count >= _MIN_CELLS}
-    if not shares:
-        return math.nan, None
-    return sum(alike for _, alike in found.values()) / cells, min(shares, key=lambda pair: shares[pair])
+        known = known1 & known2
+        alike = _correlation(cells1[known], cells2[known]) > _UNLIKE
+        if len(alike) >= _MIN_CELLS:
+            found[min(i, j), max(i, j)] = len(alike), int(alike.sum())
+            shown += min(textured[i], textured[j])
+    if not found:
+        return Likeness()
+    cells, alike_cells = (sum(counts) for counts in zip(*found.values(), strict=True))
+    worst = min(found, key=lambda pair: found[pair][1] / found[pair][0])
+    return Likeness(alike_cells / cells, 1.0 - (cells - alike_cells) / max(shown, cells), worst)
+
+
+def _textured(grey: Float32Array, inside: BoolArray, full: float) -> tuple[Float32Array, BoolArray]:
+    """Cells (N, side, side) of an image, and which of them show something."""
+    cells = _in_cells(grey)
+    shows = _in_cells(inside).all(axis=(1, 2)) & (cells.std(axis=(1, 2)) > _CONTRAST * full)
+    return cells, np.asarray(shows)
 
 
 def _in_cells(values: NDArray[Any]) -> NDArray[Any]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection, overlapping_pairs
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, measure_seams, share_alike
+from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, likeness, measure_seams
 from rdstitch.compositing.source_images import ImageReader, LoadedImage, PlacedImage
 from rdstitch.compositing.warp import Warp, locate, plan_warps, sample, sample_opacity
 from rdstitch.io.reduction import mean_of_channels
@@ -66,8 +66,7 @@ class Survey:
             full = max(float(high - low), 1e-12)
         seen = [None if tile is None else tile.seen for tile in self.tiles]
         quality = measure_seams(seen, labels, self.enlarged, self.factor / self.enlarged, full)
-        alike, worst = share_alike(seen, self.pairs(), full)
-        return replace(quality, alike=alike, least_alike=worst)
+        return replace(quality, **likeness(seen, self.pairs(), full)._asdict())
 
 
 def survey_factor(canvas: Canvas) -> int:
@@ -84,17 +83,20 @@ def survey_images(reader: ImageReader, images: Sequence[PlacedImage], canvas: Ca
     factor = survey_factor(canvas)
     small = canvas.reduced(factor)
     warps = tuple(plan_warps(images, small))
-    enlarged = factor / seen_reduction(canvas)
+    enlarged = factor / seen_reduction(canvas, [warp.shrink / factor for warp in warps])
     with ThreadPoolExecutor(workers) as pool:
         tiles = tuple(pool.map(partial(_survey_tile, reader, enlarged), range(len(warps)), warps))
     return Survey(factor, small, warps, tiles, enlarged)
 
 
-def seen_reduction(canvas: Canvas) -> float:
-    """Canvas pixels, along a side, for one of what seams are looked at on."""
+def seen_reduction(canvas: Canvas, shrinks: Sequence[float]) -> float:
+    """Canvas pixels, along a side, for one of what seams are looked at on, by image pixels for one of the canvas.
+
+    What is seen is the same for an output of any size: it decides what is shown.
+    """
     areas = np.array(canvas.areas(), dtype=np.float64)
     usual = 1.44 * math.sqrt(float(np.median(areas)))  # the diagonal of an image of 4 to 3
-    return max(1.0, usual / DIAGONAL, math.sqrt(areas.sum() / _MAX_SEEN))
+    return max(1.0 / float(np.median(shrinks)), usual / DIAGONAL, math.sqrt(areas.sum() / _MAX_SEEN))
 
 
 def _survey_tile(reader: ImageReader, enlarged: float, index: int, warp: Warp) -> SurveyTile | None:

@@ -346,7 +346,7 @@ class Camera:
         OutputError
             When the name ends otherwise, or the file cannot be written.
         """
-        from rdstitch.camera_files.own_format import save_own
+        from rdstitch.geometry.camera_record import save_own
 
         save_own(self, path)
 
@@ -359,6 +359,6 @@ class Camera:
         InputError
             When the file cannot be read or is no camera file of rdstitch.
         """
-        from rdstitch.camera_files.own_format import load_own
+        from rdstitch.geometry.camera_record import load_own
 
         return load_own(path)

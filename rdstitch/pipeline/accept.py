@@ -17,9 +17,9 @@ from rdstitch.results.messages import Message, names_of, told_once
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
 from rdstitch.verification.evidence import Evidence
-from rdstitch.verification.findings import Finding, Kind, Scope, messages_of
+from rdstitch.verification.findings import Finding, Scope, messages_of
 from rdstitch.verification.limits import limit
-from rdstitch.verification.second_motion import planes_of_pairs
+from rdstitch.verification.rival_planes import planes_of_pairs
 from rdstitch.verification.verdict import RefusedError, judge
 
 _MAX_ROUNDS = 20  # times that something is left out; each takes one adjustment
@@ -48,8 +48,7 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
     if _fails(findings) and undamaged is not None and not _fails(judged := checked(undamaged)):
         current, findings = undamaged, judged
     if _fails(findings) and not options.force:
-        another = not purpose.lens_only and _may_be_another_plane(findings)
-        plane = plane_of_most(registration, options, aligner) if another else None
+        plane = None if purpose.lens_only else plane_of_most(registration, options, aligner)
         judged = () if plane is None else checked(plane)
         if plane is not None and not any(map(_is_of_the_whole, judged)):
             current, findings = plane, judged
@@ -122,13 +121,6 @@ def _fails(findings: Iterable[Finding]) -> bool:
 def _told(registration: Registration, findings: Sequence[Finding]) -> Registration:
     """A registration with what was found of it in words."""
     return registration.with_messages(messages_of(findings, registration))
-
-
-def _may_be_another_plane(findings: Iterable[Finding]) -> bool:
-    """Whether something moves differently from what was registered, or the whole fails."""
-    return any(
-        found.kind in (Kind.SECOND_MOTION, Kind.UNDECIDED_MOTION) or _is_of_the_whole(found) for found in findings
-    )
 
 
 def plane_of_most(registration: Registration, options: StitchOptions, aligner: Aligner) -> Registration | None:

@@ -11,12 +11,12 @@ from msgspec import UNSET
 from msgspec.structs import replace as replace_fields
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera_files.own_format import CameraRecord, camera_record, lens_fields
 from rdstitch.choices import ChannelOrder, MatchBy
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, PartialResultError
 from rdstitch.export.georeference import Georeference
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera_record import CameraRecord, camera_record, lens_fields
 from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs

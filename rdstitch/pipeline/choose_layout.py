@@ -7,6 +7,7 @@ fills a good part of the images and moves of its own, what lies behind it.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 
@@ -67,13 +68,13 @@ class LaidOut:
     messages: tuple[Message, ...] = ()
 
     @property
-    def faults(self) -> tuple[bool, int]:
-        """What speaks against it: overlaps that do not look alike; and broken seams, stretched places, and local
-        alignment whose seams lie nowhere where they could be judged, 0 to 3.
+    def faults(self) -> int:
+        """What speaks against it: broken seams, stretched places, overlaps that do not look alike, and local alignment
+        whose seams lie nowhere where they could be judged, 0 to 4.
         """
         seams = self.layout.seams
         unjudged = bool(self.local.fields) and not len(seams.places)
-        return seams.contradicted, int(seams.seen) + int(_is_stretched(self.layout)) + int(unjudged)
+        return int(seams.seen) + int(_is_stretched(self.layout)) + int(seams.contradicted) + int(unjudged)
 
     @property
     def clipped(self) -> int:
@@ -118,13 +119,21 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         tried.append(laid(registration))
     except LimitError as error:
         failed = error
-    if options.dry_run or (tried and not any(tried[0].faults)):
+    if not options.dry_run and not (tried and not tried[0].layout.seams.contradicted):
+        plane = plane_of_most(registration, options, aligner)
+        if plane is not None and _joins(plane.alignment, registration.alignment, options.threshold):
+            with suppress(LimitError):
+                rival = laid(plane)
+                # What is put where it does not belong is unlike all over what the images show.
+                if not tried or rival.layout.seams.fills > tried[0].layout.seams.fills:
+                    registration, tried, failed = plane, [rival], None
+    if options.dry_run or (tried and not tried[0].faults):
         return _first(tried, failed)
     if tried and tried[0].local.fields and options.local_alignment == "auto":
         tried.append(laid(registration, no_local_alignment("seams hold better without it")))
     others = _others(registration, options, aligner, tried[0] if tried else None)
     # Of those that nothing speaks against, the most probable is taken.
-    while not (tried and tried[-1].clipped <= tried[0].clipped and not any(tried[-1].faults)):
+    while not (tried and tried[-1].clipped <= tried[0].clipped and not tried[-1].faults):
         if (other := next(others, None)) is None:
             break
         try:
@@ -134,7 +143,8 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
     first = _first(tried, failed)
     whole = [one for one in tried if one.clipped <= first.clipped]
     best = min(whole, key=lambda one: (one.faults, one.broken))
-    if failed is None and best.faults == first.faults and best.broken > _CLEARLY * first.broken:
+    broken = first.broken if first.layout.seams.seen else 0
+    if failed is None and best.faults == first.faults and not best.broken <= _CLEARLY * broken:
         best = first
     if best.layout.seams.by_chance and not options.force:
         raise RefusedError(best.registration.with_messages([_BY_CHANCE]))
@@ -166,10 +176,6 @@ def _others(
             reason = f"{other.alignment.model_reason.removesuffix('; as requested')}; seams break less than with a "
             reason += f"{alignment.model} model"
             yield replace(other, alignment=replace(other.alignment, model_reason=reason))
-    if first is None or first.layout.seams.contradicted:
-        plane = plane_of_most(registration, options, aligner)
-        if plane is not None and _joins(plane.alignment, alignment, max(options.threshold, allowed)):
-            yield plane
 
 
 def _joins(other: Alignment, alignment: Alignment, allowed: float) -> bool:

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
-from rdstitch.camera_files.own_format import CameraRecord, FocalSource, LensRecord
 from rdstitch.choices import ProjectionName
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera_record import CameraRecord, FocalSource, LensRecord
 from rdstitch.local_alignment import DisplacementField, HeldOut
 from rdstitch.system.records import Count, Matrix, NonNegative, Pair, Size, Triple, check_invertible
 

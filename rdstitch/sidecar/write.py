@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera_files.own_format import FocalSource, camera_record, lens_fields
 from rdstitch.compositing import Canvas, SeamQuality
 from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
 from rdstitch.export.georeference import Georeference, Residual
+from rdstitch.geometry.camera_record import FocalSource, camera_record, lens_fields
 from rdstitch.inputs.source import Source
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.matching.two_view import PairRegistration

@@ -2,6 +2,7 @@
 
 import cmath
 import math
+import weakref
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -15,18 +16,17 @@ import numpy as np
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.given_checks import LATE, attitudes_late, focal_contradicted
 from rdstitch.alignment.odometry import OdometryFit, motions_of
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Features, Matcher
 from rdstitch.features.corner_flow import CornerFlow, matched_corners
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.delays import DELAY_STD, at_delay, change_with_delay
 from rdstitch.inputs.odometry import BodyPose, motion_between
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
+from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.frame_links import (
     MATCH_ERROR,
     agree,
@@ -37,7 +37,7 @@ from rdstitch.tracking.frame_links import (
 )
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.metric_plane import MetricPlane, chained
-from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
+from rdstitch.tracking.placement import Placement, PlaneSimilarity
 from rdstitch.tracking.shown_camera import SeenPairs, ShownCamera, judged_focal, shown_camera
 from rdstitch.tracking.tracked_frame import Tracked, TrackedFrame
 
@@ -46,12 +46,10 @@ _WINDOW = 48  # keyframes that are aligned together
 _FIRST_ALIGNMENT = 5  # keyframes that the first alignment takes
 _GROWTH = 1.5  # from one alignment to the next, while λ is not known
 _ALIGNMENT_INTERVAL = 24  # keyframes from one alignment to the next afterwards
-_ALIGNMENT_DELAY = 8  # keyframes after which one is taken over, once λ is known; the next one before
+_FIRST_DELAY, _ALIGNMENT_DELAY = 1, 8  # keyframes after which one is taken over, before λ is known and afterwards
 _PATIENCE = 0.015  # seconds a frame that are waited for the first alignment
-_KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of an image of 640 x 480 pixels, over half of it
-_MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
-_CAMERA_CHECKS = 3, 4, 6, 8, 12, 16, 24, 32, 48  # keyframes at which what is given of the camera is compared with them
+_CAMERA_CHECKS = 3, 4, 6, 8, 12, 16, 32  # keyframes at which what is given is compared with them, beside alignments
 _CONTRADICTED = 0.999  # probability that a given focal length is wrong
 _EXACT = 1e-4  # of the logarithm of a focal length that an alignment keeps
 _MAX_LOST_FRAMES = 10  # frames in a row without a place, after which a new map begins, if all keyframes were searched
@@ -108,29 +106,16 @@ class Tracker:
         self._first_executor = executor
         if not options.patient:
             self._first_executor = ThreadPoolExecutor(1)
+            weakref.finalize(self, self._first_executor.shutdown, wait=False, cancel_futures=True)
             for name in _ALIGNMENT_IMPORTS:  # now: nothing that follows should wait for them
                 import_module(name)
         self._count, self._map_number, self._lost = 0, 0, 0
         self._flow = CornerFlow()
         self._latest_placed: TrackedFrame | None = None  # of those with odometry
         self._mounted: OdometryFit | None = None  # how the camera is on the body, in units of the map
-        self._model = options.alignment.model
-        self._distortion = options.pair.distortion
-        self._std = 0.0 if self.distortion_known else math.inf
-        self._length_std = self._given_length_std = math.nan  # now, and when all frames were given last
-        # Of positions, relative to their distance from the first, and of yaw, by a lens that is still estimated.
-        self._shape_std = (0.0, 0.0)
-        self._focal: float | None = None  # half diagonals: that of the map, whose lengths it determines
-        self._stated_std = 0.0  # of the logarithm of the focal length that was given
-        self._delay, self._delay_std = 0.0, DELAY_STD  # s, of attitudes
-        self._plane: MetricPlane | None = None
+        self._known = CameraKnowledge.of(options.alignment, options.pair)
         self.messages: list[Message] = []
         self._start_map()
-
-    @property
-    def distortion_known(self) -> bool:
-        """True where λ was given, or is known well enough to be kept."""
-        return self._options.pair.distortion is not None
 
     @property
     def waits(self) -> bool:
@@ -176,7 +161,7 @@ class Tracker:
     def finish(self) -> list[Tracked]:
         """Frames that find their place, or another one, when no other frame comes."""
         results = self._take_over(None, latest=-1)
-        if len(self._map.keyframes) > 1 and not self._focal_kept and (self.waits or self._plane is not None):
+        if len(self._map.keyframes) > 1 and not self._keeps_focal and (self.waits or self._known.plane is not None):
             self._align_window()
             results += self._take_over(None, latest=-1)
         return list({result.number: result for result in results}.values())
@@ -187,6 +172,9 @@ class Tracker:
             self._lost = 0
             return [*self._confirmed(frame), self._tracked(frame, keyframe=False, inliers=inliers)]
         links = self._links(frame)
+        if not links and inliers:  # placed, but by too little for a keyframe
+            self._lost = 0
+            return [*self._confirmed(frame), self._tracked(frame, keyframe=False, inliers=inliers)]
         if not links and self._placed_by_odometry(frame):
             return self._registered_by_odometry(frame)
         if not links:
@@ -198,7 +186,7 @@ class Tracker:
         with_last = next((link for link in links if link.image1 == last.number), None)
         if with_last is not None and self._shown_by_last(frame) >= _KEYFRAME_OVERLAP:
             self._flow.begin(frame.image, with_last.points1, with_last.points2)
-            self._between.append((frame, last, with_last.points1, with_last.points2))
+            self._keep_between(frame, with_last.points1, with_last.points2)
             return [*self._confirmed(frame), self._tracked(frame, keyframe=False, inliers=inliers)]
         confirmed = self._confirmed(frame)
         self._flow.begin(frame.image, frame.corners)
@@ -219,58 +207,22 @@ class Tracker:
     def _first(self, frame: TrackedFrame) -> Tracked:
         """The first keyframe of a map."""
         self._start_map()
-        known = self._distortion if self._distortion is not None and math.isfinite(self._std) else 0.0
-        camera = frame.camera if self._lens_given else frame.camera.with_coefficients(known)
+        camera = self._known.camera_of(frame.camera)
         frame.place = Placement(camera, np.eye(3), None)
-        self._plane = self._plane or self._given_plane(frame)
-        if self._plane is not None:
-            frame.place, frame.covariance = self._plane.below(camera, self._attitude(frame)), np.zeros((4, 4))
+        self._known.plane = self._known.plane or self._known.given_plane(frame.camera)
+        if self._known.plane is not None:
+            frame.place = self._known.plane.below(camera, self._known.attitude(frame))
+            frame.covariance = np.zeros((4, 4))
         self._map.keyframes.append(frame)
         self._flow.begin(frame.image, frame.corners)
         reason = "first frame" if not self._map_number else "no keyframe shows what it shows: it begins a new map"
         reason = reason if frame.textured else "no floor texture"
         return self._tracked(frame, keyframe=True, inliers=0, reason=reason)
 
-    @property
-    def _lens_given(self) -> bool:
-        return self._options.alignment.lens_known
-
-    def _given_plane(self, frame: TrackedFrame) -> MetricPlane | None:
-        """What is given of the camera, where that suffices for metric poses from the second frame on."""
-        tilt, rigid = self._options.alignment.tilt, self._model in ("auto", "rigid")
-        camera = frame.camera
-        if not self._metric_camera(camera) or not (rigid or self._model == "similarity"):
-            return None
-        assert camera.focal is not None
-        self._focal, self._stated_std = camera.focal / camera.scale, camera.focal_log_std
-        self._length_std, _ = judged_focal(self._stated_std, 0.0, math.inf)
-        self._given_length_std = self._length_std
-        if tilt is None:
-            return None
-        self._model = "rigid" if rigid else "similarity"
-        return MetricPlane(self._focal, tilt, rigid)
-
-    def _metric_camera(self, camera: Camera) -> bool:
-        """Whether lens and focal length of a camera are given."""
-        return self._lens_given and camera.focal is not None and camera.focal_source in ("option", "file")
-
-    def _attitude(self, frame: TrackedFrame) -> tuple[float, float] | None:
-        """(ψ, θ), radians, as measured when the frame was taken."""
-        if frame.attitude is None:
-            return None
-        psi, theta = at_delay(frame.attitude, self._delay).tolist()
-        return psi, theta
-
-    def _attitude_std(self, frame: TrackedFrame) -> float:
-        """Its standard deviation, radians, with what the delay leaves open."""
-        assert frame.attitude is not None
-        late = self._delay_std * float(change_with_delay(frame.attitude).max())
-        return math.hypot(self._options.alignment.attitudes_std, late)
-
     def _confirmed(self, frame: TrackedFrame) -> list[Tracked]:
         """The first keyframe, where it has its place by what is given, and a second frame shows that it is one."""
         first = self._map.keyframes[0]
-        if self._plane is None or first.aligned or len(self._map.keyframes) > 1 or frame.covariance is None:
+        if self._known.plane is None or first.aligned or len(self._map.keyframes) > 1 or frame.covariance is None:
             return []
         self._mapped = first.aligned = frame.aligned = True
         return [replace(self._tracked(first, keyframe=True, inliers=0), revised=True)]
@@ -291,8 +243,14 @@ class Tracker:
             frame.place, frame.aligned = None, False
             return 0
         self._flow.begin(frame.image, before, now)
-        self._between.append((frame, last, before[inliers], now[inliers]))
+        self._keep_between(frame, before[inliers], now[inliers])
         return int(inliers.sum())
+
+    def _keep_between(self, frame: TrackedFrame, before: FloatArray, now: FloatArray) -> None:
+        """Keep what a frame between keyframes shows of the last one, instead of what was kept of it."""
+        if self._between and self._between[-1][0] is frame:
+            self._between.pop()
+        self._between.append((frame, self._map.keyframes[-1], before, now))
 
     def _place(
         self, frame: TrackedFrame, other: TrackedFrame, before: FloatArray, now: FloatArray, *, rough: bool = False
@@ -300,21 +258,21 @@ class Tracker:
         """Place a frame by points (N, 2) of a keyframe that it shows too; which of them (N,) agree."""
         assert other.place is not None
         start = other.place
-        stay = replace(start, camera=camera_beside(frame, start, lens_given=self._lens_given))
-        rough |= not (self._mapped or self.distortion_known)
+        stay = replace(start, camera=camera_beside(frame, start, lens_given=self._known.lens_given))
+        rough |= not (self._mapped or self._known.distortion_known)
         error = _ROUGH * max(frame.camera.image_size) if rough else MATCH_ERROR
         homography, inliers = fitted_homography(start.camera, stay.camera, before, now, error)
         frame.place, frame.aligned, frame.covariance = None, False, None
         if homography is None:
             return inliers
         frame.quality, frame.aligned = float(inliers.mean()), other.aligned
-        if self._plane is None or other.covariance is None:
+        if self._known.plane is None or other.covariance is None:
             frame.place = replace(stay, homography=start.homography @ homography)
             return inliers
-        below = self._plane.below(stay.camera, self._attitude(frame))
-        tilt_std = 0.0 if frame.attitude is None else self._attitude_std(frame)
+        below = self._known.plane.below(stay.camera, self._known.attitude(frame))
+        tilt_std = 0.0 if frame.attitude is None else self._known.attitude_std(frame)
         points, places = now[inliers], start.to_plane(before[inliers])
-        frame.place, step = self._plane.placed(below, points, places, tilt_std=tilt_std)
+        frame.place, step = self._known.plane.placed(below, points, places, tilt_std=tilt_std)
         at, was = frame.place.pose, start.pose
         if at is not None and was is not None:
             frame.covariance = chained(other.covariance, step, (at.x - was.x, at.y - was.y), was.height)
@@ -323,7 +281,7 @@ class Tracker:
     def _placed_by_odometry(self, frame: TrackedFrame) -> bool:
         """Place a frame that shows no keyframe by what the wheels say of the way from the last one that had a place."""
         last, fit = self._latest_placed, self._mounted
-        if last is None or fit is None or frame.body is None or last.body is None or self._plane is None:
+        if last is None or fit is None or frame.body is None or last.body is None or self._known.plane is None:
             return False
         was = last.place.pose if last.place is not None and last.aligned else None
         if was is None or last.place is None or last.covariance is None:
@@ -331,7 +289,7 @@ class Tracker:
         step = motion_between(last.body, frame.body)
         moved = cmath.exp(1j * was.yaw) * fit.camera_motion(step.moved, step.turn)
         place, yaw = complex(was.x, was.y) + moved.conjugate(), was.yaw + step.turn
-        below = self._plane.below(last.place.camera, self._attitude(frame))
+        below = self._known.plane.below(last.place.camera, self._known.attitude(frame))
         frame.place = PlaneSimilarity(was.height * cmath.exp(-1j * yaw), place).applied(below)
         spread = fit.noise**2 * np.array([step.variance / abs(fit.scale) ** 2] * 2 + [0.0, step.turn_variance])
         offset = moved.real, -moved.imag
@@ -362,7 +320,7 @@ class Tracker:
 
     def _links(self, frame: TrackedFrame) -> list[Link]:
         """The frame with the last keyframes, as far as they can be registered; of a lost one, with more of them."""
-        lens, pair = self._lens_given, self._options.pair
+        lens, pair = self._known.lens_given, self._known.pair
         if links := links_by_corners(frame, self._map.partners, pair, lens_given=lens):
             return links
         if self._lost == 0:
@@ -397,10 +355,10 @@ class Tracker:
         seen = self._map.seen
         if self._between and self._between[-1][0] is frame:
             self._between.pop()
-        if not self.distortion_known and not self._mapped:  # λ by the pairs alone, until there is an alignment
+        if not self._known.distortion_known and not self._mapped:  # λ by the pairs alone, until there is an alignment
             relations = [link.relation for link in self._map.links]
             consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
-            self._distortion, self._std = consensus.distortion, consensus.std
+            self._known.distortion, self._known.distortion_std = consensus.distortion, consensus.std
         revised = self._check_camera(frame)
         if frame.body is not None:
             keyframes = sorted(self._map.by_number.values(), key=lambda keyframe: keyframe.number)[-_MOUNTED:]
@@ -410,11 +368,11 @@ class Tracker:
             revised += self._take_over(None)
         if seen + 1 >= self._next_alignment and self._alignment is None:
             grown = max(2, round(self._next_alignment * (_GROWTH - 1.0)))
-            steps = _ALIGNMENT_INTERVAL if self.distortion_known else min(grown, _ALIGNMENT_INTERVAL)
+            steps = _ALIGNMENT_INTERVAL if self._known.distortion_known else min(grown, _ALIGNMENT_INTERVAL)
             self._next_alignment += steps
             # At a keyframe and not when it is done: so that time does not decide on the result.
-            waits_long = self.distortion_known and not self.waits
-            self._taken_over_at = seen + (_ALIGNMENT_DELAY if waits_long else 1)
+            waits_long = self._known.distortion_known and not self.waits
+            self._taken_over_at = seen + (_ALIGNMENT_DELAY if waits_long else _FIRST_DELAY)
             self._align_window()
         return revised
 
@@ -423,70 +381,71 @@ class Tracker:
 
         Its tilt, with which a map begins; whether the focal length is right, and how late attitudes are.
         """
-        if self._focal is None or not self._metric_camera(frame.camera) or self._model not in ("auto", "rigid"):
+        known, seen = self._known, self._map.seen
+        if known.focal is None or not known.is_metric(frame.camera) or known.model not in ("auto", "rigid"):
             return []
-        if self._mapped and self._map.seen not in _CAMERA_CHECKS:
+        if self._mapped and seen not in _CAMERA_CHECKS and seen % _ALIGNMENT_INTERVAL:
             return []
         shown = self._shown_camera()
-        before = self._delay
+        before = known.delay
         if frame.attitude is not None:
-            self._delay, self._delay_std = shown.delay, shown.delay_std
+            known.delay, known.delay_std = shown.delay, shown.delay_std
             if abs(shown.delay) > LATE * shown.delay_std:
                 self._tell(attitudes_late(shown.delay, shown.delay_std))
-        if math.isinf(self._stated_std):  # it was wrong
+        if known.focal_contradicted:
             if abs(shown.log_focal) > shown.log_focal_std:
                 return self._with_shown_focal(frame, shown)
         else:
-            self._length_std, wrong = judged_focal(self._stated_std, shown.log_focal, shown.log_focal_std)
+            known.length_std, wrong = judged_focal(known.stated_std, shown.log_focal, shown.log_focal_std)
             if wrong > _CONTRADICTED:
                 return self._with_shown_focal(frame, shown)
-            if self._mapped and abs(self._delay - before) > self._delay_std:
+            if self._mapped and abs(known.delay - before) > known.delay_std:
                 return self._placed_anew(frame, 1.0)
-            if self._mapped and self._length_std < _SURER * self._given_length_std:
-                self._given_length_std = self._length_std
+            if self._mapped and known.length_std < _SURER * known.given_length_std:
+                known.given_length_std = known.length_std
                 return self._revised(except_for=frame.number)
-        pixels = self._focal * frame.camera.scale
+        pixels = known.focal * frame.camera.scale
         if self._mapped or not (shown.tilt_std * pixels < MATCH_ERROR and shown.rms * pixels < MATCH_ERROR):
             return []
-        self._plane = MetricPlane(self._focal, shown.tilt, True, shown.tilt_std)
+        known.plane = MetricPlane(known.focal, shown.tilt, True, shown.tilt_std)
         return self._placed_anew(frame, 1.0)
 
     def _shown_camera(self) -> ShownCamera:
-        assert self._focal is not None
+        assert self._known.focal is not None
         rays, attitudes, by_number = [], [], self._map.by_number
         for link in self._map.links:
             ends = by_number[link.image1], by_number[link.image2]
             for frame, points in zip(ends, (link.points1, link.points2), strict=True):
                 camera = frame.camera
-                rays.append((camera.undistort(points) - camera.center) / (self._focal * camera.scale))
+                rays.append((camera.undistort(points) - camera.center) / (self._known.focal * camera.scale))
                 attitudes.append(frame.attitude)
         measured = [attitude for attitude in attitudes if attitude is not None]
-        tilt = None if self._plane is None else self._plane.tilt
+        tilt = None if self._known.plane is None else self._known.plane.tilt
         return shown_camera(SeenPairs.of(rays, measured if len(measured) == len(rays) else []), tilt)
 
     def _with_shown_focal(self, frame: TrackedFrame, shown: ShownCamera) -> list[Tracked]:
         """The map by the focal length that the images show, instead of the one that was given."""
-        assert self._focal is not None
-        given = self._focal * frame.camera.scale
+        assert self._known.focal is not None
+        given = self._known.focal * frame.camera.scale
         found, std = given * math.exp(shown.log_focal), shown.log_focal_std
-        if not math.isinf(self._stated_std):
+        if not self._known.focal_contradicted:
             self._tell(focal_contradicted(given, found, std))
-        self._focal, self._stated_std = found / frame.camera.scale, math.inf  # from now on it is what they show
-        self._length_std = std
+        self._known.focal, self._known.focal_contradicted = found / frame.camera.scale, True
+        self._known.length_std = std
         self._alignment = None  # one that is under way was begun with the old focal length
-        self._plane = MetricPlane(self._focal, shown.tilt_by_itself, True, shown.tilt_std)
+        self._known.plane = MetricPlane(self._known.focal, shown.tilt_by_itself, True, shown.tilt_std)
         return self._placed_anew(frame, math.exp(-shown.log_focal))
 
     def _placed_anew(self, latest: TrackedFrame, longer: float) -> list[Tracked]:
         """All keyframes by the camera as it is known now, by which lengths are so many times as long."""
-        assert self._plane is not None
+        assert self._known.plane is not None
         first, *others = self._map.keyframes
         assert first.place is not None
         was = first.place.pose
         move = PlaneSimilarity(1.0, 0.0)
         if was is not None and first.aligned:
             move = PlaneSimilarity(np.exp(-1j * was.yaw).item(), longer * complex(was.x, was.y))
-        first.place = move.applied(self._plane.below(first.camera, self._attitude(first)))
+        first.place = move.applied(self._known.plane.below(first.camera, self._known.attitude(first)))
         first.covariance = np.zeros((4, 4)) if first.covariance is None else first.covariance
         first.aligned = self._mapped = True
         for keyframe in self._map.older:
@@ -517,40 +476,40 @@ class Tracker:
         return {frame.number for frame in frames if not frame.aligned}
 
     @property
-    def _focal_kept(self) -> bool:
+    def _keeps_focal(self) -> bool:
         """Whether alignments keep the focal length: that of one map must not depend on the window."""
-        return self._focal is not None and (self._stated_std > 0.0 or not self._map.whole)
+        return self._known.focal is not None and (self._known.stated_std > 0.0 or not self._map.whole)
 
     def _align_window(self) -> None:
         """Begin to align the keyframes of the window among themselves."""
         window = self._map.keyframes
-        known = self._options.pair.distortion
+        known = self._known.pair.distortion
         cameras = [keyframe.camera.with_focal() for keyframe in window]
-        if known is not None and not self._lens_given:
+        if known is not None and not self._known.lens_given:
             cameras = [camera.with_coefficients(known) for camera in cameras]
-        if self._focal is not None and self._focal_kept:
-            focal = self._focal
+        if self._known.focal is not None and self._keeps_focal:
+            focal = self._known.focal
             cameras = [c.with_focal(focal * c.scale, "file", _EXACT * focal * c.scale) for c in cameras]
-        attitudes = [attitude for keyframe in window if (attitude := self._attitude(keyframe)) is not None]
+        attitudes = [attitude for keyframe in window if (attitude := self._known.attitude(keyframe)) is not None]
         measured = len(attitudes) == len(cameras)
         stated = max(
-            (self._attitude_std(keyframe) for keyframe in window if keyframe.attitude is not None), default=0.0
+            (self._known.attitude_std(keyframe) for keyframe in window if keyframe.attitude is not None), default=0.0
         )
         options = replace(
-            self._options.alignment,
-            model=self._model,
+            self._known.given,
+            model=self._known.model,
             lens="auto" if known is not None else "division",
             lens_known=known is not None,
             most=_MATCHES,
             attitudes=np.array(attitudes) if measured else None,
             delayed_attitudes=None,
-            attitudes_std=stated if measured else self._options.alignment.attitudes_std,
+            attitudes_std=stated if measured else self._known.given.attitudes_std,
             reference=None,
             pose_covariance=known is None,
         )
         executor = self._executor if self._mapped else self._first_executor
         aligned = executor.submit(align, cameras, self._map.window_links(), options)
-        self._alignment = list(window), aligned, self._focal_kept
+        self._alignment = list(window), aligned, self._keeps_focal
 
     def _take_over(self, patience: float | None, latest: int | None = None) -> list[Tracked]:
         """λ, the model and the places of keyframes from an alignment; frames but the latest that have another place.
@@ -574,8 +533,8 @@ class Tracker:
         if alignment.on_sphere:
             self._tell(Message("the camera turns on the spot: there is no path"))
             return []
-        if not self.distortion_known and alignment.distortion_std < self._std:
-            self._distortion, self._std = alignment.distortion, alignment.distortion_std
+        if not self._known.distortion_known and alignment.distortion_std < self._known.distortion_std:
+            self._known.distortion, self._known.distortion_std = alignment.distortion, alignment.distortion_std
         placed = [
             (keyframe, Placement(camera, homography, alignment.focal))
             for keyframe, camera, homography, used in zip(
@@ -589,72 +548,24 @@ class Tracker:
             move = PlaneSimilarity.to_origin(pose)  # the others are relative to it
         self._mapped = True
         if not kept:
-            self._length_std = alignment.length_std
+            self._known.length_std = alignment.length_std
         for keyframe, placement in placed:
             keyframe.place, keyframe.aligned = move.applied(placement), True
-        self._focal = self._focal if kept else alignment.focal
-        self._learn(alignment, keyframes)
+        self._known.focal = self._known.focal if kept else alignment.focal
+        self._known.learn(alignment, keyframes)
+        if self._known.plane is not None:  # until there is a window, errors have nothing to grow from
+            reached = np.zeros((4, 4))
+            for keyframe in self._map.keyframes:
+                if keyframe.aligned:
+                    reached = keyframe.covariance = reached if keyframe.covariance is None else keyframe.covariance
         aligned = {id(keyframe) for keyframe, _ in placed}
         for keyframe in self._map.keyframes:
             links = self._map.links_to(keyframe)
             if id(keyframe) not in aligned and links:
                 self._settle(keyframe, links)
         # What was said of the lengths before is replaced, so that all lengths of a map are wrong by the same.
-        anew = not kept and abs(math.log(longer)) > _SAME_LENGTHS * self._length_std
+        anew = not kept and abs(math.log(longer)) > _SAME_LENGTHS * self._known.length_std
         return self._revised(None if anew else waiting, except_for=self._count - 1 if latest is None else latest)
-
-    def _learn(self, alignment: Alignment, keyframes: Sequence[TrackedFrame]) -> None:
-        """Keep what an alignment shows of the camera, for the frames to come."""
-        poses, tilt = alignment.poses, alignment.tilt
-        self._shape_std = (0.0, 0.0)
-        if poses is not None and poses.covariance is not None:
-            path = Trajectory.from_poses(poses)
-            far = np.linalg.norm(path.position, axis=1)
-            last = int(np.argmax(far))
-            if path.covariance is not None and far[last] > 0.0:
-                # Across: along it is what all lengths share.
-                variance = float(np.linalg.eigvalsh(path.covariance[last, :2, :2])[0]) / far[last] ** 2
-                self._shape_std = math.sqrt(max(variance, 0.0)), math.sqrt(float(path.covariance[:, 3, 3].max()))
-        measured = [attitude for keyframe in keyframes if (attitude := self._attitude(keyframe)) is not None]
-        tilts_known = len(measured) == len(keyframes)
-        known = ("rigid", "similarity", *(("tilting",) if tilts_known else ()))
-        if alignment.model in known and poses is not None and tilt and self._focal:
-            mount = np.array(tilt)
-            if tilts_known:
-                mount = np.nanmedian(poses.tilt - np.array(measured), axis=0)
-            given = self._options.alignment.tilt is not None
-            tilt_std = None if given else math.sqrt(float(np.trace(alignment.covariance[:2, :2])))
-            rigid = alignment.model == "rigid"
-            self._plane = MetricPlane(self._focal, (float(mount[0]), float(mount[1])), rigid, tilt_std)
-            # Until there is a window, errors have nothing to grow from.
-            reached = np.zeros((4, 4))
-            for keyframe in self._map.keyframes:
-                if keyframe.aligned:
-                    reached = keyframe.covariance = reached if keyframe.covariance is None else keyframe.covariance
-        else:
-            self._plane = None
-        if self.distortion_known:
-            self._model = alignment.model
-        elif self._std <= _KNOWN_STD and len(keyframes) >= _MIN_KEYFRAMES_FOR_LENS:
-            pair = replace(self._options.pair, distortion=self._distortion, solver="auto")
-            self._options = replace(self._options, pair=pair)
-            self._model = alignment.model
-
-    def _covariance(self, frame: TrackedFrame, pose: CameraPose) -> FloatArray | None:
-        """Of a frame's pose, with what all frames have in common but for the unit of lengths."""
-        known, (relative, yaw_std) = frame.covariance, self._shape_std
-        if known is None:
-            if not relative:
-                return None
-            known = np.zeros((4, 4))
-        far = math.hypot(pose.x, pose.y)
-        if self._plane is not None and not relative:
-            relative = yaw_std = self._plane.bend_std(self._length_std)
-        place = (relative * far) ** 2
-        if frame.attitude is not None:
-            # The foot of the camera is off by the error of its tilt, and so is that of the first frame.
-            place += 2.0 * (pose.height * self._attitude_std(frame)) ** 2
-        return np.asarray(known + np.diag([place, place, 0.0, yaw_std**2]))
 
     def _tell(self, message: Message) -> None:
         """Keep a message, if nothing of its kind is known."""
@@ -670,18 +581,19 @@ class Tracker:
             reason = reason if self.waits else "it is not linked with the map yet"
         elif placement is not None:
             reason = "" if placement.pose is not None else "the model has no metric poses"
+        pose = None if placement is None else placement.pose
         return Tracked(
             number=frame.number,
             placement=placement,
-            distortion=math.nan if self._distortion is None else self._distortion,
-            distortion_std=self._std,
-            distortion_known=self.distortion_known,
+            distortion=math.nan if self._known.distortion is None else self._known.distortion,
+            distortion_std=self._known.distortion_std,
+            distortion_known=self._known.distortion_known,
             map_number=self._map_number,
             keyframe=keyframe,
             inliers=inliers,
             quality=frame.quality,
-            covariance=None if placement is None or placement.pose is None else self._covariance(frame, placement.pose),
-            length_std=self._length_std,
+            covariance=None if pose is None else self._known.covariance(frame, pose),
+            length_std=self._known.length_std,
             unit=math.nan if self._mounted is None else abs(self._mounted.scale),
             unit_std=math.nan if self._mounted is None else self._mounted.relative_std,
             reason=reason,

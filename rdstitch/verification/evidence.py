@@ -13,7 +13,6 @@ from rdstitch.results.registration import Registration
 from rdstitch.system.cache import NO_CACHE, Cache
 from rdstitch.verification.limits import limit
 from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps, share_alike
-from rdstitch.verification.second_motion import SecondMotion, explains, find_second_motions, is_clear
 
 
 @dataclass(frozen=True)
@@ -55,25 +54,9 @@ class Evidence:
         return check_overlaps(self.registration, self._images, self.cache)
 
     @cached_property
-    def motions(self) -> list[SecondMotion]:
-        """What moves differently, pair by pair."""
-        return find_second_motions(self.alignment, self.registration.pairs, self.threshold)
-
-    @cached_property
-    def clear(self) -> bool:
-        """Whether the pixels say that what was aligned is the plane, and what moves differently is not."""
-        return is_clear(self._images, self.motions, [] if self.alignment.on_sphere else self.checked)
-
-    @cached_property
     def ambiguous(self) -> dict[Pair, CheckedLink]:
         """Pairs of a repeated pattern, of which nobody can say by how many periods they are apart."""
-        doubtful = [link for link in self.checked if link.ambiguity.ambiguous and not link.unique]
-        moving = {motion.images: motion for motion in self.motions} if doubtful else {}
-        return {
-            link.pair: link
-            for link in doubtful
-            if link.pair not in moving or not explains(self._images, moving[link.pair], link)
-        }
+        return {link.pair: link for link in self.checked if link.ambiguity.ambiguous and not link.unique}
 
     def looks_right(self, images: Sequence[int]) -> bool:
         """Whether what an image, or a pair, or all of them if empty, has in common with others is clearly alike."""

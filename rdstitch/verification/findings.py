@@ -66,15 +66,6 @@ class Kind(Enum):
         "parallax",
         "{what}; most of all between {first} and {second} ({rms:.1f} pixels)",
     )
-    PARALLAX = (
-        Scope.WHOLE,
-        "parallax",
-        (
-            "the camera moved while it turned (parallax), or things moved before it: they are off by up to "
-            "{size:.0f} pixels between {first} and {second} ({share:.0%} of their matches); turn about the lens, "
-            "not about yourself"
-        ),
-    )
     SHAPE_UNKNOWN = (
         Scope.WHOLE,
         "shape",
@@ -131,15 +122,11 @@ class Kind(Enum):
             "they lie; look at the seams, that between {first} and {second} first"
         ),
     )
-    SECOND_MOTION = (
+    RIVAL_MOTION = (
         Scope.WHOLE,
         "rival-motion",
-        "{moving} (something that moved, or a second surface?); a mask keeps it out",
-    )
-    UNDECIDED_MOTION = (
-        Scope.WHOLE,
-        "rival-motion",
-        "{moving}, and it is not clear which of the two is the plane; mask what does not belong to it",
+        "what was put together fills at most {share:.0%} of the images, and the rest looks different (something that "
+        "moved, or a second surface?); mask what does not belong to the plane",
     )
     TWO_OF_ONE_LENS = (
         Scope.WHOLE,
@@ -198,12 +185,6 @@ class Finding:
         return self.severity == "failure"
 
 
-_MOVING = (
-    "{share:.0%} of what the images have in common moves differently from the rest, most of it around ({place[0]:.0f}, "
-    "{place[1]:.0f}) of {shown[0]} when compared with {shown[1]}, by {off:.0f} pixels"
-)
-
-
 def messages_of(findings: Iterable[Finding], registration: Registration) -> list[Message]:
     """One message for each finding."""
     paths = [str(source.path) for source in registration.sources]
@@ -230,7 +211,5 @@ def _message(finding: Finding, paths: Sequence[str]) -> Message:
         bodies = sorted(values["bodies"].items(), key=lambda body: -len(body[1]))
         listed = (f"{body} ({len(shown)}: {shortened(names_of(paths[k] for k in shown))})" for body, shown in bodies)
         values |= {"number": len(bodies), "bodies": "; ".join([*listed][:MAX_NAMED])}
-    if "shown" in values:
-        values["moving"] = _MOVING.format(**{**values, "shown": names_of(paths[k] for k in values["shown"])})
     kind = finding.kind
     return Message(kind.text.format(of_all=len(paths), **values), images, finding.severity, kind.code, kind.name)

@@ -44,15 +44,8 @@ LIMITS = {
     "matched departures": Limit(400.0, "squared spreads times pixels", "a stain of 16 pixels, 5 spreads beyond noise"),
     "lead": Limit(3.0, "times what any other shift matches", "chosen"),
     # Second motions.
-    "off the plane": Limit(3.0, "thresholds", "nearer, relief and the lens may be to blame"),
-    "motion": Limit(0.02, "of an image's diagonal", "relief moves what stands on the plane by less"),
-    "far motion": Limit(0.05, "of an image's diagonal", "tops of trees and houses less; vehicles 0.25 to 0.5"),
     "inliers of a motion": Limit(12, "matches", "four define it; eight more by chance have not been seen"),
-    "second motion": Limit(
-        0.1, "share of the area of either motion", "flights over trees and houses reach 0.08: benchmarks.trust"
-    ),
     "filled by a plane": Limit(0.5, "share of the images", "what fills less is in front of it"),
-    "same shift": Limit(0.05, "of the longer side of an image", "matches show a shift where they are, pixels a mean"),
     # Inputs.
     "zoom": Limit(1.03, "ratio of focal lengths in EXIF", "they are rounded to about one per cent"),
 }  # fmt: skip

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.seam_quality import SeamTile, share_alike
+from rdstitch.compositing.seam_quality import SeamTile, likeness
 from rdstitch.compositing.warp import Lattice
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
@@ -48,6 +48,11 @@ class Agreement:
     def share(self) -> float:
         """Share of the cells that confirm the registration; 1 without cells."""
         return self.confirming / self.cells if self.cells else 1.0
+
+    @property
+    def unlike(self) -> float:
+        """Number of the cells that look different three times smaller, where depth and blur are no difference."""
+        return 0.0 if math.isnan(self.coarsely) else self.cells * (1.0 - self.coarsely)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +88,8 @@ class ComparedImage:
 
 def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> Grey:
     pixels = image.pixels
-    full = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else max(float(pixels.max()), 1e-12)
-    black = 0.0
+    largest = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else np.nanmax(pixels, initial=1e-12)
+    black, full = 0.0, float(largest)
     if stretch is not None:
         # Correlations of small differences on a large base would be lost in rounding.
         black, full = stretch[0], max(stretch[1] - stretch[0], 1e-12)
@@ -125,7 +130,7 @@ def overlap_agreement(first: ComparedImage, second: ComparedImage) -> Agreement:
     known = textured & _have_texture(cells) & np.isfinite(windows).all(axis=(1, 2))
     confirming = sum(_confirms(*both) for both in zip(cells[known], windows[known], strict=True))
     tiles = [SeamTile((0, 0, width, height), np.nan_to_num(grey), np.isfinite(grey)) for grey in (seen, second.grey)]
-    return Agreement(int(known.sum()), confirming, int(textured.sum()), share_alike(tiles, np.array([[0, 1]]), 1.0)[0])
+    return Agreement(int(known.sum()), confirming, int(textured.sum()), likeness(tiles, np.array([[0, 1]]), 1.0).alike)
 
 
 def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:

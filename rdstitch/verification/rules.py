@@ -16,7 +16,7 @@ from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding, Kind
 from rdstitch.verification.limits import limit
 from rdstitch.verification.overlap_check import wrong_at_most
-from rdstitch.verification.second_motion import share_of
+from rdstitch.verification.rival_planes import fills_at_most
 
 MAX_WARNINGS = 3
 """Lines of one run."""
@@ -160,28 +160,13 @@ def _pattern(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(Kind.SETTLED_PATTERN, min(settled, key=lambda link: link.agreement.share).pair, "warning")
 
 
-def _second_motion(evidence: Evidence) -> Iterator[Finding]:
-    """What moves differently: a failure of all images where it may be the plane, as without the one that shows it best
-    it would only be harder to see. Of a turn it is parallax, or what moved before the camera.
+def _rival_motion(evidence: Evidence) -> Iterator[Finding]:
+    """Poses by something that fills less than half of the images: what drives ahead, say. Pictures have their seams, a
+    lens is the same.
     """
-    if evidence.purpose.picture:
-        return
-    motions = evidence.motions
-    if evidence.purpose.lens_only:  # a motion by a period of the pattern is none; what is static has a message
-        motions = [] if evidence.static else [motion for motion in motions if motion.images not in evidence.ambiguous]
-    share = share_of(motions)
-    if share < limit("second motion"):
-        return
-    worst = max(motions, key=lambda motion: motion.area)
-    off = min(worst.disagreement, 2.0 * evidence.alignment.cameras[worst.images[0]].scale)
-    values = {"share": share, "place": worst.center, "shown": worst.images, "off": off}
-    if evidence.alignment.on_sphere:
-        yield Finding(Kind.PARALLAX, worst.images, "warning", {"size": off, "share": share})
-    elif evidence.purpose.lens_only or (worst.is_far and evidence.clear):
-        yield Finding(Kind.SECOND_MOTION, worst.images, "warning", values)
-    elif worst.is_far:  # nearer, it is depth
-        images = tuple(sorted({k for motion in motions for k in motion.images}))
-        yield Finding(Kind.UNDECIDED_MOTION, images, "failure", values)
+    share = fills_at_most(link.agreement for link in evidence.checked) if evidence.purpose.poses else 1.0
+    if share < limit("filled by a plane"):
+        yield Finding(Kind.RIVAL_MOTION, values={"share": share})
 
 
 def _two_left(evidence: Evidence) -> Iterator[Finding]:
@@ -228,7 +213,7 @@ OF_THE_WHOLE: tuple[Find, ...] = (
     _shape,
     _looked_at,
     _pattern,
-    _second_motion,
+    _rival_motion,
     _two_left,
     _inputs,
 )
@@ -242,7 +227,7 @@ OF_PLACES = {
 as before."""
 
 
-SEEN_AT_SEAMS = {Kind.ROUGH, Kind.RELIEF, Kind.DEPTH_OF_A_TURN}
+SEEN_AT_SEAMS = {Kind.RELIEF, Kind.DEPTH_OF_A_TURN}
 """Kinds that the seams of a picture show, or do not."""
 
 
@@ -264,8 +249,9 @@ class Aloud(NamedTuple):
 
 ALOUD = {
     **dict.fromkeys((Kind.SHAPE_UNKNOWN, Kind.SHAPE_BENT, Kind.SHAPE_FREE), Aloud("flatness", _bent)),
-    **dict.fromkeys((Kind.ROUGH, Kind.RELIEF), Aloud("flatness", lambda evidence: evidence.flat or _seen(evidence))),
-    **dict.fromkeys((Kind.PARALLAX, Kind.DEPTH_OF_A_TURN), Aloud("flatness", _seen)),
-    Kind.SECOND_MOTION: Aloud("second motion"),
+    # Local alignment makes the seams of a picture hold over any ground, and leaves the whole bent.
+    Kind.ROUGH: Aloud("flatness", lambda evidence: evidence.flat or (_seen(evidence) and not evidence.purpose.picture)),
+    Kind.RELIEF: Aloud("flatness", lambda evidence: evidence.flat or _seen(evidence)),
+    Kind.DEPTH_OF_A_TURN: Aloud("flatness", _seen),
 }
 """The gravest first; other kinds are always said, and before these."""

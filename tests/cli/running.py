@@ -17,9 +17,9 @@ import numpy as np
 from jsonschema import Draft202012Validator
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera_files.own_format import CameraRecord
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera_record import CameraRecord
 from rdstitch.geometry.radial_homography import project
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.sidecar.read import json_schema

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rdstitch.camera_files.own_format import camera_json
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera_record import camera_json
 from rdstitch.inputs import source as sources
 from rdstitch.io import Metadata, read_image, read_metadata
 from rdstitch.pipeline import accept, recipes, register

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rdstitch.camera_files import load_camera, save_camera
-from rdstitch.camera_files.own_format import camera_json
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera_record import camera_json
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.sidecar import write
 from rdstitch.sidecar.read import read_sidecar

@@ -53,9 +53,11 @@ def test_what_moves_differently_is_never_stitched_silently(kind: str, seed: int,
         assert judged.status == 0, judged.text
 
 
-@pytest.mark.parametrize("seed", sampled([9803, 9806, 20022, 30008]))
+@pytest.mark.parametrize("seed", sampled([9803, 9806, 20022, 30008, 94002, 94025]))
 def test_a_vehicle_with_more_matches_than_the_plane_is_not_taken_for_it(seed: int, tmp_path: Path) -> None:
-    """Some pairs show it and some the plane; it looks like rough ground; it may be all that most of the pairs show."""
+    """Some pairs show it and some the plane; it looks like rough ground; it may be all that most of the pairs show; no
+    layout holds both; another part of the pairs than the plane's looks alike.
+    """
     judged = judge_set(trust_set(seed, "vehicle"), tmp_path)
     assert judged.status == 0, judged.text
     assert judged.right, judged

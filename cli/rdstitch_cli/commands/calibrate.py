@@ -46,7 +46,7 @@ def calibrate(
     """
     from rdstitch.alignment.lens_description import describe_camera
     from rdstitch.camera_files import export_note
-    from rdstitch.camera_files.own_format import camera_json
+    from rdstitch.geometry.camera_record import camera_json
     from rdstitch.pipeline.recipes import calibrate as recipe
 
     paths = resolve(inputs)

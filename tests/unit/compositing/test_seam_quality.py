@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rdstitch.compositing.boxes import Box, Float32Array
-from rdstitch.compositing.seam_quality import SeamQuality, SeamTile, measure_seams, share_alike
+from rdstitch.compositing.seam_quality import SeamQuality, SeamTile, likeness, measure_seams
 from rdstitch.synthetic.textures import ground
 
 SIZE = (400, 300)
@@ -87,19 +87,19 @@ def test_nothing_is_said_of_images_without_texture_or_without_neighbours() -> No
     assert not measure_seams([_tile(flat, (0, 0, *SIZE)), None], LABELS, 1.0, 1.0).seen
 
 
-def test_the_share_of_overlaps_that_look_alike_and_the_pair_that_does_so_the_least() -> None:
+def test_how_alike_overlaps_look_what_that_fills_and_the_pair_that_does_so_the_least() -> None:
     """A tile elsewhere on the canvas, and one of which a third shows something else."""
     whole = _tile(SCENE[: SIZE[1], : SIZE[0]], (0, 0, *SIZE))
     beside = _tile(SCENE[: SIZE[1], 101:501], (101, 0, 501, 300))
-    spoiled = _shifted(50, 70, (200, 300))
-    third = _tile(spoiled, (0, 0, *SIZE))
-    assert share_alike([whole, beside, None], np.array([[1, 0], [2, 0]])) == (1.0, (0, 1))
-    share, worst = share_alike([whole, beside, third], np.array([[1, 0], [2, 0]]))
-    assert share == pytest.approx((299 + 400 * 2 / 3) / 699, abs=0.06)
-    assert worst == (0, 2)
-    share, worst = share_alike([_tile(0.0 * SCENE[:60, :60], (0, 0, 60, 60))] * 2, np.array([[1, 0]]))
-    assert np.isnan(share)
-    assert worst is None
+    third = _tile(_shifted(50, 70, (200, 300)), (0, 0, *SIZE))
+    assert likeness([whole, beside, None], np.array([[1, 0], [2, 0]])) == (1.0, 1.0, (0, 1))
+    found = likeness([whole, beside, third], np.array([[1, 0], [2, 0]]))
+    assert found.alike == pytest.approx((299 + 400 * 2 / 3) / 699, abs=0.06)
+    assert found.fills == pytest.approx(1.0 - 400 / 3 / 800, abs=0.06)
+    assert found.least_alike == (0, 2)
+    nothing = likeness([_tile(0.0 * SCENE[:60, :60], (0, 0, 60, 60))] * 2, np.array([[1, 0]]))
+    assert np.isnan(nothing.alike)
+    assert nothing.least_alike is None
 
 
 @pytest.mark.parametrize(
@@ -107,8 +107,7 @@ def test_the_share_of_overlaps_that_look_alike_and_the_pair_that_does_so_the_lea
 )
 def test_images_that_are_put_anywhere_are_alike_by_chance(right: int, down: int, by_chance: bool) -> None:
     tiles = [_tile(pixels, (0, 0, *SIZE)) for pixels in (_shifted(0, 0), _shifted(right, down))]
-    share, _ = share_alike(tiles, np.array([[1, 0]]))
-    quality = SeamQuality(alike=share)
+    quality = SeamQuality(alike=likeness(tiles, np.array([[1, 0]])).alike)
     assert (quality.by_chance, quality.contradicted) == (by_chance, by_chance)
 
 

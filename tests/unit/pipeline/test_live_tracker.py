@@ -178,12 +178,18 @@ def _rows(tracker: rdstitch.Tracker, images: Iterable[NDArray[np.uint8]]) -> lis
     return [poses[number] for number in sorted(poses)]
 
 
-def test_a_focal_length_that_the_images_contradict_is_replaced_and_lengths_are_as_uncertain_until_then() -> None:
+@pytest.mark.parametrize("late", [0, 3])  # keyframes by which alignments come later than planned
+def test_a_focal_length_that_the_images_contradict_is_replaced_and_lengths_are_as_uncertain_until_then(
+    late: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tracker_module, "_FIRST_DELAY", 1 + late)
+    monkeypatch.setattr(tracker_module, "_ALIGNMENT_DELAY", 8 + late)
     lens = Camera((320, 240), DISTORTION, focal=256.0)
     poses = drive_poses(lens, "turn", 24, overlap=0.75, tilt=(0.12, -0.07))
     images = sequence_over(partial(ground, seed=3), lens, poses).frames()
     told = replace(CAMERA, focal=1.1 * 256.0)
-    tracker = rdstitch.Tracker(rdstitch.StitchOptions(camera=told), rdstitch.FollowedPoses(HEIGHT, "camera"))
+    options = rdstitch.StitchOptions(camera=told, workers=1)
+    tracker = rdstitch.Tracker(options, rdstitch.FollowedPoses(HEIGHT, "camera"), patient=True)
     early = tracker.add(images[0]), tracker.add(images[1]), tracker.add(images[2])
     last = _rows(tracker, images[3:])
     turn, first = np.exp(1j * poses.yaw[0]), poses.position[0]

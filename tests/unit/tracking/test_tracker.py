@@ -216,6 +216,21 @@ def test_between_keyframes_corners_are_followed(video: tuple[Sequence, list[NDAr
     assert error.rotation < math.radians(0.03)
 
 
+def test_a_frame_that_corners_place_is_not_lost_where_they_make_no_link(
+    video: tuple[Sequence, list[NDArray[np.uint8]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracker = _tracker(DISTORTION, lambda image: detect(image.grey, FeatureOptions(max_features=600)))
+    for image in video[1][:30]:
+        tracker.add(prepare(View(image), None), Camera(SIZE))
+    monkeypatch.setattr(tracker, "_links", lambda _: [])
+    later = [tracker.add(prepare(View(image), None), Camera(SIZE))[-1] for image in video[1][30:36]]
+    assert any(result.inliers for result in later)
+    assert all(result.inliers > 0 for result in later if result.placement is not None)
+    assert tracker._lost == 0
+    numbers = [frame.number for frame, *_ in tracker._between]
+    assert len(set(numbers)) == len(numbers)
+
+
 def test_a_cut_is_no_motion(video: tuple[Sequence, list[NDArray[np.uint8]]]) -> None:
     _, images = video
     flow, first = CornerFlow(), prepare(View(images[0]), None)

@@ -112,6 +112,13 @@ def _fit(i: int, j: int, inliers: int = 50) -> LinkFit:
     return LinkFit(i, j, 100, inliers, 0.5, True)
 
 
+def test_a_place_that_a_float_image_does_not_know_spoils_no_other() -> None:
+    pixels = PLANE[:300, :400].astype(np.float32)
+    pixels[10, 20] = np.nan
+    grey = ComparedImage.of(DecodedImage(pixels, None, Metadata(SIZE)), LENS, np.eye(3)).grey
+    assert np.isfinite(grey).mean() > 0.99
+
+
 def test_of_many_links_those_with_the_fewest_triangles_and_matches_are_compared() -> None:
     """A clique of nine has 36 links in seven triangles each; a chain of 20 hangs on it. Of few all are compared."""
     links = [_fit(i, i + 1) for i in range(40)]

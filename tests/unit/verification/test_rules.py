@@ -10,7 +10,6 @@ import pytest
 from rdstitch.alignment.result import LinkFit
 from rdstitch.choices import Purpose
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.inputs.source import Source
 from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.results.messages import Message
@@ -20,7 +19,6 @@ from rdstitch.verification.findings import Finding, Kind, messages_of
 from rdstitch.verification.limits import LIMITS
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
-from rdstitch.verification.second_motion import SecondMotion
 from rdstitch.verification.self_similarity import Ambiguity
 from rdstitch.verification.verdict import _aloud
 from tests.registrations import CAMERA, evidence, registration, source
@@ -43,14 +41,14 @@ SMALL = evidence(registration(shape=replace(SHAPE, shift=1e4)), alike=0.8)
     ("found", "kinds", "said"),
     [
         (TURNED, [Kind.RELIEF], []),  # of a turn and of pairs only what is seen
-        (TURNED, [Kind.PARALLAX], []),
         (UNLIKE, [Kind.RELIEF], [Kind.RELIEF]),
-        (UNLIKE, [Kind.PARALLAX], [Kind.PARALLAX]),
+        (UNLIKE, [Kind.DEPTH_OF_A_TURN], [Kind.DEPTH_OF_A_TURN]),
         (SHAPED, [Kind.RELIEF], [Kind.RELIEF]),
         (SHAPED, [Kind.RELIEF, Kind.SHAPE_BENT], [Kind.SHAPE_BENT]),  # one line says that the plane may be none
         (SMALL, [Kind.SHAPE_BENT], []),  # by more than an image
         (evidence(TURNED.registration, Purpose.MOSAIC, alike=0.1), [Kind.RELIEF, Kind.ROUGH], []),
-        (SHAPED, [Kind.SECOND_MOTION], [Kind.SECOND_MOTION]),
+        # What local alignment hides along the seams of a plane leaves the whole bent.
+        (evidence(SHAPED.registration, Purpose.MOSAIC, alike=0.8), [Kind.RELIEF, Kind.ROUGH], [Kind.ROUGH]),
     ],
 )
 def test_what_is_said_aloud(found: Evidence, kinds: list[Kind], said: list[Kind]) -> None:
@@ -60,13 +58,13 @@ def test_what_is_said_aloud(found: Evidence, kinds: list[Kind], said: list[Kind]
 def test_failures_stay_and_what_is_not_said_is_a_detail() -> None:
     given = (Finding(Kind.ERRORS), Finding(Kind.IMAGE_MISFITS, (1,)))
     assert _aloud(given, TURNED) == given
-    (note,) = _aloud([Finding(Kind.PARALLAX, (0, 1), "warning", {"size": 3.0})], SHAPED)
-    assert note == Finding(Kind.PARALLAX, (0, 1), "detail", {"size": 3.0})
+    (note,) = _aloud([Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "warning", {"size": 3.0})], SHAPED)
+    assert note == Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "detail", {"size": 3.0})
 
 
 def test_there_are_a_few_lines_of_a_run_the_gravest_first_and_one_of_a_kind() -> None:
     others = [Kind.UNMASKED, Kind.ZOOMED, Kind.TWO_OF_ONE_LENS, Kind.SETTLED_PATTERN][: rules.MAX_WARNINGS]
-    assert _said(Kind.SECOND_MOTION, *others) == others
+    assert _said(Kind.SHAPE_BENT, *others) == others
     assert _said(others[0], others[0]) == others[:1]
 
 
@@ -74,37 +72,23 @@ def test_every_kind_has_a_sentence_and_every_threshold_its_unit_andsource() -> N
     assert all(limit.unit and limit.source for limit in LIMITS.values())
 
 
-MOTION = SecondMotion((0, 1), 46, 54, (30.0, 40.0), 120.0)
-
-
-def _of_motions(
-    motion: SecondMotion, purpose: Purpose = Purpose.TRAJECTORY, *, clear: bool = True, model: str = "rigid"
-) -> list[tuple[str, str]]:
-    """Severity and words of what is said of a second motion."""
-    given = registration(cameras=(CAMERA,) * 3, model=model)
-    found = evidence(given, purpose, motions=[motion], ambiguous={}, clear=clear)
-    return [(message.severity, message.text) for message in messages_of(rules._second_motion(found), given)]
-
-
 @pytest.mark.parametrize(
-    ("area", "clear", "severity"), [(9, False, None), (11, True, "warning"), (11, False, "failure")]
+    ("purpose", "coarsely", "severity"),
+    [
+        (Purpose.TRAJECTORY, 0.35, ["failure"]),
+        (Purpose.TRAJECTORY, 0.45, []),
+        (Purpose.TRAJECTORY, np.nan, []),
+        (Purpose.MOSAIC, 0.35, []),
+        (Purpose.CALIBRATE, 0.35, []),
+    ],
 )
-def test_of_a_motion_with_an_area_the_pixels_decide(area: int, clear: bool, severity: str | None) -> None:
-    said = _of_motions(replace(MOTION, area=area, plane_area=100 - area), clear=clear)
-    assert [how for how, _ in said] == ([] if severity is None else [severity])
-    assert _of_motions(replace(MOTION, area=area, plane_area=100 - area), purpose=Purpose.MOSAIC, clear=clear) == []
-
-
-def test_the_place_is_named_and_no_distance_is_larger_than_an_image() -> None:
-    ((_, text),) = _of_motions(MOTION)
-    for part in ("46%", "(30, 40) of a.jpg", "b.jpg", "120 pixels", "a mask keeps it out"):
-        assert part in text
-    ((_, text),) = _of_motions(replace(MOTION, disagreement=np.inf))
-    assert "by 500 pixels" in text
-    # Of a turn it is parallax, and it does not spoil the lens.
-    ((severity, text),) = _of_motions(SecondMotion((0, 1), 51, 49, (8.0, 9.0), 40.0), model="rotation")
-    assert (severity, "(parallax)" in text) == ("warning", True)
-    assert [how for how, _ in _of_motions(MOTION, Purpose.CALIBRATE, clear=False)] == ["warning"]
+def test_poses_by_what_fills_less_than_half_of_the_images_are_none(
+    purpose: Purpose, coarsely: float, severity: list[str]
+) -> None:
+    """A truck that drives ahead, say: four fifths of the images lie over each other, and most of that is unlike."""
+    link = replace(_checked(0.1, (0, 1), unique=False), agreement=Agreement(80, 8, 100, coarsely))
+    found = list(rules._rival_motion(evidence(registration(), purpose, checked=[link])))
+    assert [finding.severity for finding in found] == severity
 
 
 def _misfits(count: int, *, agree: float = 0.2, keypoints: tuple[int, ...] = (900, 900, 900)) -> list[Message]:
@@ -173,14 +157,6 @@ def test_images_without_a_mask_among_others_are_named() -> None:
     assert _texts(*masked) == []
     assert _texts(*masked, source("x.png")) == ["1 of 4 images have no mask: x.png"]
     assert _texts(masked[0], source("x.png"), source("y.png")) == ["2 of 3 images have no mask: x.png, y.png"]
-
-
-def test_what_moves_by_no_more_than_tree_tops_rivals_no_plane() -> None:
-    relation = RadialHomography(np.eye(3), CAMERA, CAMERA, np.ones(20, dtype=np.bool_))
-    near, far = (SecondMotion((0, 1), 46, 54, (30.0, 40.0), off, relation) for off in (20.0, 30.0))
-    assert [how for how, _ in _of_motions(far, clear=False)] == ["failure"]
-    assert _of_motions(near, clear=False) == []
-    assert [how for how, _ in _of_motions(near, Purpose.CALIBRATE, clear=False)] == ["warning"]
 
 
 @pytest.mark.parametrize(("doubtful", "severity"), [(True, "warning"), (False, "detail")])

@@ -1,4 +1,4 @@
-"""Camera files of rdstitch itself: the camera as a record, which sidecars and the files of other programs hold too."""
+"""The camera as a record: its own files, which sidecars and the files of other programs hold too."""
 
 import math
 from dataclasses import replace

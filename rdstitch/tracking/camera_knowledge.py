@@ -1,0 +1,143 @@
+"""What a tracker knows of its camera so far: the lens, the focal length, the tilt, and how late attitudes are."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from rdstitch.alignment import Alignment, AlignmentOptions
+from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.arrays import FloatArray
+from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.delays import DELAY_STD, at_delay, change_with_delay
+from rdstitch.robust import EstimationOptions
+from rdstitch.tracking.metric_plane import MetricPlane
+from rdstitch.tracking.placement import CameraPose
+from rdstitch.tracking.shown_camera import judged_focal
+from rdstitch.tracking.tracked_frame import TrackedFrame
+
+_KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of an image of 640 x 480 pixels, over half of it
+_MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
+
+
+@dataclass
+class CameraKnowledge:
+    """Of the camera whose frames are tracked."""
+
+    given: AlignmentOptions
+    pair: EstimationOptions  # with λ, once it is known
+    model: str  # of the motion
+    distortion: float | None
+    distortion_std: float
+    length_std: float = math.nan  # of all lengths, relative
+    given_length_std: float = math.nan  # the same when all frames were given last
+    # of positions, relative to their distance from the first, and of yaw, by a lens that is still estimated
+    shape_std: tuple[float, float] = (0.0, 0.0)
+    focal: float | None = None  # half diagonals: that of the map, whose lengths it determines
+    stated_std: float = 0.0  # of the logarithm of the focal length that was given
+    focal_contradicted: bool = False  # so that it is what the images show
+    delay: float = 0.0  # delay, delay_std: s, of attitudes
+    delay_std: float = DELAY_STD
+    plane: MetricPlane | None = None
+
+    @classmethod
+    def of(cls, given: AlignmentOptions, pair: EstimationOptions) -> Self:
+        """Before the first frame."""
+        return cls(given, pair, given.model, pair.distortion, math.inf if pair.distortion is None else 0.0)
+
+    @property
+    def distortion_known(self) -> bool:
+        """True where λ was given, or is known well enough to be kept."""
+        return self.pair.distortion is not None
+
+    @property
+    def lens_given(self) -> bool:
+        """Whether the cameras of the frames have their lens."""
+        return self.given.lens_known
+
+    def camera_of(self, camera: Camera) -> Camera:
+        """That of a frame with the lens as it is known so far."""
+        if self.lens_given:
+            return camera
+        seen = self.distortion is not None and math.isfinite(self.distortion_std)
+        return camera.with_coefficients((self.distortion or 0.0) if seen else 0.0)
+
+    def given_plane(self, camera: Camera) -> MetricPlane | None:
+        """What is given of the camera, where that suffices for metric poses from the second frame on."""
+        tilt, rigid = self.given.tilt, self.model in ("auto", "rigid")
+        if self.focal_contradicted or not self.is_metric(camera) or not (rigid or self.model == "similarity"):
+            return None
+        assert camera.focal is not None
+        self.focal, self.stated_std = camera.focal / camera.scale, camera.focal_log_std
+        self.length_std, _ = judged_focal(self.stated_std, 0.0, math.inf)
+        self.given_length_std = self.length_std
+        if tilt is None:
+            return None
+        self.model = "rigid" if rigid else "similarity"
+        return MetricPlane(self.focal, tilt, rigid)
+
+    def is_metric(self, camera: Camera) -> bool:
+        """Whether lens and focal length of a camera are given."""
+        return self.lens_given and camera.focal is not None and camera.focal_source in ("option", "file")
+
+    def attitude(self, frame: TrackedFrame) -> tuple[float, float] | None:
+        """(ψ, θ), radians, as measured when the frame was taken."""
+        if frame.attitude is None:
+            return None
+        psi, theta = at_delay(frame.attitude, self.delay).tolist()
+        return psi, theta
+
+    def attitude_std(self, frame: TrackedFrame) -> float:
+        """Its standard deviation, radians, with what the delay leaves open."""
+        assert frame.attitude is not None
+        late = self.delay_std * float(change_with_delay(frame.attitude).max())
+        return math.hypot(self.given.attitudes_std, late)
+
+    def learn(self, alignment: Alignment, keyframes: Sequence[TrackedFrame]) -> None:
+        """Keep what an alignment shows of the camera, for the frames to come."""
+        poses, tilt = alignment.poses, alignment.tilt
+        self.shape_std = (0.0, 0.0)
+        if poses is not None and poses.covariance is not None:
+            path = Trajectory.from_poses(poses)
+            far = np.linalg.norm(path.position, axis=1)
+            last = int(np.argmax(far))
+            if path.covariance is not None and far[last] > 0.0:
+                # Across: along it is what all lengths share.
+                variance = float(np.linalg.eigvalsh(path.covariance[last, :2, :2])[0]) / far[last] ** 2
+                self.shape_std = math.sqrt(max(variance, 0.0)), math.sqrt(float(path.covariance[:, 3, 3].max()))
+        measured = [attitude for keyframe in keyframes if (attitude := self.attitude(keyframe)) is not None]
+        tilts_known = len(measured) == len(keyframes)
+        known = ("rigid", "similarity", *(("tilting",) if tilts_known else ()))
+        if alignment.model in known and poses is not None and tilt and self.focal:
+            mount = np.array(tilt)
+            if tilts_known:
+                mount = np.nanmedian(poses.tilt - np.array(measured), axis=0)
+            given = self.given.tilt is not None
+            tilt_std = None if given else math.sqrt(float(np.trace(alignment.covariance[:2, :2])))
+            rigid = alignment.model == "rigid"
+            self.plane = MetricPlane(self.focal, (float(mount[0]), float(mount[1])), rigid, tilt_std)
+        else:
+            self.plane = None
+        if self.distortion_known:
+            self.model = alignment.model
+        elif self.distortion_std <= _KNOWN_STD and len(keyframes) >= _MIN_KEYFRAMES_FOR_LENS:
+            self.pair = replace(self.pair, distortion=self.distortion, solver="auto")
+            self.model = alignment.model
+
+    def covariance(self, frame: TrackedFrame, pose: CameraPose) -> FloatArray | None:
+        """Of a frame's pose, with what all frames have in common but for the unit of lengths."""
+        known, (relative, yaw_std) = frame.covariance, self.shape_std
+        if known is None:
+            if not relative:
+                return None
+            known = np.zeros((4, 4))
+        far = math.hypot(pose.x, pose.y)
+        if self.plane is not None and not relative:
+            relative = yaw_std = self.plane.bend_std(self.length_std)
+        place = (relative * far) ** 2
+        if frame.attitude is not None:
+            # The foot of the camera is off by the error of its tilt, and so is that of the first frame.
+            place += 2.0 * (pose.height * self.attitude_std(frame)) ** 2
+        return np.asarray(known + np.diag([place, place, 0.0, yaw_std**2]))

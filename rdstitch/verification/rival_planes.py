@@ -1,0 +1,103 @@
+"""Of two motions in the same images, which is that of the plane?
+
+A vehicle ahead, or a part of the robot, has matches that agree with each other, and may have more of them than the
+plane. What contradicts a motion says which is which: something that hardly moves is put over nearly all of the next
+image, and most of that looks different: it fills less than half of the images, for certain. The plane is put over a
+part only, and may fill all that is not seen there.
+"""
+
+import math
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rdstitch.executors import batches
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.matching.match_graph import connected_components
+from rdstitch.matching.two_view import PAIRS_ESTIMATED_AT_ONCE, Pair, PairRegistration
+from rdstitch.results.registration import Registration
+from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
+from rdstitch.verification.limits import limit
+from rdstitch.verification.overlap_check import ComparedImages
+from rdstitch.verification.photometric_agreement import Agreement, overlap_agreement
+
+
+def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRegistration] | None:
+    """Every pair by that of its two strongest motions which may fill more than half of its images.
+
+    Each pair decides for itself: where two motions are about as strong, some pairs were registered by one and some by
+    the other, and no alignment holds both. None where no pair has a motion that fills less.
+    """
+    pairs = [pair for pair in registration.pairs if pair.relation]
+    images = ComparedImages(registration.sources, registration.stretch)
+
+    def fills(pair: Pair, motion: RadialHomography) -> float:
+        first = images.placed(pair[0], motion.camera, motion.homography)
+        return fills_at_most([overlap_agreement(first, images.placed(pair[1], motion.camera2, np.eye(3)))])
+
+    half = limit("filled by a plane")
+    found = {pair.images: (fills(pair.images, pair.relation), pair.relation) for pair in pairs}
+    if all(share >= half for share, _ in found.values()):
+        return None
+    for pair, motion in _second_motions(registration.alignment.cameras, pairs, threshold).items():
+        found[pair] = max(found[pair], (fills(pair, motion), motion), key=lambda each: each[0])
+    needed = _least_needed({pair: share for pair, (share, _) in found.items() if share >= half})
+    return [
+        replace(pair, relation=found[pair.images][1] if found[pair.images][0] >= needed else _no_plane(pair))
+        if pair.images in found
+        else pair
+        for pair in registration.pairs
+    ]
+
+
+def _least_needed(fills: Mapping[Pair, float]) -> float:
+    """The share from which on pairs join all images that all of them join: those of less may show anything."""
+    surest = sorted(fills, key=lambda pair: -fills[pair])
+    images = sorted({k for pair in surest for k in pair})
+    if not images:
+        return math.inf
+
+    def parts(count: int) -> int:
+        firsts, seconds = zip(*surest[:count], strict=True)
+        return len([part for part in connected_components(images[-1] + 1, firsts, seconds) if part[0] in images])
+
+    return fills[surest[bisect_left(range(1, len(surest)), -parts(len(surest)), key=lambda count: -parts(count))]]
+
+
+def _second_motions(
+    cameras: Sequence[Camera], pairs: Sequence[PairRegistration], threshold: float
+) -> Mapping[Pair, RadialHomography]:
+    """Of each pair the motion that most of the matches agree on that its own does not explain, with its own λ: that of
+    a vehicle, whose image hardly changes, says nothing.
+    """
+    result = {}
+    rests = {pair.images: np.flatnonzero(~pair.relation.inliers) for pair in pairs}
+    enough = [pair for pair in pairs if len(rests[pair.images]) >= limit("inliers of a motion")]
+    for batch in batches(enough, PAIRS_ESTIMATED_AT_ONCE):
+        given = []
+        for pair in batch:
+            first, second = (cameras[k] for k in pair.images)
+            camera = first.without_lens().with_focal()
+            matches, other = pair.correspondences.take(rests[pair.images]), camera.resized(second.image_size)
+            given.append(PairMatches(matches.points1, matches.points2, camera, other, -matches.ratio))
+        motions = estimate_radial_homographies(given, EstimationOptions(threshold=threshold))
+        for pair, motion in zip(batch, motions, strict=True):
+            if motion and int(motion.inliers.sum()) >= limit("inliers of a motion"):
+                inliers = np.zeros(len(pair.matches), dtype=np.bool_)
+                inliers[rests[pair.images][motion.inliers]] = True
+                result[pair.images] = replace(motion, inliers=inliers)
+    return result
+
+
+def fills_at_most(compared: Iterable[Agreement]) -> float:
+    """Share of the images of some pairs that is not seen to contradict a motion, in [0, 1]."""
+    agreements = list(compared)
+    return 1.0 - sum(each.unlike for each in agreements) / max(sum(each.in_all for each in agreements), 1)
+
+
+def _no_plane(pair: PairRegistration) -> RadialHomography:
+    relation, reason = pair.relation, "what the two share fills less than half of them (something that moved?)"
+    return RadialHomography.failed(reason, relation.camera, relation.camera2, len(relation.inliers))
