@@ -1,5 +1,6 @@
 """The array types that travel through the library."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -22,7 +23,14 @@ class Rows:
 
     def take(self, rows: NDArray[Any]) -> Self:
         """The rows of some indices, in their order, or of a mask; copies."""
-        return type(self)(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+        columns = (getattr(self, name) for name in self.__dataclass_fields__)
+        return type(self)(*(None if column is None else column[rows] for column in columns))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """The rows of at least one part, one after the other; what is None in the first part is None."""
+        columns = ([getattr(part, name) for part in parts] for name in cls.__dataclass_fields__)
+        return cls(*(None if column[0] is None else np.concatenate(column) for column in columns))
 
     def put(self, rows: NDArray[Any], others: Self) -> None:
         """Replace some rows."""

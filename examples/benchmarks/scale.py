@@ -1,9 +1,10 @@
 """Cost and accuracy by the number of frames: ``python -m examples.benchmarks.scale [COUNT …]``.
 
 A drone's survey of 480 x 360 frames, or of another ``--size``, one lane beside the other, is rendered frame by frame
-into a temporary folder (60 kB a frame) and stitched by one worker in a process of its own. Printed are processor time
-and peak memory by stage, the error of λ, and the median and largest position error of the frames, also as a share of
-the path. Times depend on the machine: only those of one run compare.
+into a temporary folder (60 kB a frame) and stitched by one worker, or ``--workers``, in a process of its own. Printed
+are processor time and peak memory by stage, the error of λ, and the median and largest position error of the frames,
+also as a share of the path; and seconds of the main thread, and their share: with two workers or more, what no further
+one shortens, and the encoder, which works beside them. Times depend on the machine: only those of one run compare.
 
 ``--drawn``: matches are drawn instead of found, and nothing is composited, so that alignment, loop closure, checks by
 matches and local alignment of 10,000 frames take minutes.
@@ -13,6 +14,7 @@ import json
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import thread_time
 from typing import Any, cast
 
 import numpy as np
@@ -68,20 +70,23 @@ def write_frames(sequence: Sequence, order: list[int], folder: Path) -> None:
         write_image(folder / f"frame_{place:05d}.jpg", sequence.frame(index))
 
 
-def measure(folder: Path, sequence: Sequence, order: list[int], *, register_only: bool, drawn: bool) -> dict[str, Any]:
+def measure(
+    folder: Path, sequence: Sequence, order: list[int], workers: int, *, register_only: bool, drawn: bool
+) -> dict[str, Any]:
     """Stitch a folder of rendered frames in this process; what that cost, and how near it came to the truth."""
     drafts = iter(("draft",))
 
     def note(stage: str, done: int, total: int) -> None:
         stages(stage, done, total)
+        serial(stage, done, total)
         peaks(stage, done, total)
 
     count = len(sequence)
     matches = DrawnMatches(sequence, progress=lambda *_: note(next(drafts, "closing loops"), 1, 1))
     pairs = matches.first() if drawn else []
-    stages, peaks, before = StageTimes(), StagePeaks(), processor_time()
+    stages, serial, peaks, before = StageTimes(), StageTimes(thread_time), StagePeaks(), processor_time()
     forget_peak_memory()
-    options = rdstitch.StitchOptions(workers=1, overwrite=True, force=True)
+    options = rdstitch.StitchOptions(workers=workers, overwrite=True, force=True)
     if drawn:
         registration = aligned_by_drawn(matches, pairs, options, note)
     elif register_only:
@@ -106,6 +111,7 @@ def measure(folder: Path, sequence: Sequence, order: list[int], *, register_only
         "median": error.median,
         "path": path,
         "stages": stages.spent,
+        "serial": serial.spent,
         "peaks": peaks.held,
     }
 
@@ -151,6 +157,7 @@ def print_row(row: dict[str, Any], first: dict[str, Any]) -> None:
     for unit, values in (
         ("ms/frame", {stage: 1e3 * taken / count for stage, taken in row["stages"].items()}),
         ("MB", row["peaks"]),
+        (f"main thread, {sum(row['serial'].values()) / row['seconds']:.0%}", row["serial"]),
     ):
         print(f"{'':8s}{unit}: {costliest(values, 6)}", flush=True)
 
@@ -162,12 +169,13 @@ def main(
     shuffled: bool = False,
     register: bool = False,
     drawn: bool = False,
+    workers: int = 1,
     folder: Path | None = None,
 ) -> None:
     """Print the table; or, in a process of its own, one row of it as JSON."""
     if folder is not None:
         sequence, order = survey(counts[0], size, rendered=False), frame_order(counts[0], shuffled)
-        print(json.dumps(measure(folder, sequence, order, register_only=register, drawn=drawn)))
+        print(json.dumps(measure(folder, sequence, order, workers, register_only=register, drawn=drawn)))
         return
     columns = ("s", "ms/frame", "ratio", "MB", "MB/frame", "used", "pairs/fr.", "Δλ", "median", "largest", "% of path")
     widths = (10, 10, 8, 10, 10, 8, 10, 11, 9, 9, 10)
@@ -178,7 +186,7 @@ def main(
             if not drawn:
                 write_frames(survey(count, size), frame_order(count, shuffled), Path(rendered))
             options = ["--shuffled"] * shuffled + ["--register"] * register + ["--drawn"] * drawn
-            row = apart("scale", str(count), "--folder", rendered, "--size", size, *options)
+            row = apart("scale", str(count), "--folder", rendered, "--size", size, "--workers", str(workers), *options)
         first = first or row
         print_row(row, first)
 

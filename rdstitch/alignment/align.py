@@ -18,10 +18,11 @@ from rdstitch.alignment.build_result import AdjustedImages, GivenImages, build_a
 from rdstitch.alignment.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
-from rdstitch.alignment.lens_selection import choose_lens, left_coherence, with_third_coefficient
+from rdstitch.alignment.lens_selection import LensChoice, choose_lens, left_coherence, with_third_coefficient
 from rdstitch.alignment.map_priors import hold_on_map
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, independent_errors
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.priors import CameraPriors
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
@@ -109,56 +110,71 @@ def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
 
 def _chosen(task: GivenImages) -> AdjustedImages:
     """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
-    cameras, links, options = task.cameras, task.links, task.options
-    known = options.camera_priors(cameras)
-    everything, read = _observations(links, cameras, _matches_of_a_link(len(links), options))
-    few = everything.thinned(thin_for_selection(len(links)))
-    votes = vote([k.relation.distortion for k in links], [k.relation.distortion_std for k in links])
-    lens, free_lens = _lens_start(cameras, options, votes)
-    relations = relations_at(few, read, lens)
-    apart = homography_apart(few, relations, lens, free_lens, known)
-    observable = options.lens_known or _observable(apart)
-    given, none = _lens_of(cameras[0]), np.zeros_like(free_lens)
-    may_be_depth = observable and not options.lens_known and len(np.unique([few.image1, few.image2])) <= _FEW_VIEWS
-    held = apart
-    if may_be_depth or not observable:
-        held = homography_apart(few, relations_at(few, read, given), given, none, known)
-    depth = may_be_depth and _is_depth(few, apart, held)
-    observable &= not depth
-    chosen, apart = choose_lens(few, apart if observable else held, options.lenses if observable else (), known)
-    free_lens, lens, relations = chosen.free if observable else none, apart.parameters.lens, apart.homographies
-
-    wrong, confirmed = cycle_consistency(apart, few, len(cameras))
-    del apart, held  # with the derivatives of two images for each link
-    trust = _trust(few, confirmed)
-    whole = Problem(few, relations, trust, len(cameras), options.reference, lens, free_lens, known, min_gain=FEW_GAIN)
+    options, known = task.options, task.options.camera_priors(task.cameras)
+    everything, relations = _observations(task.links, task.cameras, _matches_of_a_link(len(task.links), options))
+    few = everything.thinned(thin_for_selection(len(task.links)))
+    lens = _choose_lens(task, few, relations, known)
+    wrong, confirmed = cycle_consistency(lens.choice.apart, few, len(task.cameras))
+    whole = _all_links(task, few, lens, _trust(few, confirmed), known, wrong)
     problem, images = whole.part(~wrong)
-    if options.reference is None:
-        whole = replace(whole, fixed=int(images[_full_size_reference(problem, [cameras[k] for k in images])]))
-        problem, _ = whole.part(~wrong, images)
     # Data weigh against priors as they will in the final adjustment.
     shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
     problem = replace(problem, overdispersion=shared)
     if (doubt := check_attitudes(problem, options)) is not None:
         without = _chosen(replace(task, options=doubt[0]))
         return replace(without, messages=(doubt[1], *without.messages))
-    choice = select_model(problem, options.models, chosen.refinements, options.purpose)
+    choice = select_model(problem, options.models, lens.choice.refinements, options.purpose)
     choice, images, wrong = _drop_wrong_pairs(whole, problem, images, choice, wrong)
     problem, _ = whole.part(~wrong, images)
     choice = choose_over_relief(problem, choice, options.models, options.purpose)
-    free_lens = choice.fit.free_lens
-    whole = replace(whole, observations=everything, free_lens=free_lens, min_gain=MIN_GAIN)
-    return AdjustedImages(
-        task,
-        images,
-        ~wrong,
-        whole,
-        replace(problem, free_lens=free_lens),
-        choice,
-        chosen.refined(free_lens),
-        observable,
-        depth,
-    )
+    free = choice.fit.free_lens
+    whole = replace(whole, observations=everything, free_lens=free, min_gain=MIN_GAIN)
+    problem, refined = replace(problem, free_lens=free), lens.choice.refined(free)
+    return AdjustedImages(task, images, ~wrong, whole, problem, choice, refined, lens.observable, lens.depth)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lens:
+    """The lens that every link on its own shows."""
+
+    choice: LensChoice
+    free: BoolArray  # (5,): parameters of the lens that are to be estimated
+    observable: bool  # whether λ is, or is known
+    depth: bool  # whether it is not because what few images show has depth
+
+
+def _choose_lens(
+    task: GivenImages, few: Observations, relations: Sequence[RadialHomography], known: CameraPriors
+) -> _Lens:
+    """Every link with a homography of its own: is λ seen, or could it be depth, and which lens is it."""
+    options, none = task.options, np.zeros(len(LENS_STD), dtype=np.bool_)
+    votes = vote([k.relation.distortion for k in task.links], [k.relation.distortion_std for k in task.links])
+    start, free = _lens_start(task.cameras, options, votes)
+    estimated = homography_apart(few, relations_at(few, relations, start), start, free, known)
+    observable, depth = options.lens_known or _observable(estimated), False
+    if not options.lens_known:
+        few_views = len(np.unique([few.image1, few.image2])) <= _FEW_VIEWS
+        if few_views or not observable:
+            given = _lens_of(task.cameras[0])
+            held = homography_apart(few, relations_at(few, relations, given), given, none, known)
+            depth = observable and _is_depth(few, estimated, held)
+            observable &= not depth
+    apart = estimated if observable else held
+    choice = choose_lens(few, apart, options.lenses if observable else (), known)
+    return _Lens(choice, choice.free if observable else none, observable, depth)
+
+
+def _all_links(
+    task: GivenImages, few: Observations, lens: _Lens, trust: FloatArray, known: CameraPriors, wrong: BoolArray
+) -> Problem:
+    """The problem of all images, with the reference that was asked for, or else a good one of those not ``wrong``."""
+    apart, reference = lens.choice.apart, task.options.reference
+    count, start = len(task.cameras), apart.parameters.lens
+    whole = Problem(few, apart.homographies, trust, count, reference, start, lens.free, known, min_gain=FEW_GAIN)
+    if reference is None:
+        problem, images = whole.part(~wrong)
+        reference = int(images[_full_size_reference(problem, [task.cameras[k] for k in images])])
+    return replace(whole, fixed=reference)
 
 
 def _adjusted(chosen: AdjustedImages) -> AdjustedImages:

@@ -57,13 +57,8 @@ def framed_link(link: Link, size: Size) -> Link:
         points1=link.points1 + _margin(one.image_size, size),
         points2=link.points2 + _margin(two.image_size, size),
         relation=replace(
-            relation,
-            homography=second[:, None] * relation.homography / first,
-            camera=camera,
-            camera2=camera2,
+            relation.reexpressed(second[:, None] * relation.homography / first, camera, camera2),
             distortion_std=relation.distortion_std / first[0] ** 2,
-            covariance=np.empty((0, 0)),
-            motion=None,
         ),
     )
 

@@ -107,13 +107,8 @@ def _turned_link(link: Link, cameras: Sequence[Camera], orientations: Sequence[i
         link,
         points1=_turned_points(link.points1, cameras[link.image1], pair[0]),
         points2=_turned_points(link.points2, cameras[link.image2], pair[1]),
-        relation=replace(
-            relation,
-            homography=second @ relation.homography @ first.T,
-            camera=relation.camera.turned(pair[0]),
-            camera2=relation.camera2.turned(pair[1]),
-            covariance=np.empty((0, 0)),
-            motion=None,
+        relation=relation.reexpressed(
+            second @ relation.homography @ first.T, relation.camera.turned(pair[0]), relation.camera2.turned(pair[1])
         ),
     )
 

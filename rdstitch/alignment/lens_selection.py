@@ -52,6 +52,7 @@ class LensChoice:
 
     name: str  # a key of LENSES
     free: BoolArray  # (5,): its parameters among LENS_PARAMETERS
+    apart: BundleAdjustmentResult  # every link on its own with this lens
     reason: str  # one sentence
     # what may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
     # motion that is less regular. That μ is needed only pairs can say: it could stand for relief
@@ -73,14 +74,13 @@ def free_parameters(name: str) -> BoolArray:
 
 def choose_lens(
     observations: Observations, apart: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
-) -> tuple[LensChoice, BundleAdjustmentResult]:
+) -> LensChoice:
     """Choose among lenses, keys of :data:`LENSES` from the simplest; none where the lens is given.
 
-    ``apart`` is every link on its own with a homography, and λ free unless the lens is given. Returned with the lens is
-    the same with that lens.
+    ``apart`` is every link on its own with a homography, and λ free unless the lens is given.
     """
     if not names:
-        return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), "given"), apart
+        return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")
     if len(names) > 1 and len(observations) > _ENOUGH_LINKS:
         return _choose_by_some(observations, apart, names, known)
     images = _images(observations)
@@ -93,7 +93,7 @@ def choose_lens(
         return homography_apart(observations, start.homographies, start.parameters.lens, free, known)
 
     if len(names) == 1:
-        return LensChoice(names[0], free[0], "as requested"), apart if names[0] == "division" else fit(free[0], apart)
+        return LensChoice(names[0], free[0], apart if names[0] == "division" else fit(free[0], apart), "as requested")
     fits, best = [apart], 0
     for index, name in enumerate(names[1:], start=1):
         if name == "division3" and names[best] != "division2":
@@ -108,20 +108,20 @@ def choose_lens(
     if few:
         reason += "; too few images to find the distortion centre, which is taken to be the middle"
     refinements = (CENTER,) if best == 0 and images >= _ENOUGH_IMAGES_OF_A_MOTION else ()
-    return LensChoice(names[best], free[best], reason, refinements), fits[best]
+    return LensChoice(names[best], free[best], fits[best], reason, refinements)
 
 
 def _choose_by_some(
     observations: Observations, apart: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
-) -> tuple[LensChoice, BundleAdjustmentResult]:
+) -> LensChoice:
     """The lens that evenly chosen links show, and every link on its own with it."""
     start, simplest = apart.parameters.lens, free_parameters("division")
     some = np.arange(0, len(observations), -(-len(observations) // _ENOUGH_LINKS))
     few = observations.subset(some)
-    choice, _ = choose_lens(few, homography_apart(few, apart.homographies[some], start, simplest, known), names, known)
+    choice = choose_lens(few, homography_apart(few, apart.homographies[some], start, simplest, known), names, known)
     if (choice.free != simplest).any():
         apart = homography_apart(observations, apart.homographies, start, choice.free, known)
-    return choice, apart
+    return replace(choice, apart=apart)
 
 
 def _images(observations: Observations) -> int:

@@ -18,7 +18,7 @@ from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
-from rdstitch.robust.posterior import Evidence
+from rdstitch.robust.posterior import Evidence, overlap_cells
 
 _CELLS = (2, 3, 4)
 """Cells per side of a link's overlap within which errors are added up; the worst counts."""
@@ -113,12 +113,8 @@ def _sample(observations: Observations, inliers: BoolArray) -> IntArray:
 
 def _overdispersion(link: IntArray, points: FloatArray, residual: FloatArray, count: int, cells: int) -> float:
     """Mean over the cells of all links of ``|Σ r|² / Σ |r|²``."""
-    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    np.minimum.at(low, link, points)
-    np.maximum.at(high, link, points)
-    place = (points - low[link]) / np.maximum(high - low, 1e-12)[link]
-    cell = np.minimum((place * cells).astype(np.intp), cells - 1)
-    number = (link * cells + cell[:, 0]) * cells + cell[:, 1]
+    x, y = overlap_cells(link, points, count, cells)
+    number = (link * cells + x) * cells + y
     size = count * cells**2
     sums = np.stack([np.bincount(number, residual[:, axis], size) for axis in range(2)], axis=1)
     power = np.bincount(number, np.einsum("mi,mi->m", residual, residual), size)

@@ -39,18 +39,17 @@ class Observations:
     relief: FloatArray | None = None
 
     @classmethod
-    def from_links(cls, links: Sequence[Link], cameras: Sequence[Camera], most: int | None = None) -> Self:
-        """Of each link at most about ``most`` correspondences, well spread over its overlap."""
-        thinned = [link.thinned(most) for link in links]
+    def from_links(cls, links: Sequence[Link], cameras: Sequence[Camera]) -> Self:
+        """The points of links, normalized by the cameras of their images."""
         sizes = [camera.scale for camera in cameras]
         index1, index2 = np.array([(link.image1, link.image2) for link in links], dtype=np.intp).reshape(-1, 2).T
         empty = [np.empty((0, 2))]
         return cls(
             index1,
             index2,
-            np.concatenate([[0], np.cumsum([len(link.points1) for link in thinned])]).astype(np.intp),
-            np.concatenate(empty + [cameras[link.image1].normalize(link.points1) for link in thinned]),
-            np.concatenate(empty + [cameras[link.image2].normalize(link.points2) for link in thinned]),
+            np.concatenate([[0], np.cumsum([len(link.points1) for link in links])]).astype(np.intp),
+            np.concatenate(empty + [cameras[link.image1].normalize(link.points1) for link in links]),
+            np.concatenate(empty + [cameras[link.image2].normalize(link.points2) for link in links]),
             np.array([sizes[i] for i in index1]),
             np.array([sizes[j] for j in index2]),
             np.array([len(link) for link in links], dtype=np.intp),

@@ -26,6 +26,7 @@ from rdstitch.alignment.select import Posterior
 from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.choices import Purpose
+from rdstitch.robust.covariance import enlarged
 from rdstitch.robust.posterior import EXACTNESS, LENS
 
 _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
@@ -112,12 +113,8 @@ def _at_least(covariance: FloatArray, least: FloatArray) -> FloatArray:
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     values = np.maximum(values, _SINGULAR)
-    # In the basis where the first is the identity, the larger of the two is a matter of eigenvalues.
     root, inverse = vectors * np.sqrt(values) * scale[:, None], vectors / np.sqrt(values) / scale[:, None]
-    spread, directions = np.linalg.eigh(inverse.T @ least @ inverse)
-    root = root @ (directions * np.sqrt(np.maximum(spread, 1.0)))
-    larger: FloatArray = root @ root.T
-    return larger
+    return enlarged(root, inverse.T @ least @ inverse)
 
 
 def _by_keypoints(observations: Observations, influence: FloatArray) -> FloatArray:

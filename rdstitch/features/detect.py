@@ -77,9 +77,7 @@ def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
     most, megapixels = options.limits
     image, detection, usable = _look(source, options, megapixels)
     shown, few = len(usable), len(usable) < _MIN_KEYPOINT_SHARE * most
-    # Differences of grey levels are divided by the most that equalization multiplies them by.
-    weaker = np.rint(image.grey / CLIP_LIMIT).astype(np.uint8)
-    faint = few and len(_usable(image, find(weaker, options))) <= _LASTING * shown
+    faint = few and len(_usable(image, find(_weakened(image.grey), options))) <= _LASTING * shown
     if megapixels is not None and image.reduced and few:
         image, detection, usable = _look(source, options, CLOSER * megapixels)
     points, response = detection.points[usable], detection.response[usable]
@@ -94,6 +92,11 @@ def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
     scale = features.scale * float(np.sqrt(image.factor.prod()))
     points = image.to_full_size(features.points)
     return replace(features, points=points, scale=scale, image_size=image.full_size, shown=shown, faint=faint)
+
+
+def _weakened(grey: PixelArray) -> PixelArray:
+    """With differences of grey levels divided by the most that equalization multiplies them by."""
+    return np.rint(grey / CLIP_LIMIT).astype(np.uint8)
 
 
 def _look(

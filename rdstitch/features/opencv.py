@@ -8,6 +8,7 @@ ones are those of the image at half its size, and so on.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from operator import attrgetter
 from typing import Any, Self, cast
 
 import cv2
@@ -123,7 +124,7 @@ def _table(keypoints: Sequence[cv2.KeyPoint], *names: str) -> FloatArray:
     if len(keypoints):
         table[:, :2] = cv2.KeyPoint.convert(keypoints)
     for column, name in enumerate(names, start=2):
-        table[:, column] = [getattr(keypoint, name) for keypoint in keypoints]
+        table[:, column] = np.fromiter(map(attrgetter(name), keypoints), np.float64, len(keypoints))
     return table
 
 

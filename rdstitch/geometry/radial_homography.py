@@ -6,7 +6,7 @@ adjustment are both built on.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -277,6 +277,11 @@ class RadialHomography:
         none = np.zeros(count, dtype=np.bool_)
         h = np.full((3, 3), np.nan)
         return cls(h, camera, camera2, none, iterations=iterations, reason=reason, ok=False)
+
+    def reexpressed(self, homography: FloatArray, camera: Camera, camera2: Camera) -> Self:
+        """The same relation in other frames of the images, without covariance and motion, which were of those."""
+        none = np.empty((0, 0))
+        return replace(self, homography=homography, camera=camera, camera2=camera2, covariance=none, motion=None)
 
     def __repr__(self) -> str:
         if not self.ok:

@@ -1,4 +1,4 @@
-"""Files in and out: images with their metadata, sidecars, and nothing half-written."""
+"""Images in and out, with their metadata, and nothing half-written."""
 
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.io.attitude import Attitude

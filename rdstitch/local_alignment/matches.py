@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, Rows
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
@@ -73,7 +73,7 @@ class ImagesOnSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedMatches:
+class PlacedMatches(Rows):
     """Matches of one pair of images, or of many, one pair after the other."""
 
     images: NDArray[np.intp]  # (M, 2): the two images of each match
@@ -84,10 +84,10 @@ class PlacedMatches:
         return len(self.images)
 
     @classmethod
-    def join(cls, parts: Iterable["PlacedMatches"]) -> Self:
+    def join(cls, parts: Iterable[Self]) -> Self:
         """All of them, one after the other."""
-        every = list(parts) or [cls(np.empty((0, 2), np.intp), np.empty((0, 2, 2)), np.empty((0, 2, 2)))]
-        return cls(*(np.concatenate([getattr(p, name) for p in every]) for name in ("images", "points", "places")))
+        none = cls(np.empty((0, 2), np.intp), np.empty((0, 2, 2)), np.empty((0, 2, 2)))
+        return cls.concatenate(list(parts) or [none])
 
     @cached_property
     def residual(self) -> FloatArray:
@@ -122,10 +122,6 @@ class PlacedMatches:
         """At most about so many of them, evenly, and no fewer than a few."""
         count = min(len(self), max(most, _MIN_MATCHES))
         return self if count == len(self) else self.take(np.linspace(0, len(self) - 1, count).astype(np.intp))
-
-    def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "PlacedMatches":
-        """A part of them."""
-        return PlacedMatches(self.images[chosen], self.points[chosen], self.places[chosen])
 
 
 def place_matches(matches: Iterable[Match], images: ImagesOnSurface) -> Iterator[PlacedMatches]:

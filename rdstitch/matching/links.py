@@ -58,23 +58,9 @@ class Link:
 
     def reversed(self) -> Self:
         """The same correspondences, from the second image to the first."""
-        relation = self.relation
-        relation = replace(
-            relation,
-            homography=inverses(relation.homography[None])[0],
-            camera=relation.camera2,
-            camera2=relation.camera,
-            covariance=np.empty((0, 0)),
-            motion=None,
-        )
-        return replace(
-            self,
-            image1=self.image2,
-            image2=self.image1,
-            points1=self.points2,
-            points2=self.points1,
-            relation=relation,
-        )
+        one, two = self.relation.camera, self.relation.camera2
+        back = self.relation.reexpressed(inverses(self.relation.homography[None])[0], two, one)
+        return type(self)(self.image2, self.image1, self.points2, self.points1, back, self.count)
 
     def thinned(self, most: int | None) -> Self:
         """About ``most`` of the correspondences at the most, well spread over the overlap; the number stays."""

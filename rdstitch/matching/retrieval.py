@@ -26,7 +26,6 @@ _TRAINING_PER_BRANCH = 50
 _ROUNDS = 3  # of Lloyd's algorithm
 _SHORTLIST = 40  # most similar images of each that are considered further
 _SHARED_NEIGHBOURS = 10  # most similar images of each that two images may have in common
-_SHARED_NEIGHBOUR_WEIGHT = 1.0  # weight of having all neighbours in common, in units of the usual best similarity
 _SEQUENCE_RANK = 0.75  # share of the other images that are less alike than the next one where the order means something
 _MIN_SEQUENTIAL_SHARE = 0.5  # share of the images of which that is true of the next one; a quarter by chance
 _BLOCK = 8192  # descriptors assigned at a time
@@ -166,9 +165,8 @@ def _with_shared_neighbours(best: IntArray, excess: FloatArray) -> "sparse.csr_a
     """Similarities (N, N), raised where images are alike to the same others."""
     direct = _symmetric(best, excess)
     neighbours = _unit_rows(_symmetric(best[:, :_SHARED_NEIGHBOURS], excess[:, :_SHARED_NEIGHBOURS]))
-    return sparse.csr_array(
-        direct + _SHARED_NEIGHBOUR_WEIGHT * float(np.mean(excess[:, 0])) * (neighbours @ neighbours.T)
-    )
+    # To have all neighbours in common counts as much as the usual best similarity.
+    return sparse.csr_array(direct + float(np.mean(excess[:, 0])) * (neighbours @ neighbours.T))
 
 
 def _symmetric(columns: IntArray, values: FloatArray) -> "sparse.csr_array":

@@ -259,6 +259,7 @@ class Tracker:
     ) -> None:
         self._options, self._poses = options or StitchOptions(), poses or FollowedPoses()
         self._detection = _live_features(self._options.features)
+        self._megapixels = self._detection.limits[1]
         given = self._options.odometry
         for file in (
             self._options.attitude,
@@ -332,7 +333,7 @@ class Tracker:
         sources, unread = read_frames([frame], options, skip_bad=True)
         if not sources:
             return None, None, unread[0].text
-        source, megapixels = replace(sources[0], attitude=attitude), features.limits[1]
+        source, megapixels = replace(sources[0], attitude=attitude), self._megapixels
         try:
             (source,) = self._measured(source)
             view = source.view(megapixels)
@@ -360,7 +361,7 @@ class Tracker:
         if source is None or image is None:
             return [label]
         label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))
-        camera = at_working_size(source.camera, self._detection.limits[1])
+        camera = at_working_size(source.camera, self._megapixels)
         attitude = source.attitude_by_delay
         if attitude is None and source.attitude is not None:
             attitude = np.tile(source.attitude, (len(DELAYS), 1))

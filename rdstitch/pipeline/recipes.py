@@ -32,7 +32,6 @@ from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, told_once
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.sidecar.write import sidecar
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_not_read, check_outputs, json_bytes, text_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent
@@ -328,6 +327,8 @@ def compose_registration(chosen: LaidOut, run: Run, outputs: Outputs, executor: 
     result = result.with_messages(stage_beside(run, outputs, result))
     if run.output is not None:
         # Last: whoever finds it finds what it belongs to.
+        from rdstitch.sidecar.write import sidecar  # and with it the forms of camera files, which no picture needs
+
         outputs.write(f"{run.output}.json", json_bytes(sidecar(result)))
     return result
 

@@ -31,17 +31,25 @@ def covariances(
     usable, values, vectors, scale = usable[determined], values[determined], vectors[determined], scale[determined]
     if not len(usable):
         return result
-    # In the basis where noise² A⁻¹ is the identity, the larger of the two is a matter of eigenvalues.
+    # In the basis of this root noise² A⁻¹ is the identity.
     root = (vectors / np.sqrt(values)[:, None]) / scale[:, :, None]
     of_cells, pair = _summed_over_cells(influence[usable], data.x1[usable])
     starts = np.searchsorted(pair, np.arange(len(usable)))
     outer = np.add.reduceat(of_cells[:, :, None] * of_cells[:, None], starts, axis=0)
     turn = chain[usable] @ root
     clustered = np.swapaxes(turn, 1, 2) @ (outer / (noise[usable] ** 2)[:, None, None]) @ turn
-    spread, directions = np.linalg.eigh(clustered)
-    root = root @ (directions * np.sqrt(np.maximum(spread, 1.0))[:, None])
-    result[usable] = (noise[usable] ** 2)[:, None, None] * (root @ np.swapaxes(root, 1, 2))
+    result[usable] = (noise[usable] ** 2)[:, None, None] * enlarged(root, clustered)
     return result
+
+
+def enlarged(root: FloatArray, other: FloatArray) -> FloatArray:
+    """Covariances ``R R'`` (..., P, P), in no direction less than others, which are given in the basis of R.
+
+    There the first are the identity, so that the larger of the two is a matter of eigenvalues.
+    """
+    spread, directions = np.linalg.eigh(other)
+    larger = root @ (directions * np.sqrt(np.maximum(spread, 1.0))[..., None, :])
+    return np.asarray(larger @ np.swapaxes(larger, -1, -2))
 
 
 def _summed_over_cells(values: FloatArray, points: FloatArray) -> tuple[FloatArray, IntArray]:

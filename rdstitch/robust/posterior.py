@@ -163,6 +163,16 @@ WRONG_GIVEN_FOCAL = 0.02, 0.2
 TILT = Prior(((0.8, 0.0, math.radians(20.0)), (0.2, 0.0, math.radians(45.0))))
 
 
+def overlap_cells(link: IntArray, points: FloatArray, count: int, side: int) -> tuple[IntArray, IntArray]:
+    """Column and row (M,) of each point (M, 2) among ``side`` cells a side of the overlap of its link, of ``count``."""
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, link, points)
+    np.maximum.at(high, link, points)
+    place = (points - low[link]) / np.maximum(high - low, 1e-12)[link]
+    x, y = np.minimum((place * side).astype(np.intp), side - 1).T
+    return x, y
+
+
 @dataclass(frozen=True, eq=False)
 class ErrorCost:
     """What the errors of G problems say of a hypothesis, each array (G,)."""
@@ -199,11 +209,7 @@ class Evidence:
 
         ``noise``, half diagonals ``scale`` in pixels, and ``weight`` are those of each problem.
         """
-        low, high = np.full((len(group), 2), np.inf), np.full((len(group), 2), -np.inf)
-        np.minimum.at(low, link, points)
-        np.maximum.at(high, link, points)
-        place = (points - low[link]) / np.maximum(high - low, 1e-12)[link]
-        x, y = np.minimum((place * _SIDE).astype(np.intp), _SIDE - 1).T
+        x, y = overlap_cells(link, points, len(group), _SIDE)
         numbers, cell = np.unique((link * _SIDE + x) * _SIDE + y, return_inverse=True)
         in_link, x, y = numbers // _SIDE**2, numbers // _SIDE % _SIDE // 2, numbers % _SIDE // 2
         blocks, block = np.unique((in_link * 2 + x) * 2 + y, return_inverse=True)

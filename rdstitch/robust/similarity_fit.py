@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, evenly_spaced
+from rdstitch.robust.loss import robust_weight
 
 OUTLYING = 3.0
 """Standard deviations from which on a point is an outlier."""
@@ -47,7 +48,7 @@ def fit_similarity(source: Points, target: Points, std: float) -> SimilarityFit:
     best = int(np.argmin(np.minimum(residuals, width).sum(axis=1)))
     away = residuals[best]
     for _ in range(_ROUNDS):
-        weights = 1.0 / (1.0 + (away / width) ** 2) ** 2
+        weights = robust_weight(away**2, width)
         a, b = np.average(source, weights=weights), np.average(target, weights=weights)
         power = float(np.vdot(source - a, weights * (source - a)).real)
         fitted = complex(np.vdot(source - a, weights * (target - b)) / max(power, 1e-300))

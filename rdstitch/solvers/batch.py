@@ -49,12 +49,4 @@ def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int
             points = np.ascontiguousarray(np.stack([a[block].T, b[block].T], axis=1))
             part = solve(points, index[block])
             parts.append(replace(part, sample=index[part.sample + start]))
-    if len(parts) < 2:
-        return parts[0] if parts else Solutions.empty()
-    focal = [part.focal for part in parts if part.focal is not None]
-    return Solutions(
-        np.concatenate([part.sample for part in parts]),
-        np.concatenate([part.homography for part in parts]),
-        np.concatenate([part.distortion for part in parts]),
-        None if not focal else np.concatenate(focal),
-    )
+    return Solutions.concatenate(parts) if parts else Solutions.empty()

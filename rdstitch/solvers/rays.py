@@ -86,15 +86,6 @@ def rotation_of_two(bundle: FloatArray) -> FloatArray:
     return rotation
 
 
-def rotation_of_many(bundle: FloatArray) -> FloatArray:
-    """The least-squares rotations (b, 3, 3) of unit rays (3, 2, k, b), by Kabsch's singular value decomposition."""
-    correlation = np.einsum("ikb,jkb->bij", bundle[:, 1], bundle[:, 0])
-    left, _, right = np.linalg.svd(correlation)
-    left[..., 2] *= np.where(np.linalg.det(left @ right) < 0.0, -1.0, 1.0)[:, None]
-    rotation: FloatArray = left @ right
-    return rotation
-
-
 def with_focal(rotation: FloatArray, focal: FloatArray) -> FloatArray:
     """``K R K⁻¹``, ``K = diag(g, g, 1)``, of rotations (b, 3, 3) and focal lengths (b,)."""
     k = np.stack([focal, focal, np.ones_like(focal)], axis=-1)

@@ -6,12 +6,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, Rows
 from rdstitch.errors import ArgumentError
 
 
 @dataclass(frozen=True, eq=False)
-class Solutions:
+class Solutions(Rows):
     """All solutions of a batch of samples; a sample may have none or several.
 
     Attributes

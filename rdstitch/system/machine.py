@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 _UNKNOWN = 2 * 2**30  # bytes, where the system does not say how much memory is available
@@ -25,6 +26,7 @@ def available_memory() -> int:
     return min([_memory(_SYSTEM, "MemAvailable:"), *_group_memory(_SYSTEM)])
 
 
+@cache
 def memory_size() -> int:
     """Bytes that the machine has, or that the control groups of this process may take."""
     return min([_memory(_SYSTEM, "MemTotal:"), *_group_memory(_SYSTEM, in_use=False)])

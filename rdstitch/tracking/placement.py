@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -37,7 +38,7 @@ class Placement:
         """Map points (N, 2) of the image, pixels, to the plane."""
         return to_plane(self.camera, self.homography, points)
 
-    @property
+    @cached_property
     def pose(self) -> CameraPose | None:
         """Pose of the camera over the plane; None where its focal length is not known.
 

@@ -108,7 +108,11 @@ def _plain_frame(grey: Grey) -> NDArray[np.bool_]:
     frame = np.zeros_like(grey, dtype=np.bool_)
     for image, masked in ((grey, frame), (grey.T, frame.T)):
         inside = ~masked.all(axis=0)
-        texture = np.array([row[np.isfinite(row)].std() if np.isfinite(row).any() else 0.0 for row in image[:, inside]])
+        rows = image[:, inside].astype(np.float64)
+        known = np.isfinite(rows)
+        count = np.maximum(known.sum(axis=1), 1)
+        apart = np.where(known, rows - np.where(known, rows, 0.0).sum(axis=1, keepdims=True) / count[:, None], 0.0)
+        texture = np.sqrt((apart**2).sum(axis=1) / count)
         shown = np.flatnonzero(texture > _PLAIN * np.median(texture))
         if len(shown) and len(shown) < len(image):
             first, last = shown[[0, -1]]

@@ -9,6 +9,8 @@ from PIL import Image
 import rdstitch
 from examples.worlds.drone_xmp import euler_angles, xmp_of
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.exif_orientation import turning_matrix
+from rdstitch.geometry.planar_motion import turned_tilt
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 from tests.cli.running import CACHED, Run
 from tests.sampled import sampled
@@ -65,7 +67,9 @@ def test_measured_tilts_are_used_as_those_of_the_camera_whatever_exif_turns(
     assert registration.alignment.used.all()
     assert registration.alignment.model != "homography"
     assert abs(registration.alignment.distortion - LENS.distortion) < 0.005
-    difference = np.degrees(registration.alignment.poses.tilt - windy.poses.tilt)
+    true = zip(windy.poses.tilt.tolist(), orientations, strict=True)
+    upright = [turned_tilt((psi, theta), turning_matrix(orientation)) for (psi, theta), orientation in true]
+    difference = np.degrees(registration.alignment.poses.tilt - upright)
     assert np.abs(difference).max() < (0.01 if std == 0.0 else 1.0)
     assert len(trajectory.position) == len(paths)
     turn = np.degrees(trajectory.yaw - windy.poses.yaw)

@@ -95,7 +95,7 @@ def test_same_bytes_of_one_and_four_workers(
             handed.add(getattr(fn, "func", fn).__name__)
             return super().submit(fn, *args, **kwargs)
 
-    monkeypatch.setattr("rdstitch.options.stitch_options.open_executor", lambda workers, *_, **__: Recording(workers))
+    monkeypatch.setattr("rdstitch.pipeline.run.open_executor", lambda workers, *_, **__: Recording(workers))
     outputs = []
     for workers in (1, 4):
         outputs.append(tmp_path / str(workers) / "out.png")

@@ -10,7 +10,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.plane import lens_range
-from rdstitch.solvers.rays import RayPairs, rotation_of_many, turned_solutions
+from rdstitch.solvers.rays import RayPairs, turned_solutions
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
 
@@ -69,7 +69,7 @@ def rotation_three_point(
         focal2 = polished(pairs, distortion, common_root(*cubics(pairs, distortion)))
         possible = (focal2 > low * low) & (focal2 < high * high) & pairs.same_side(distortion, focal2)
         index, distortion, focal2 = index[possible], distortion[possible], focal2[possible]
-        return turned_solutions(np.take(points, index, axis=-1), index, distortion, np.sqrt(focal2), rotation_of_many)
+        return turned_solutions(np.take(points, index, axis=-1), index, distortion, np.sqrt(focal2), _rotation_of_many)
 
     return solve_in_blocks(solve, x1, x2, 3)
 
@@ -141,3 +141,12 @@ def polished(pairs: RayPairs, distortion: FloatArray, focal2: FloatArray) -> Flo
     slope = f[:, 1] + focal2 * (2.0 * f[:, 2] + focal2 * 3.0 * f[:, 3])
     step = (value * slope).sum(axis=0) / (slope * slope).sum(axis=0)
     return np.where(np.abs(step) < 0.01 * np.abs(focal2), focal2 - step, focal2)
+
+
+def _rotation_of_many(bundle: FloatArray) -> FloatArray:
+    """The least-squares rotations (b, 3, 3) of unit rays (3, 2, k, b), by Kabsch's singular value decomposition."""
+    correlation = np.einsum("ikb,jkb->bij", bundle[:, 1], bundle[:, 0])
+    left, _, right = np.linalg.svd(correlation)
+    left[..., 2] *= np.where(np.linalg.det(left @ right) < 0.0, -1.0, 1.0)[:, None]
+    rotation: FloatArray = left @ right
+    return rotation

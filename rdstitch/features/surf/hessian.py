@@ -12,8 +12,7 @@ a level of the pyramid that is just finer than the patch stands for the box sums
 from the integral image would alias.
 """
 
-from dataclasses import dataclass, fields, replace
-from typing import Self
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -97,11 +96,6 @@ class Blobs(Rows):
     def scale(self) -> FloatArray:
         """The s of the paper, pixels, shape (N,)."""
         return self.size * SIGMA_PER_SIZE
-
-    @classmethod
-    def concatenate(cls, parts: list[Self]) -> Self:
-        """All blobs of at least one part."""
-        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
 
 def find_blobs(grey: Grey, threshold: float, octaves: int, layers: int) -> Blobs:

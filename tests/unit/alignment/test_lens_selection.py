@@ -18,7 +18,7 @@ from rdstitch.alignment.lens_selection import LensChoice, free_parameters
 from rdstitch.alignment.observations import Observations
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
-from tests.alignment_stubs import independent_errors, observations
+from tests.alignment_stubs import adjusted, independent_errors, observations
 from tests.sampled import sampled
 
 OFF_CENTRE = Camera(SIZE, -0.25, 0.0, (339.0, 229.0))
@@ -202,7 +202,7 @@ BASE = np.full(540, 1.0)
     ],
 )
 def test_a_lens_with_more_freed_is_the_next_that_has_it_all(freed: list[int], name: str) -> None:
-    plain = LensChoice("division", free_parameters("division"), "enough")
+    plain = LensChoice("division", free_parameters("division"), adjusted(SEEN, BASE), "enough")
     found = plain.refined(np.array(freed, dtype=np.bool_))
     assert found.name == name
     assert (found.free == np.array(freed, dtype=np.bool_)).all()
@@ -217,13 +217,13 @@ def test_all_images_together_show_a_third_coefficient_that_pairs_do_not(monkeypa
     given = lens_scene(replace(FISHEYE, distortion2=-0.03, distortion3=-0.03), 0)
     chosen = []
 
-    def choose(seen: Observations, apart: Any, names: object, known: Any) -> tuple[LensChoice, Any]:
+    def choose(seen: Observations, apart: Any, names: object, known: Any) -> LensChoice:
         chosen.append(lens_selection.choose_lens(seen, apart, ["division", "division2"], known))
         return chosen[-1]
 
     monkeypatch.setattr(align_module, "choose_lens", choose)
     found, simpler = aligned(given), aligned(given, lens="division2")
-    assert chosen[0][0].name == "division2"
+    assert chosen[0].name == "division2"
     assert found.lens == "division3"
     assert "distortion3" in found.parameters
     truth = replace(FISHEYE, distortion2=-0.03, distortion3=-0.03)
