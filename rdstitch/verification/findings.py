@@ -52,8 +52,8 @@ class Kind(Enum):
         Scope.WHOLE,
         "relief",
         (
-            "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels: the ground"
-            " is rough"
+            "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels, most of all "
+            "{both}: the ground is rough"
         ),
     )
     RELIEF = (

@@ -88,7 +88,7 @@ def _errors(evidence: Evidence) -> Iterator[Finding]:
     )
     values = {"rms": rms, "threshold": threshold}
     if rough or evidence.purpose.picture:
-        yield Finding(Kind.ROUGH, (), "warning", values)
+        yield Finding(Kind.ROUGH, max(evidence.used, key=lambda fit: fit.rms).images, "warning", values)
     else:
         yield Finding(Kind.ERRORS, values=values)
 
