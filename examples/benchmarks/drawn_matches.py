@@ -22,7 +22,7 @@ from rdstitch.synthetic import Sequence
 from rdstitch.synthetic.lenses import focal_length
 from rdstitch.synthetic.poses import pixels_of_texels, plane_outline
 from rdstitch.system.cache import Cache
-from rdstitch.system.progress import silent
+from rdstitch.system.progress import Progress, silent
 
 _KEYPOINTS = 400  # of an image
 _NOISE = 0.25  # pixels
@@ -39,7 +39,7 @@ class DrawnMatches:
 
     sequence: Sequence
     store: Cache = field(default_factory=Cache.for_this_run)
-    progress = staticmethod(silent)
+    progress: Progress = silent
 
     @cached_property
     def keypoints(self) -> list[tuple[IntArray, FloatArray]]:

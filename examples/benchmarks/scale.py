@@ -32,7 +32,7 @@ from rdstitch.io import DecodedImage, Metadata
 from rdstitch.io.write import write_image
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.pipeline.aligner import Aligner, close_loops
+from rdstitch.pipeline.aligner import Aligner, draft_with_loops
 from rdstitch.pipeline.placed_images import align_registration_locally
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.registration import Registration
@@ -74,16 +74,18 @@ def measure(
     folder: Path, sequence: Sequence, order: list[int], workers: int, *, register_only: bool, drawn: bool
 ) -> dict[str, Any]:
     """Stitch a folder of rendered frames in this process; what that cost, and how near it came to the truth."""
-    count, matches = len(sequence), DrawnMatches(sequence)
-    pairs = matches.first() if drawn else []
-    stages, serial, peaks, before = StageTimes(), StageTimes(thread_time), StagePeaks(), processor_time()
-    forget_peak_memory()
+    drafts = iter(("draft",))
 
     def note(stage: str, done: int, total: int) -> None:
         stages(stage, done, total)
         serial(stage, done, total)
         peaks(stage, done, total)
 
+    count = len(sequence)
+    matches = DrawnMatches(sequence, progress=lambda *_: note(next(drafts, "closing loops"), 1, 1))
+    pairs = matches.first() if drawn else []
+    stages, serial, peaks, before = StageTimes(), StageTimes(thread_time), StagePeaks(), processor_time()
+    forget_peak_memory()
     options = rdstitch.StitchOptions(workers=workers, overwrite=True, force=True)
     if drawn:
         registration = aligned_by_drawn(matches, pairs, options, note)
@@ -124,9 +126,7 @@ def aligned_by_drawn(
     sources = read_sources(frames, skip_bad=False)[0]
     options = options.for_images(count)
     aligner = Aligner.of(sources, options, Cache())
-    aligned = aligner.draft(pairs)
-    note("draft", 1, 1)
-    aligned = close_loops(aligner, cast(Pairing, matches), aligned, matches.pairs)
+    aligned = draft_with_loops(aligner, cast(Pairing, matches), pairs, matches.pairs)
     note("closing loops", 1, 1)
     aligned = aligner.completed(aligned)
     note("aligning", 1, 1)

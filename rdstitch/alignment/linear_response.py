@@ -13,7 +13,7 @@ import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
 from rdstitch.alignment.link_equations import LinearizedErrors, linearized_errors
-from rdstitch.alignment.normal_equations import SparseNormalEquations, link_derivatives, sums_by_image
+from rdstitch.alignment.normal_equations import SparseNormalEquations, link_derivatives
 from rdstitch.arrays import FloatArray
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_slope, robust_weight
 
@@ -49,8 +49,8 @@ class LinearResponse:
 
     def steps_of(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray]:
         """Steps of poses (N, D, C) and shared parameters (S, C) when the errors change by so many ``fields``."""
-        observations, free = self.adjuster.observations, self.adjuster.free.poses
-        start, pair, of_poses = observations.start, 2 * free.shape[1], np.zeros((*free.shape, columns))
+        o, (count, size) = self.adjuster.observations, self.adjuster.free.poses.shape
+        start, of_poses = o.start, np.zeros((count, size, columns))
         of_shared = np.zeros((len(self.normal.gradient_shared), columns))
         for part in self.parts():
             weighted = fields(part) * (self.curvature * self.weight[part.rows])[:, None, None]
@@ -61,8 +61,9 @@ class LinearResponse:
                 jacobian = part.jacobian[rows].reshape(-1, derivative.shape[1])
                 answers[link - part.first] = jacobian.T @ weighted[rows].reshape(-1, columns)
             local = np.swapaxes(derivative, 1, 2) @ answers
-            of_poses += sums_by_image(free, observations, slice(part.first, part.last), local[:, :pair])
-            of_shared += local[:, pair:].sum(axis=0)
+            for k, images in enumerate((o.image1, o.image2)):
+                np.add.at(of_poses, images[part.first : part.last], local[:, k * size : (k + 1) * size])
+            of_shared += local[:, 2 * size :].sum(axis=0)
         return self.normal.responses(of_poses, of_shared)
 
     def changes(self, part: LinearizedErrors, poses: FloatArray, shared: FloatArray) -> FloatArray:

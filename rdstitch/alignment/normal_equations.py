@@ -17,6 +17,7 @@ from rdstitch.alignment.motion_models import ModelMatrices
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
+from rdstitch.system.late_imports import sparse
 
 _LINKS_AT_ONCE = 4096
 """Whose dense blocks are made at a time: those of all links would be most of an alignment's memory."""
@@ -33,7 +34,7 @@ class SparseNormalEquations:
     Rows and columns of parameters that are not free are zero, and so are their steps.
     """
 
-    elimination: Elimination  # of the images by the links of the blocks
+    elimination: Elimination  # of the images by the L links between images that are not fixed
     free: BoolArray  # (N, D)
     poses: FloatArray  # (N, D, D): the blocks of A on its diagonal
     links: FloatArray  # (L, D, D): those of the links: rows of their second image, columns of their first
@@ -133,15 +134,6 @@ class SparseNormalEquations:
         return self.elimination.factorized(self.poses + added[..., None] * np.eye(added.shape[1]), self.links)
 
 
-def sums_by_image(free: BoolArray, observations: Observations, links: slice, values: FloatArray) -> FloatArray:
-    """Of values (l, 2 D, ...) of some links the sum for each free parameter, (N, D, ...)."""
-    total, size = np.zeros((*free.shape, *values.shape[2:])), free.shape[1]
-    np.add.at(total, observations.image1[links], values[:, :size])
-    np.add.at(total, observations.image2[links], values[:, size:])
-    total[~free] = 0.0
-    return total
-
-
 def _solve_scaled(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Least-norm solution of a small symmetric system, in units in which its diagonal is one; of one or several."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
@@ -196,8 +188,7 @@ def chain(
     """
     size, others = model.by_pose.shape[1], model.by_shared.shape[1] + equations.gram.shape[1] - 9
     pair, count = 2 * size, len(free)
-    poses, of_links = np.zeros((count, size, size)), np.empty((len(observations), size, size))
-    coupling, gradient_poses = np.zeros((count, size, others)), np.zeros((count, size))
+    by_image, of_links = np.zeros((count, size * (size + others + 1))), np.empty((len(observations), size, size))
     shared, gradient_shared = np.zeros((others, others)), np.zeros(others)
     for first in range(0, len(observations), _LINKS_AT_ONCE):
         links = slice(first, min(first + _LINKS_AT_ONCE, len(observations)))
@@ -211,13 +202,24 @@ def chain(
         local, gradient = local * moving[:, :, None] * moving[:, None, :], gradient * moving
         of_links[links] = local[:, size:pair, :size]
         for of, own in zip(images, (slice(size), slice(size, pair)), strict=True):
-            np.add.at(poses, of, local[:, own, own])
-            np.add.at(coupling, of, local[:, own, pair:])
-            np.add.at(gradient_poses, of, gradient[:, own])
+            # One row for each image: its block, its rows of the coupling, and its gradient.
+            rows = np.concatenate([local[:, own, own], local[:, own, pair:], gradient[:, own, None]], axis=2)
+            by_image += _incidence(count, of) @ rows.reshape(len(rows), -1)
         shared += local[:, pair:, pair:].sum(axis=0)
         gradient_shared += gradient[:, pair:].sum(axis=0)
-    elimination = Elimination.of_links(count, observations.image1, observations.image2)
-    return SparseNormalEquations(elimination, free, poses, of_links, coupling, shared, gradient_poses, gradient_shared)
+    poses, coupling, gradient_poses = np.split(by_image.reshape(count, size, -1), [size, size + others], axis=2)
+    gradient_poses = gradient_poses[:, :, 0]
+    moving = np.flatnonzero(free.any(axis=1))
+    joined = np.isin(observations.image1, moving) & np.isin(observations.image2, moving)
+    elimination = Elimination.of_links(count, observations.image1[joined], observations.image2[joined])
+    return SparseNormalEquations(
+        elimination, free, poses, of_links[joined], coupling, shared, gradient_poses, gradient_shared
+    )
+
+
+def _incidence(count: int, images: IntArray) -> "sparse.csr_array":
+    """Which of so many images each link has, (N, l): its product is the sum over the links of each image."""
+    return sparse.csr_array((np.ones(len(images)), (images, np.arange(len(images)))), shape=(count, len(images)))
 
 
 def link_derivatives(

@@ -204,12 +204,15 @@ class Aligner:
         return replace(self, options=replace(self.options, model="pose")).draft(aligned.pairs)
 
 
-def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candidates: Sequence[Pair]) -> AlignedPairs:
-    """Draft the alignment anew with what a draft shows to be missing: pairs, and inliers.
+def draft_with_loops(
+    aligner: Aligner, pairing: Pairing, pairs: Sequence[PairRegistration], candidates: Sequence[Pair]
+) -> AlignedPairs:
+    """Draft the alignment, and anew with what a draft shows to be missing: pairs, and inliers.
 
     Those are pairs of images that the poses put beside each other, candidate pairs of images without a pose, and, where
     the lens has more than λ, what it selects: with the one λ of a pair, matches at the corners of it are outliers.
     """
+    aligned = aligner.draft(pairs)
     for _ in range(_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
         tried = {pair.images for pair in pairs}
@@ -221,6 +224,7 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
         if selected is None and not any(pair.relation for pair in more):
             return replace(aligned, pairs=pairs)
         pairing.progress("aligning", 0, 1)
+        del aligned, alignment, selected  # what a draft was made from takes as much memory as the next one
         aligned = aligner.draft(pairs)
     return aligned
 

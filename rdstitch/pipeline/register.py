@@ -16,7 +16,7 @@ from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail
+from rdstitch.pipeline.aligner import Aligner, draft_with_loops, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.image_circle import with_image_circle
 from rdstitch.pipeline.settle_repeated_pattern import match_crossings, settle_repeated_pattern
@@ -80,9 +80,9 @@ def register(
     pairs = pairing.match_repeated_patterns(pairs) if purpose.lens_only else pairs
     mixed, other_lens = separate_lenses(aligner.cameras, pairs, options.threshold, options.known_distortion)
     progress("aligning", 0, 1)
-    aligned = aligner.draft([pair for pair in pairs if not {*pair.images} & other_lens.keys()])
+    pairs = [pair for pair in pairs if not {*pair.images} & other_lens.keys()]
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
-    aligned = close_loops(aligner, pairing, aligned, candidates)
+    aligned = draft_with_loops(aligner, pairing, pairs, candidates)
     if purpose.poses:
         aligner = replace(aligner, needs_poses=True)
         aligned = aligner.metric(aligned)

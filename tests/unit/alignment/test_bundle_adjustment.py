@@ -34,8 +34,10 @@ def _dense(normal: SparseNormalEquations, observations: Observations) -> np.ndar
     (count, size), shared = normal.free.shape, len(normal.shared)
     poses, images = np.zeros((count, count, size, size)), np.arange(count)
     poses[images, images] = normal.poses
-    poses[observations.image2, observations.image1] += normal.links
-    poses[observations.image1, observations.image2] += normal.links.swapaxes(1, 2)
+    image1, image2 = observations.image1, observations.image2
+    joined = np.array([normal.free[k].any() for k in image1]) & np.array([normal.free[k].any() for k in image2])
+    poses[image2[joined], image1[joined]] += normal.links
+    poses[image1[joined], image2[joined]] += normal.links.swapaxes(1, 2)
     rows, coupling = poses.swapaxes(1, 2).reshape(count * size, -1), normal.coupling.reshape(-1, shared)
     free = np.append(normal.free.ravel(), np.ones(shared, dtype=np.bool_))
     dense: np.ndarray = np.block([[rows, coupling], [coupling.T, normal.shared]])[np.ix_(free, free)]
