@@ -16,7 +16,8 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.camera_record import camera_json
 from rdstitch.inputs import source as sources
 from rdstitch.io import Metadata, read_image, read_metadata
-from rdstitch.pipeline import accept, recipes, register
+from rdstitch.pipeline import accept, register
+from rdstitch.sidecar import write
 from rdstitch.verification.verdict import judge
 from tests.cli.faulty import UNREADABLE, UNUSABLE
 from tests.cli.running import CACHED, FAST, Run, finished, shown, sidecar_of, start, state_of
@@ -322,9 +323,9 @@ def _too_large(*_: object, **__: object) -> None:
     [
         (register, "separate_lenses", ImpossibleCameraError("distortion -1.2 folds"), 4, "no reliable result"),
         (register, "separate_lenses", _too_large, 7, "out of memory"),
-        (recipes, "sidecar", KeyboardInterrupt(), 130, "interrupted"),
-        (recipes, "sidecar", MemoryError(), 7, "memory"),
-        (recipes, "sidecar", ZeroDivisionError("x\ny"), 1, "x y"),
+        (write, "sidecar", KeyboardInterrupt(), 130, "interrupted"),
+        (write, "sidecar", MemoryError(), 7, "memory"),
+        (write, "sidecar", ZeroDivisionError("x\ny"), 1, "x y"),
     ],
 )
 def test_what_fails_in_the_middle(
