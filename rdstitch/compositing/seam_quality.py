@@ -93,6 +93,12 @@ class SeamQuality:
         many = self.share > _MAX_SHARE and self.broken.sum() >= _MIN_BROKEN
         return many or longest > _MAX_LENGTH * DIAGONAL / _STEP * self.spacing
 
+    @property
+    def visible(self) -> bool:
+        """Whether that is seen in the output too: one smaller than what seams are looked at on shows a window's length."""
+        longest = max((one.length for one in self.breaks), default=0.0)
+        return self.seen and (self.spacing >= _STEP or longest > 2 * _HALF)
+
     def cropped(self, box: Box) -> "SeamQuality":
         """The same of a part of the output."""
         corner, last = np.array(box[:2]), np.array(box[2:]) - 0.5

@@ -181,7 +181,7 @@ def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
     more = f", and {rest} more" if (rest := len(seams.breaks) - len(worst)) else ""
     text = f"{'; '.join(told)}{more}: something moved, or is nearer than the rest; leave one of the two out, or mask it"
     images = tuple(dict.fromkeys(paths[k] for one in worst for k in one.images))
-    return [Message(text, images, "warning" if seams.seen else "detail", code="seam-break")]
+    return [Message(text, images, "warning" if seams.visible else "detail", code="seam-break")]
 
 
 def _box_of_rectangle(placed: PlacedImages, corners: Corners, canvas: Canvas) -> Box | None:

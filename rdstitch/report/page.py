@@ -123,7 +123,7 @@ def summary(result: StitchResult | Registration) -> str:
     alignment, camera, reason = registration.alignment, registration.camera, registration.alignment.model_reason
     known = {str(source.path) for source in registration.sources}
     unread = sum(message.images[0] not in known for message in registration.left_out)
-    seen = isinstance(result, StitchResult) and result.seams.seen
+    seen = isinstance(result, StitchResult) and result.seams.visible
     verdict = element("p", "The result passed its own checks.", class_="good")
     if seen:
         verdict = element("p", "Seams are broken; the picture below shows where.", class_="bad")

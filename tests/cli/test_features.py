@@ -11,7 +11,7 @@ from tests.sampled import sampled
 
 PAIR = sorted((Path(__file__).resolve().parents[2] / "examples/data/garfield_red").glob("*.jpg"))
 # What is looked at is the registration; the image may be small.
-SMALL = ("--scale", "0.1", "--blend", "feather", "-j", "1")
+SMALL = ("--scale", "0.1", "--blend", "feather", "--seam", "voronoi", "-j", "1")
 
 
 def stitched(rdstitch: Run, folder: Path, kind: str) -> dict[str, Any]:

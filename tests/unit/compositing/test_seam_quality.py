@@ -1,11 +1,13 @@
 """Breaks along seams: content that is shifted, and objects that are cut; not what a seam goes around."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from rdstitch.compositing.boxes import Box, Float32Array
-from rdstitch.compositing.seam_quality import SeamQuality, SeamTile, likeness, measure_seams
+from rdstitch.compositing.seam_quality import SeamBreak, SeamQuality, SeamTile, likeness, measure_seams
 from rdstitch.synthetic.textures import ground
 
 SIZE = (400, 300)
@@ -119,3 +121,10 @@ def test_grass_in_the_wind_is_no_break() -> None:
     quality = measure_seams([_tile(image, (0, 0, *SIZE)) for image in (first, second)], LABELS, 1.0, 1.0)
     assert len(quality.places) > 25
     assert quality.broken.sum() <= 1
+
+
+def test_a_small_output_hides_what_a_large_one_shows() -> None:
+    shown = SeamQuality(np.zeros((20, 2)), np.arange(20) < 8, (SeamBreak((0, 1), (0.0, 0.0), 64.0, 4.0),), spacing=8.0)
+    tenth = replace(shown, breaks=(SeamBreak((0, 1), (0.0, 0.0), 6.4, 0.4),), spacing=0.8)
+    assert shown.visible
+    assert tenth.seen and not tenth.visible
