@@ -95,7 +95,7 @@ class SeamQuality:
 
     @property
     def visible(self) -> bool:
-        """Whether that is seen in the output too: one smaller than what seams are looked at on shows a window's length."""
+        """Whether that is seen in the output too: a smaller one shows what is as long as a window."""
         longest = max((one.length for one in self.breaks), default=0.0)
         return self.seen and (self.spacing >= _STEP or longest > 2 * _HALF)
 

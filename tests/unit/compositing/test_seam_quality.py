@@ -127,4 +127,5 @@ def test_a_small_output_hides_what_a_large_one_shows() -> None:
     shown = SeamQuality(np.zeros((20, 2)), np.arange(20) < 8, (SeamBreak((0, 1), (0.0, 0.0), 64.0, 4.0),), spacing=8.0)
     tenth = replace(shown, breaks=(SeamBreak((0, 1), (0.0, 0.0), 6.4, 0.4),), spacing=0.8)
     assert shown.visible
-    assert tenth.seen and not tenth.visible
+    assert tenth.seen
+    assert not tenth.visible
