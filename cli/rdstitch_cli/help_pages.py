@@ -114,7 +114,7 @@ def help_command(context: click.Context, topics: Sequence[str]) -> None:
 
 
 def troubleshooting() -> dict[str, str]:
-    """Give what to do about each message, by its code: the paragraphs of docs/troubleshooting.md."""
+    """What to do about each message, by its code: the paragraphs of docs/troubleshooting.md."""
     page = resources.files("rdstitch_cli") / "troubleshooting.md"
     if not page.is_file():  # a checkout
         page = Path(__file__).parents[2] / "docs" / "troubleshooting.md"

@@ -157,7 +157,7 @@ def report_applied(result: "Recomposition", reporter: Reporter) -> None:
 
 
 def show_plan(plan: "CompositePlan") -> None:
-    """Give what compositing would take, to standard output."""
+    """What compositing would take, to standard output."""
     (width, height), megapixels = plan.canvas_size, plan.canvas_size[0] * plan.canvas_size[1] / 1e6
     click.echo(f"images: {plan.images}")
     click.echo(f"canvas: {width} x {height} pixels, {megapixels:.4g} megapixels")
@@ -184,7 +184,7 @@ def report_registration(
 
 
 def warn_of(registration: "Registration", reporter: Reporter) -> None:
-    """Give what the user must know of a registration."""
+    """What the user must know of a registration."""
     from rdstitch.results.messages import of_severity, told_once
 
     alignment = registration.alignment

@@ -38,7 +38,7 @@ def write_whatever_the_encoding() -> None:
 
 
 def spell_out(error: UnicodeError) -> tuple[str | bytes, int]:
-    """Give what stands for characters that an encoding lacks; an error handler of :mod:`codecs`."""
+    """What stands for characters that an encoding lacks; an error handler of :mod:`codecs`."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     first, end = error.object[error.start], error.start + 1

@@ -28,7 +28,7 @@ from rdstitch.system.process_memory import peak_memory
 
 
 def path_of(frames: list[Pose]) -> Trajectory:
-    """The path of the poses as they were first given."""
+    """The path of the poses as they were given last: a better alignment gives earlier ones again."""
     known = {frame.number: pose for frame in frames if frame.tracked and (pose := frame.tracked.pose)}
     numbers = sorted(known)
     places = np.array([(known[k].x, known[k].y) for k in numbers])
@@ -74,7 +74,7 @@ def main(
             if len(poses) == frames // 3:
                 memory = peak_memory()
         whole = rdstitch.trajectory([images], None, options)[0] if end else None
-    aligned = [k for k, frame in enumerate(poses) if frame.tracked and frame.tracked.placement is not None]
+    placed = {frame.number for frame in poses if frame.tracked and frame.tracked.placement is not None}
     unknown = [k for k, frame in enumerate(poses) if not (frame.tracked and frame.tracked.distortion_known)]
     for name, rows in (("λ unknown", unknown), ("λ known", sorted({*range(len(poses))} - {*unknown}))):
         if rows:
@@ -89,8 +89,8 @@ def main(
         if tracked is not None:
             print(f"after {share:4.0%} of the frames: λ - truth {tracked.distortion - DISTORTION:+.5f}", end=" ")
             print(f"± {tracked.distortion_std:.5f}")
-    print(f"{len(aligned)} of {frames} frames placed, along {truth.length:.0f} heights of the camera")
-    for name, one in (("as they came", path_of(poses)), ("at the end", whole)):
+    print(f"{len(placed)} of {frames} frames placed, along {truth.length:.0f} heights of the camera")
+    for name, one in (("while driving", path_of(poses)), ("at the end", whole)):
         if one is not None:
             error = compare_trajectories(one, truth)
             print(f"{name}: drift {error.drift:.4%} of the path, {end_error(one, truth):.3%} at its end")

@@ -257,7 +257,7 @@ def opencv_text(camera: Camera, *, yaml: bool = True, fisheye: bool = False) -> 
 
 
 def _calibration(camera: Camera, lens: LensModel, **further: Any) -> dict[str, Any]:
-    """Give the fields that FileStorage and ROS share."""
+    """The fields that FileStorage and ROS share."""
     (width, height), (cx, cy), focal = camera.image_size, camera.center, lens.mean_focal
     return {
         "image_width": width,
@@ -338,12 +338,12 @@ def opendronemap_json(camera: Camera) -> str:
 
 
 def comments(camera: Camera, fit: LensFit, model: str) -> str:
-    """Give comment lines, the last one with the camera itself."""
+    """Comment lines, the last one with the camera itself."""
     return f"# {model}: at most {fit.largest:.3f} pixels from the lens\n{OWN_COMMENT}{json.dumps(_own(camera, fit))}\n"
 
 
 def _own(camera: Camera, fit: LensFit) -> dict[str, Any]:
-    """Give the camera, and the residual of the model that was fitted to it; what is not known is left out."""
+    """The camera, and the residual of the model that was fitted to it; what is not known is left out."""
     known = {key: value for key, value in camera_json(camera).items() if value is not None}
     return {**known, "fit_rms_px": fit.rms, "fit_largest_px": fit.largest}
 

@@ -95,8 +95,8 @@ def read_polynomial(
     return fitted_camera(lens, kind, size)
 
 
-def hugin_lens(camera: Camera) -> tuple[str, LensFit]:
-    """The parameters f, v, a, b, c, d and e of an image line, and how far they are from the lens."""
+def hugin_lens(camera: Camera) -> tuple[dict[str, float], LensFit]:
+    """The size and lens of an image line by Hugin's names, and how far that is from the lens."""
     width, height = camera.image_size
     lens = fitted_polynomial(camera, min(camera.image_size) / 2, (4, 3, 2))
     fit, (scale, (a, b, c)) = lens.fit, lens.moved()
@@ -104,16 +104,21 @@ def hugin_lens(camera: Camera) -> tuple[str, LensFit]:
     view = 2.0 * math.degrees(half_width if lens.fisheye else math.atan(half_width))
     projection = _FISHEYE if lens.fisheye else _RECTILINEAR
     d, e = camera.center[0] - (width - 1) / 2, camera.center[1] - (height - 1) / 2
-    return f"w{width} h{height} f{projection} v{view!r} a{a!r} b{b!r} c{c!r} d{d!r} e{e!r} g0 t0", fit
+    size: dict[str, float] = {"w": width, "h": height, "f": projection, "v": view}
+    return {**size, "a": a, "b": b, "c": c, "d": d, "e": e, "g": 0, "t": 0}, fit
+
+
+def image_line(values: Mapping[str, float]) -> str:
+    """Values by Hugin's names as an image line has them."""
+    return " ".join(f"{name}{value!r}" for name, value in values.items())
 
 
 def hugin_project(camera: Camera) -> str:
     """A project with one image of this lens, for "load lens" or as a template."""
     (width, height), (lens, fit) = camera.image_size, hugin_lens(camera)
-    view = next(part[1:] for part in lens.split() if part.startswith("v"))
     return (
-        f'{HEAD}{comments(camera, fit, "a, b, c")}p f0 w{width} h{height} v{float(view):.6g} n"TIFF_m c:LZW"\nm i0\n'
-        f'i {lens} r0 p0 y0 TrX0 TrY0 TrZ0 n"image.jpg"\n'
+        f'{HEAD}{comments(camera, fit, "a, b, c")}p f0 w{width} h{height} v{lens["v"]:.6g} n"TIFF_m c:LZW"\nm i0\n'
+        f'i {image_line(lens)} r0 p0 y0 TrX0 TrY0 TrZ0 n"image.jpg"\n'
     )
 
 
@@ -128,7 +133,7 @@ class Polynomial:
     fit: LensFit
 
     def moved(self) -> tuple[float, tuple[float, ...]]:
-        """Give how much larger the undistorted image is with the scale kept at r = 1, ``1 - Σ k`` at the centre; and k.
+        """How much larger the undistorted image is with the scale kept at r = 1, ``1 - Σ k`` at the centre; and k.
 
         r = s u, where s (1 - Σ k) = 1, and k are those found over s^p.
         """

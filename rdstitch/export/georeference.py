@@ -158,7 +158,7 @@ class Georeference:
         return places
 
     def tiff_tags(self) -> list[ExtraTag]:
-        """Give what makes a TIFF file a GeoTIFF."""
+        """What makes a TIFF file a GeoTIFF."""
         a, b = self.scale.real, self.scale.imag
         # GeoTIFF counts from the corner of the first pixel.
         corner = self.origin - self.scale * (0.5 - 0.5j)

@@ -7,7 +7,7 @@ import numpy as np
 from rdstitch.alignment.frames import QuarterTurns
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
-from rdstitch.camera_files.polynomials import HEAD, hugin_lens
+from rdstitch.camera_files.polynomials import HEAD, hugin_lens, image_line
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
@@ -46,12 +46,13 @@ def project_of_hugin(registration: Registration, canvas: Canvas) -> str:
     lines, variables = [], []
     for place, k in enumerate(used):
         camera = alignment.cameras[k]
-        lens = hugin_lens(camera)[0].split()
+        values = hugin_lens(camera)[0]
+        lens = image_line(values)
         if camera in lenses:  # linked with the image that has the same
-            lens = [part if part[0] in "whf" else f"{part[0]}={lenses[camera]}" for part in lens]
+            own = {name: values[name] for name in "whf"}
+            lens = " ".join([image_line(own), *(f"{name}={lenses[camera]}" for name in values if name not in own)])
         lenses.setdefault(camera, place)
-        path = str(sources[k].path.absolute())
-        lines.append(" ".join(["i", *lens, *(f"{n}{v!r}" for n, v in _pose(alignment, k).items()), f'n"{path}"']))
+        lines.append(f'i {lens} {image_line(_pose(alignment, k))} n"{sources[k].path.absolute()}"')
         if k != alignment.reference:
             variables += [f"v {name}{place}" for name in _pose(alignment, k)]
     control = []

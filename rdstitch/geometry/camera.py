@@ -198,7 +198,7 @@ class Camera:
         return nearest, float(np.sqrt(np.mean(excess**2))), float(np.abs(excess).max())
 
     def excess_radius(self, radii: FloatArray) -> FloatArray:
-        """Give how much farther out this lens measures rays than the nearest one-parameter lens does, pixels (N,).
+        """How much farther out this lens measures rays than the nearest one-parameter lens does, pixels (N,).
 
         Parameters
         ----------

@@ -41,7 +41,7 @@ def turned_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
 
 
 def turning_matrix(orientation: int) -> FloatArray:
-    """Give what :func:`turned` does to directions in the image, to the right and down, shape (2, 2)."""
+    """What :func:`turned` does to directions in the image, to the right and down, shape (2, 2)."""
     matrix = np.eye(2)[::-1] if orientation in SIDEWAYS else np.eye(2)
     signs = [-1.0 if orientation in backwards else 1.0 for backwards in (_X_BACKWARDS, _Y_BACKWARDS)]
     return np.array(signs)[:, None] * matrix

@@ -76,7 +76,7 @@ class PlanarMotion:
 
     @classmethod
     def from_homography(cls, homography: ArrayLike, normal: FloatArray | None = None) -> Self:
-        """Give the planar motion that a homography (3, 3) comes closest to, for a plane normal (3,) if given."""
+        """The planar motion that a homography (3, 3) comes closest to, for a plane normal (3,) if given."""
         h = np.array(homography, dtype=np.float64)
         row = motions_from_homographies(h[None], None if normal is None else normal[None])[0]
         psi, theta, yaw, tx, ty, height = row.tolist()

@@ -54,7 +54,7 @@ def project(homogeneous: FloatArray) -> FloatArray:
 
 
 def to_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
-    """Give where measured points of an image, pixels (N, 2), lie on the plane; NaN at and beyond the horizon.
+    """Where measured points of an image, pixels (N, 2), lie on the plane; NaN at and beyond the horizon.
 
     ``homography`` (3, 3) leads from undistorted normalized coordinates to the plane, with positive third
     coordinates in front of the camera.
@@ -91,7 +91,7 @@ def _mapped(homography: FloatArray, points: FloatArray) -> FloatArray:
 def transfer(
     homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, higher: Sequence[float] = ()
 ) -> FloatArray:
-    """Give where measured points of image 1 are measured in image 2: undistort, apply H, distort.
+    """Where measured points of image 1 are measured in image 2: undistort, apply H, distort.
 
     Of homographies (..., 3, 3), from image 1 to image 2 with positive third coordinates in front of the camera, λ
     (...) in the frame of the points, and normalized points (N, 2): (..., N, 2), NaN for a point that comes to lie

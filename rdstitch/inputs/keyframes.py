@@ -26,7 +26,7 @@ _SIDE = 320  # pixels of the longer side that frames are tracked at
 _MIN_CORNERS = 12  # corners that a motion is believed by
 _AGREEING = 0.4  # share of the corners that must agree
 _ERROR = 0.02  # of a motion, in sides: lenses and tilts are not affine
-_WORN = 0.5  # share of the corners, or of the side that they have come, after which new ones are taken
+_RENEWED_FROM = 0.5  # share of the corners, or of the side that they have come, after which new ones are taken
 _GRID = 16  # points a side by which areas are measured
 
 
@@ -77,7 +77,7 @@ def _motion(before: FloatArray, now: FloatArray, side: int, count: int) -> tuple
     if motion is None or agree.sum() < max(_MIN_CORNERS, _AGREEING * len(agree)) or np.linalg.det(motion[:, :2]) <= 0.0:
         return None, True
     way = float(np.median(np.linalg.norm(now - before, axis=1)))
-    return np.vstack([motion, [0.0, 0.0, 1.0]]), len(now) < _WORN * count or way > _WORN * side / 2
+    return np.vstack([motion, [0.0, 0.0, 1.0]]), len(now) < _RENEWED_FROM * count or way > _RENEWED_FROM * side / 2
 
 
 def _small(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""Where images were taken, by a table, exiftool or a track, instead of by EXIF; and ground control points.
+"""Where images were taken, by a table, exiftool or a track, instead of by EXIF.
 
 ================================= ====================================================================
 CSV with a header                 a name, and latitude and longitude, or x and y; as ``exiftool -csv`` too
@@ -13,7 +13,7 @@ a coordinate system, then lines   OpenDroneMap's ``geo.txt``: NAME X Y [Z … HO
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,14 +21,14 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.geometry.crs import WGS84, Crs, NamedSystem
-from rdstitch.geometry.places import GpsPosition, GroundControl
+from rdstitch.geometry.crs import WGS84, NamedSystem
+from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import Row, by_image, csv_rows, json_rows, listed_rows
 from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points
-from rdstitch.system.file_access import canonical_text, read_text
+from rdstitch.system.file_access import read_text
 
-_COLUMNS = {
+COLUMNS = {
     "name": "name filename sourcefile image imagename file label",
     "latitude": "latitude lat gpslatitude",
     "longitude": "longitude lon lng long gpslongitude",
@@ -41,24 +41,10 @@ _COLUMNS = {
     "east_std": "rtkstdlon eaststd",
     "up_std": "rtkstdhgt upstd verticalaccuracy vaccuracy vacc",
 }
-_ACCURACIES = {name: aliases for name, aliases in _COLUMNS.items() if name.endswith("std")}
-_CONTROL = {
-    "name": "image imagename filename file photo",
-    "point": "name gcpname gcp point label marker",
-    "latitude": _COLUMNS["latitude"],
-    "longitude": _COLUMNS["longitude"],
-    "x": "x easting east geox xeasting",
-    "y": "y northing north geoy ynorthing",
-    "px": "px imx pixelx column u",
-    "py": "py imy pixely row v",
-    **_ACCURACIES,
-}
-_CONTROL_WANTED = ("x,y,px,py,name", "longitude,latitude,px,py,name")
-_CONTROL_LISTED = ("x", "y", "z", "px", "py", "name")
 _SIDES = (("latitude", "south"), ("longitude", "west"))
 _LISTED = ("name", "x", "y", "altitude", "yaw", "pitch", "roll", "north_std", "up_std")  # in geo.txt
 _WANTED = ("name,latitude,longitude", "name,x,y")
-_UNITS = ("deg", "degrees", "m", "metres", "meters")
+UNITS = ("deg", "degrees", "m", "metres", "meters")
 _RECORDS = "a list of objects with SourceFile, GPSLatitude and GPSLongitude"
 
 
@@ -100,11 +86,11 @@ def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offse
         places = by_events(sources, text, name)
     else:
         if text.lstrip().startswith(("[", "{")):
-            rows = json_rows(text, name, _COLUMNS, _RECORDS)
+            rows = json_rows(text, name, COLUMNS, _RECORDS)
         elif (named := NamedSystem.named_by(lines[0])) is not None:
             rows, system = listed_rows("".join(lines[1:]).splitlines(), name, _LISTED, 2), named
         else:
-            rows = csv_rows(text, name, _COLUMNS, _WANTED, _UNITS)
+            rows = csv_rows(text, name, COLUMNS, _WANTED, UNITS)
         table = _table(rows, name, system)
         called = _same_names(sources, table)
         places = [table.get(called[source.name]) for source in sources]
@@ -135,16 +121,16 @@ def _table(rows: Iterable[Row], file: str, system: NamedSystem | None) -> dict[s
             raise InputError(f"{row.where}: in which coordinate system x and y are is not known; give --crs")
         else:
             projected[row.image] = x, y
-        table[row.image] = GpsPosition(y, x, altitude, _accuracy(row))
+        table[row.image] = GpsPosition(y, x, altitude, accuracy_of(row))
     if projected:
         assert system is not None
-        places = _geographic(system, np.array(list(projected.values())), file)
+        places = geographic_places(system, np.array(list(projected.values())), file)
         for name, (latitude, longitude) in zip(projected, places, strict=True):
             table[name] = replace(table[name], latitude=latitude, longitude=longitude)
     return table
 
 
-def _accuracy(row: Row) -> tuple[float, float] | None:
+def accuracy_of(row: Row) -> tuple[float, float] | None:
     """Standard deviations of one horizontal coordinate and of the altitude, m; None where the row has none."""
     along, across, up = (row.number(name) for name in ("north_std", "east_std", "up_std"))
     if not (along and along > 0.0):
@@ -153,7 +139,7 @@ def _accuracy(row: Row) -> tuple[float, float] | None:
     return math.hypot(along, across) / math.sqrt(2.0), up if up and up > 0.0 else 2.0 * max(along, across)
 
 
-def _geographic(system: NamedSystem, places: FloatArray, file: str) -> list[tuple[float, float]]:
+def geographic_places(system: NamedSystem, places: FloatArray, file: str) -> list[tuple[float, float]]:
     """Latitude and longitude of eastings and northings (N, 2)."""
     try:
         found = system.geographic(places)
@@ -185,77 +171,3 @@ def _same_names(sources: Sequence[Source], listed: Iterable[str]) -> dict[str, s
         alike = lines.get(source.name.casefold(), source.name)
         found[source.name] = alike if source.name not in known and names[alike.casefold()] == 1 else source.name
     return found
-
-
-def with_ground_control(
-    sources: Sequence[Source], file: str | Path | None, epsg: int | None = None, *, check: bool = False
-) -> list[Source]:
-    """The sources with the ground control points that they show by a list, if there is one.
-
-    Its first line names the coordinate system, else it is ``epsg``; then lines as OpenDroneMap's, ``X Y Z PX PY IMAGE
-    [NAME]``, or CSV with a header: pixels of the upright image, the centre of the top-left one at (0, 0). Points to
-    ``check`` come besides those that the sources have.
-    """
-    if file is None:
-        return list(sources)
-    text = read_text(file)
-    first, _, rest = text.partition("\n")
-    system = NamedSystem.named_by(first)
-    body = f"\n{rest}" if system else text  # lines keep their numbers
-    rows: Iterable[Row]
-    header = next((line for line in body.splitlines() if line.strip()), "")
-    if re.match(r"\W*[A-Za-z_ ./()]+[,;\t]", header):
-        listed = csv_rows(body, str(file), _CONTROL, _CONTROL_WANTED, _UNITS)
-        rows = [replace(row, values={**row.values, "name": row.image}) for row in listed]
-        epsg = WGS84 if any("latitude" in row.values for row in listed) else epsg
-    else:
-        rows = _opendronemap(body, str(file))
-    system = system or (None if epsg is None else NamedSystem(f"EPSG:{epsg}", epsg))
-    if system is None:
-        raise InputError(
-            f"{file}: line 1: expected a coordinate system like EPSG:32632 or WGS84 UTM 32N; or give --crs"
-        )
-    sizes = {source.name: source.metadata.size for source in sources}
-    shown: list[tuple[str, str, tuple[float, float], tuple[float, float], float | None]] = []
-    for row in rows:
-        image, point = _image_and_point(" ".join(filter(None, map(row.values.get, ("name", "point")))), sizes)
-        if image is None:
-            continue
-        x, y = (row.needed(names[names[0] not in row.values]) for names in (("longitude", "x"), ("latitude", "y")))
-        pixel = row.needed("px"), row.needed("py")
-        if not all(-0.5 <= at < side - 0.5 for at, side in zip(pixel, sizes[image], strict=True)):
-            raise InputError(f"{row.where}: is not within the {'{} x {}'.format(*sizes[image])} pixels of {image}")
-        accuracy = _accuracy(row)
-        shown.append((image, point or f"{x:.12g} {y:.12g}", (x, y), pixel, accuracy and accuracy[0]))
-    if not shown:
-        raise InputError(f"{file}: has no ground control point in any of the images")
-    places = _geographic(system, np.array([place for _, _, place, _, _ in shown]), str(file))
-    on_map = system.epsg is not None and system.epsg != WGS84 and Crs.in_metres(system.epsg) is not None
-    code = system.epsg if on_map and system.epsg is not None else WGS84
-    control: dict[str, list[GroundControl]] = {}
-    for (image, name, _, pixel, std), degrees in zip(shown, places, strict=True):
-        one = GroundControl(name, GpsPosition(*degrees), code, pixel, std, check=check)
-        control.setdefault(image, []).append(one)
-    return [replace(source, control=(*source.control, *control.get(source.name, ()))) for source in sources]
-
-
-def _opendronemap(text: str, file: str) -> Iterator[Row]:
-    """The lines of a ``gcp_list.txt`` below its coordinate system; what follows the numbers is an image and a point."""
-    for number, line in enumerate(text.splitlines(), start=1):
-        fields = line.split(maxsplit=5)
-        if not fields or fields[0].startswith("#"):
-            continue
-        row = Row(f"{file}: line {number}", dict(zip(_CONTROL_LISTED, fields, strict=False)), ".")
-        if len(fields) < 6:
-            raise InputError(f"{row.where}: expected X Y Z PX PY IMAGE [NAME]")
-        yield replace(row, values={**row.values, "name": canonical_text(fields[5].strip())})
-
-
-def _image_and_point(text: str, names: Iterable[str]) -> tuple[str | None, str]:
-    """The image that the rest of a line begins with, which may have spaces and other case, and the point's name."""
-    for same in (str, str.casefold):
-        begun = [name for name in names if f"{same(text)} ".startswith(f"{same(name)} ")]
-        if begun:
-            image = max(begun, key=len)
-            return image, text[len(image) :].strip()
-    return None, ""

@@ -51,7 +51,7 @@ def _srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> FloatArray:
 
 
 def ink_transform(profile: bytes) -> "ImageCms.ImageCmsTransform | None":
-    """Give what a colour profile of inks (CMYK) makes of them in sRGB; None where it cannot be used."""
+    """What a colour profile of inks (CMYK) makes of them in sRGB; None where it cannot be used."""
     from PIL import ImageCms
 
     try:
@@ -72,7 +72,7 @@ def without_inks(image: Image.Image) -> Image.Image:
 
 
 def colour_space(profile: bytes) -> bytes:
-    """Give what is equal of profiles of one colour space; images without one are taken for sRGB."""
+    """What is equal of profiles of one colour space; images without one are taken for sRGB."""
     if not profile or b"sRGB" in profile or b"s\0R\0G\0B" in profile:
         return b""
     return profile

@@ -26,11 +26,9 @@ from rdstitch.io.opening import (
     has_late_metadata,
     is_raw,
     opened_image,
-    own_exif,
-    raw_exif,
-    raw_size,
 )
 from rdstitch.io.radiometric_tags import Radiometry, read_radiometry
+from rdstitch.io.raw import own_exif, raw_exif, raw_size
 from rdstitch.io.read_tiff import channel_count
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
@@ -49,7 +47,7 @@ _COLOUR_SPACE = slice(16, 20)  # of a profile's header
 _UNWRITABLE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, struct.error)
 _HEADER = 16
 _TIMES = {int(getattr(ExifTags.Base, name)) for name in ("DateTimeOriginal", "OffsetTimeOriginal")}
-_OF_WHOM = {
+_AUTHOR_TAGS = {
     int(getattr(ExifTags.Base, name))
     for name in ("Make", "Model", "Artist", "Copyright", "DateTime", "Software", "ImageDescription", "Orientation")
 }
@@ -107,7 +105,7 @@ class Metadata:
 
     def of_composite(self) -> Self:
         """Of an image made from several: no lens, exposure or place of one of them is true of it."""
-        return replace(self, exif=_edited(self.exif, _who_and_when))
+        return replace(self, exif=_edited(self.exif, _keep_author_and_time))
 
 
 def read_metadata(path: str | Path) -> Metadata:
@@ -355,9 +353,9 @@ def _edited(data: bytes, edit: Callable[[Image.Exif], object]) -> bytes:
         return b""
 
 
-def _who_and_when(exif: Image.Exif) -> None:
+def _keep_author_and_time(exif: Image.Exif) -> None:
     photo = exif.get_ifd(ExifTags.IFD.Exif)
     for tag in set(photo) - _TIMES:
         del photo[tag]
-    for tag in set(exif) - _OF_WHOM - {int(ExifTags.IFD.Exif)}:
+    for tag in set(exif) - _AUTHOR_TAGS - {int(ExifTags.IFD.Exif)}:
         del exif[tag]

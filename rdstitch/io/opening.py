@@ -11,16 +11,13 @@ import stat
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib import import_module
-from io import BytesIO
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageFile, UnidentifiedImageError
+from PIL import Image, ImageFile
 
 from rdstitch.errors import InputError
 from rdstitch.system.file_access import is_url, open_regular, remote_status
@@ -35,9 +32,6 @@ RAW_SUFFIXES = frozenset(
 )
 """What TIFF readers see in raw files is their thumbnail."""
 
-_BITS = 16
-_KEPT_TAGS = {int(getattr(ExifTags.Base, name)) for name in ("Make", "Model", "Artist", "Copyright", "DateTime")}
-_KEPT_BLOCKS = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
 
 # What Pillow, tifffile and OpenCV have been seen to raise on damaged files; warnings, where filters make them errors.
 _DAMAGE = (
@@ -184,7 +178,7 @@ def check_decoded_size(file: Path, size: tuple[int, int], channels: int = 3, bit
 
 
 def _factory(file: Path, stream: BinaryIO) -> Factory:
-    """Give what opens the format of a file, by its first bytes."""
+    """What opens the format of a file, by its first bytes."""
     beginning = stream.read(_MAX_MAGIC)
     stream.seek(0)
     for magic, reader in _FORMATS.items():
@@ -194,7 +188,7 @@ def _factory(file: Path, stream: BinaryIO) -> Factory:
         if beginning[8:12] in (b"avif", b"avis"):
             return _avif_factory(file)
         # No opener is registered with Pillow, since that would be for the whole process.
-        heif: Factory = _package("pillow_heif", file).HeifImageFile
+        heif: Factory = reader_package("pillow_heif", file).HeifImageFile
         return heif
     if file.suffix.lower() == ".tga":  # has no magic
         return _imported("PIL.TgaImagePlugin.TgaImageFile")
@@ -205,7 +199,7 @@ def _check_reader(path: Path) -> None:
     """Refuse a file whose reader is not installed."""
     for suffixes, package in ((HEIF_SUFFIXES, "pillow_heif"), (RAW_SUFFIXES, "rawpy")):
         if path.suffix.lower() in suffixes:
-            _package(package, path)
+            reader_package(package, path)
 
 
 def _imported(name: str) -> Factory:
@@ -215,7 +209,7 @@ def _imported(name: str) -> Factory:
 
 
 def _avif_factory(path: Path) -> Factory:
-    """Give what opens AVIF: Pillow, since version 11.3."""
+    """What opens AVIF: Pillow, since version 11.3."""
     try:
         return _imported("PIL.AvifImagePlugin.AvifImageFile")
     except ImportError:
@@ -227,65 +221,8 @@ def is_raw(path: Path) -> bool:
     return path.suffix.lower() in RAW_SUFFIXES
 
 
-def read_raw(path: Path) -> NDArray[np.uint16]:
-    """Samples (h, w, 3) of a raw file, upright, with the camera's white balance, in sRGB without automatic exposure."""
-    with _raw(path) as raw:
-        samples = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=_BITS)
-        return np.asarray(samples, dtype=np.uint16)
-
-
-def raw_size(path: Path) -> tuple[int, int]:
-    """Width and height of a raw file, upright, without developing it."""
-    with _raw(path) as raw:
-        sizes = raw.sizes
-        sideways = sizes.flip in (5, 6)
-        size = (sizes.iheight, sizes.iwidth) if sideways else (sizes.iwidth, sizes.iheight)
-        return int(size[0]), int(size[1])
-
-
-def raw_exif(path: Path) -> Image.Exif:
-    """EXIF of a raw file: most are TIFF, others have a preview with it; what describes how it is stored is left out."""
-    exif = Image.Exif()
-    with suppress(SyntaxError, ValueError, OSError, struct.error), path.open("rb") as stream:
-        exif.load_from_fp(stream)
-    if not len(exif):
-        exif = _exif_of_preview(path)
-    return own_exif(exif)
-
-
-def own_exif(exif: Image.Exif) -> Image.Exif:
-    """EXIF of a directory of TIFF, without what describes how the file is stored."""
-    kept = Image.Exif()
-    for tag in set(exif) & _KEPT_TAGS:
-        kept[tag] = exif[tag]
-    for ifd in _KEPT_BLOCKS:
-        kept.get_ifd(ifd).update(exif.get_ifd(ifd))
-    return kept
-
-
-def _exif_of_preview(path: Path) -> Image.Exif:
-    package = _package("rawpy", path)
-    with suppress(package.LibRawError, UnidentifiedImageError), package.imread(str(path)) as raw:
-        preview = raw.extract_thumb()
-        if preview.format == package.ThumbFormat.JPEG:
-            with Image.open(BytesIO(preview.data)) as image:
-                return image.getexif()
-    return Image.Exif()
-
-
-@contextmanager
-def _raw(path: Path) -> Iterator[Any]:
-    """An opened raw file; failures of LibRaw become those of any decoder."""
-    package = _package("rawpy", path)
-    try:
-        with package.imread(str(path)) as raw:
-            yield raw
-    except package.LibRawError as error:
-        text = error.args[0] if error.args else ""
-        raise ValueError(text.decode() if isinstance(text, bytes) else str(error)) from error
-
-
-def _package(name: str, path: Path) -> Any:
+def reader_package(name: str, path: Path) -> Any:
+    """The optional package that reads a file."""
     try:
         return import_module(name)
     except ImportError:

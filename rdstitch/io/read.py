@@ -16,7 +16,8 @@ from rdstitch.geometry.exif_orientation import turned
 from rdstitch.io.colour import without_inks
 from rdstitch.io.metadata import Metadata, is_grey_palette, metadata_of, read_metadata
 from rdstitch.io.ome import read_ome
-from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image, read_raw
+from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image
+from rdstitch.io.raw import read_raw
 from rdstitch.io.read_tiff import as_opacity, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME
@@ -133,7 +134,7 @@ def reduced(image: DecodedImage, factor: int) -> DecodedImage:
 
 
 def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> int:
-    """Give by how much of a reduction the decoder can make the image smaller; 1 for nothing."""
+    """By how much of a reduction the decoder can make the image smaller; 1 for nothing."""
     factor = math.gcd(reduction, _MAX_DECODED_REDUCTION)
     # Blocks begin at the stored image's first pixel; in one that is to be mirrored they must end at its last.
     crosswise = metadata.orientation != 1 and any(n % factor for n in image.size)

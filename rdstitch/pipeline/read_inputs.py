@@ -8,8 +8,9 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import natural_key
 from rdstitch.inputs.frame import Frame, Named
+from rdstitch.inputs.ground_control import with_ground_control
 from rdstitch.inputs.input_guard import InputGuard
-from rdstitch.inputs.positions import with_ground_control, with_positions
+from rdstitch.inputs.positions import with_positions
 from rdstitch.inputs.rosbag import camera_in_bag, is_bag
 from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
@@ -98,7 +99,7 @@ def check_size(sources: Sequence[Source]) -> None:
 def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
     """The tiles, which are read without the illumination that all have; and what there is to say of that."""
     # Imported late: images that are no tiles have no use for it.
-    from rdstitch.stage.estimate_flat_field import LEAST_TILES, estimate_illumination
+    from rdstitch.stage.estimate_flat_field import MIN_TILES, estimate_illumination
 
     if wanted == "off":
         return list(sources), []
@@ -108,7 +109,7 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
         field = read_flat_field(wanted, sources[0].camera.image_size, channels)
         return [replace(source, flat_field=field) for source in sources], []
     shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
-    if shown.field is None and len(sources) < LEAST_TILES:
+    if shown.field is None and len(sources) < MIN_TILES:
         text = f"{len(sources)} tiles are too few to show their flat field, and samples stay as they are"
         return list(sources), [Message(text, severity="note", code="flat-field")]
     if shown.field is None:

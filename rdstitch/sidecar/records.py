@@ -176,7 +176,7 @@ class ImageRecord(LensRecord):
         return None if self.size is None else self.lens(self.size)
 
     def displacement_field(self) -> DisplacementField | None:
-        """Give what local alignment found; None where the image was not aligned locally."""
+        """What local alignment found; None where the image was not aligned locally."""
         if self.displacement is None or self.size is None or not self.used:
             return None
         columns, rows = self.displacement.grid

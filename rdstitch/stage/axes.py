@@ -12,11 +12,11 @@ from rdstitch.stage.grid import TileGrid
 
 _TRIED, _ENOUGH = 48, 8  # pairs of an axis that are compared at most, and those with evidence that are enough
 # factor of evidence that other axes must have: of two where one is right, the pairs along it agree in both
-_CLEARLY = 1.2
-_LEAST_NATS = 10.0  # evidence below which nothing is known, about one overlap of a correlation of 0.9
-_STANDS_OUT = 4.6  # nats by which a peak that stands out is above the others of its pair: a hundred to one
+_MIN_RATIO = 1.2
+_MIN_EVIDENCE = 10.0  # evidence below which nothing is known, about one overlap of a correlation of 0.9
+_PEAK_MARGIN = 4.6  # nats by which a peak that stands out is above the others of its pair: a hundred to one
 _ACROSS = 2.0  # times as far as along a step neighbours may be off across it
-_RIGHT_ANGLE = 0.1  # radians that the two axes may be off it
+_MAX_SKEW = 0.1  # radians that the two axes may be off it
 _SIMILAR = 0.2  # share by which the steps of pairs may differ to be compared with each other
 
 
@@ -72,7 +72,7 @@ def with_axes_shown(
                 most, best = score, [x, y]
     nominal = scores[id(told[0]), id(told[1])]
     if (
-        most < max(_LEAST_NATS, _CLEARLY * nominal)
+        most < max(_MIN_EVIDENCE, _MIN_RATIO * nominal)
         or best is told
         or all(s is None or t is None or np.abs(s - t).max() <= search for s, t in zip(best, told, strict=True))
     ):
@@ -105,13 +105,13 @@ def _axis(grid: TileGrid, axis: int, read: Callable[[int], CoarseTile], factor: 
             others = nats[np.abs(places - places[best]).max(axis=1) > min(tile.grain for tile in tiles)]
             shown.append(places[best] * factor)
             margins.append(max(0.0, float(nats[best] - others.max(initial=0.0))))
-            if sum(margin > _STANDS_OUT for margin in margins) == _ENOUGH:
+            if sum(margin > _PEAK_MARGIN for margin in margins) == _ENOUGH:
                 break
     return _Axis(np.asarray(step), np.array(shown).reshape(-1, 2), np.array(margins))
 
 
 def _perpendicular(x: FloatArray, y: FloatArray) -> bool:
-    return bool(abs(x @ y) <= math.sin(_RIGHT_ANGLE) * np.linalg.norm(x) * np.linalg.norm(y))
+    return bool(abs(x @ y) <= math.sin(_MAX_SKEW) * np.linalg.norm(x) * np.linalg.norm(y))
 
 
 def _completed(

@@ -27,16 +27,16 @@ _INDEPENDENT = 24  # independent pieces of evidence that the pixels of an overla
 _CONTENT = 0.02  # least share of the variance that is content: the noise is not known better
 _WIDE_PEAKS = 6  # highest peaks of two whole tiles that are compared by their normalized cross-correlation
 _EDGE = 0.02  # the taper of whole tiles, whose overlap is at their border
-_ASIDE = 0.35  # displacement of neighbours along one of the axes, at least, share of the side
-_LEAST_COMMON = 0.02  # share of the side that neighbours have in common, at least
+_MIN_STEP = 0.35  # displacement of neighbours along one of the axes, at least, share of the side
+_MIN_COMMON = 0.02  # share of the side that neighbours have in common, at least
 _BLOCKS = 8  # blocks along a side of a tile: a lens that bends the overlap hardly bends one of them
 # side of a block, pixels, from which on it has enough of independent pixels for its displacement to be sure
-_LEAST_SIDE = 40
+_MIN_BLOCK_SIDE = 40
 
 
 def _count(length: int, side: int) -> int:
     """Blocks along a length on a tile of a side."""
-    return max(1, min(round(length / side * _BLOCKS), length // _LEAST_SIDE))
+    return max(1, min(round(length / side * _BLOCKS), length // _MIN_BLOCK_SIDE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,8 +251,8 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
     )
     height, width = sizes.min(axis=0)
     common = [np.minimum(s[0], v + s[1]) - np.maximum(0, v) for v, s in ((y, sizes[:, 0]), (x, sizes[:, 1]))]
-    least = [max(2.0, _LEAST_COMMON * n) for n in (height, width)]
-    aside = (np.abs(y)[:, None] > _ASIDE * height) | (np.abs(x) > _ASIDE * width)
+    least = [max(2.0, _MIN_COMMON * n) for n in (height, width)]
+    aside = (np.abs(y)[:, None] > _MIN_STEP * height) | (np.abs(x) > _MIN_STEP * width)
     broad = (common[0][:, None] > 0.5 * height) | (common[1] > 0.5 * width)
     possible = aside & broad & (common[0][:, None] > least[0]) & (common[1] > least[1])
     deviation = normal_std(surface[possible]) + 1e-12

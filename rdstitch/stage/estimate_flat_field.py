@@ -21,7 +21,7 @@ from rdstitch.io.flat_field import FlatField
 from rdstitch.io.reduction import block_mean
 from rdstitch.robust.loss import NORMAL_MEDIAN, normal_std
 
-LEAST_TILES = 20  # fewer show one flat field as well as another
+MIN_TILES = 20  # fewer show one flat field as well as another
 LARGEST_ERROR = 0.01  # root mean square, by which two halves of the tiles may differ from their mean
 _PARTS = 4  # of the tiles, by which the error of the dark level is known
 _KNOWN = 3.0  # standard deviations from 0 from which on it is taken out
@@ -91,7 +91,7 @@ def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
 
 def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
     """Estimate the flat field and the dark level of tiles."""
-    if count < LEAST_TILES:
+    if count < MIN_TILES:
         return Illumination(None, math.inf, 0.0, np.zeros(1), np.zeros(1))
     first = read(0)
     shown = _Statistics(read(index) for index in range(count))

@@ -12,8 +12,9 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.places import GpsPosition
+from rdstitch.inputs.ground_control import with_ground_control
 from rdstitch.inputs.measurements import positions_of
-from rdstitch.inputs.positions import with_ground_control, with_positions
+from rdstitch.inputs.positions import with_positions
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import Metadata
 

@@ -1,0 +1,76 @@
+"""Raw files of cameras, which rawpy develops."""
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ExifTags, Image, UnidentifiedImageError
+
+from rdstitch.io.opening import reader_package
+
+_BITS = 16
+_KEPT_TAGS = {int(getattr(ExifTags.Base, name)) for name in ("Make", "Model", "Artist", "Copyright", "DateTime")}
+_KEPT_BLOCKS = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
+
+
+def own_exif(exif: Image.Exif) -> Image.Exif:
+    """EXIF of a directory of TIFF, without what describes how the file is stored."""
+    kept = Image.Exif()
+    for tag in set(exif) & _KEPT_TAGS:
+        kept[tag] = exif[tag]
+    for ifd in _KEPT_BLOCKS:
+        kept.get_ifd(ifd).update(exif.get_ifd(ifd))
+    return kept
+
+
+def read_raw(path: Path) -> NDArray[np.uint16]:
+    """Samples (h, w, 3) of a raw file, upright, with the camera's white balance, in sRGB without automatic exposure."""
+    with _raw(path) as raw:
+        samples = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=_BITS)
+        return np.asarray(samples, dtype=np.uint16)
+
+
+def raw_size(path: Path) -> tuple[int, int]:
+    """Width and height of a raw file, upright, without developing it."""
+    with _raw(path) as raw:
+        sizes = raw.sizes
+        sideways = sizes.flip in (5, 6)
+        size = (sizes.iheight, sizes.iwidth) if sideways else (sizes.iwidth, sizes.iheight)
+        return int(size[0]), int(size[1])
+
+
+def raw_exif(path: Path) -> Image.Exif:
+    """EXIF of a raw file: most are TIFF, others have a preview with it; what describes how it is stored is left out."""
+    exif = Image.Exif()
+    with suppress(SyntaxError, ValueError, OSError, struct.error), path.open("rb") as stream:
+        exif.load_from_fp(stream)
+    if not len(exif):
+        exif = _exif_of_preview(path)
+    return own_exif(exif)
+
+
+def _exif_of_preview(path: Path) -> Image.Exif:
+    package = reader_package("rawpy", path)
+    with suppress(package.LibRawError, UnidentifiedImageError), package.imread(str(path)) as raw:
+        preview = raw.extract_thumb()
+        if preview.format == package.ThumbFormat.JPEG:
+            with Image.open(BytesIO(preview.data)) as image:
+                return image.getexif()
+    return Image.Exif()
+
+
+@contextmanager
+def _raw(path: Path) -> Iterator[Any]:
+    """An opened raw file; failures of LibRaw become those of any decoder."""
+    package = reader_package("rawpy", path)
+    try:
+        with package.imread(str(path)) as raw:
+            yield raw
+    except package.LibRawError as error:
+        text = error.args[0] if error.args else ""
+        raise ValueError(text.decode() if isinstance(text, bytes) else str(error)) from error
