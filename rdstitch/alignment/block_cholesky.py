@@ -253,10 +253,18 @@ def dissection(count: int, image1: IntArray, image2: IntArray) -> tuple[IntArray
 
 
 def _coordinates(graph: "sparse.csr_array", part: IntArray) -> FloatArray:
-    """Coordinates (N, 4) of the images by their distances, in links, from the ends of their part."""
+    """Coordinates (N, 4) of the images by their distances, in links, from the ends of their part.
+
+    A link between images without a common neighbour, as wrong ones are, is as long as a way through all others.
+    """
+    both = (graph + graph.T).tocsr()
+    both.data[:] = 1.0
+    confirmed = both * (both @ both)
+    far = both - (confirmed > 0).astype(np.float64)
+    lengths = both + far * float(len(part))
 
     def distances(images: IntArray) -> FloatArray:
-        found: FloatArray = csgraph.dijkstra(graph, directed=False, indices=images, unweighted=True, min_only=True)
+        found: FloatArray = csgraph.dijkstra(lengths, directed=False, indices=images, min_only=True)
         return found
 
     def farthest(away: FloatArray) -> IntArray:

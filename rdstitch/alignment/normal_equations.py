@@ -204,7 +204,8 @@ def chain(
         for of, own in zip(images, (slice(size), slice(size, pair)), strict=True):
             # One row for each image: its block, its rows of the coupling, and its gradient.
             rows = np.concatenate([local[:, own, own], local[:, own, pair:], gradient[:, own, None]], axis=2)
-            by_image += _incidence(count, of) @ rows.reshape(len(rows), -1)
+            found, number = np.unique(of, return_inverse=True)
+            by_image[found] += _incidence(len(found), number.reshape(-1)) @ rows.reshape(len(rows), -1)
         shared += local[:, pair:, pair:].sum(axis=0)
         gradient_shared += gradient[:, pair:].sum(axis=0)
     poses, coupling, gradient_poses = np.split(by_image.reshape(count, size, -1), [size, size + others], axis=2)

@@ -64,13 +64,18 @@ def test_solution_and_diagonal_of_the_inverse_are_those_of_the_dense_matrix(
 
 
 def test_factors_grow_little_faster_than_the_images() -> None:
-    """A square of images, each linked to eight around it, of four times as many: entries of the factors an image."""
-    entries = []
-    for side in (20, 40):
+    """Squares of images, each linked to eight around it: entries of the factors an image.
+
+    Of four times as many images, and where one image in a hundred has a wrong link to some other one.
+    """
+    entries, rng = [], np.random.default_rng(4)
+    for side, wrong in ((20, 0), (40, 0), (40, 16)):
         number = np.arange(side * side).reshape(side, side)
         steps = [(number[:-1], number[1:]), (number[:, :-1], number[:, 1:])]
         steps += [(number[:-1, :-1], number[1:, 1:]), (number[1:, :-1], number[:-1, 1:])]
-        image1, image2 = (np.concatenate([step[k].ravel() for step in steps]) for k in (0, 1))
+        far = np.sort(rng.choice(side * side, (2, wrong), replace=False), axis=0)
+        image1, image2 = (np.concatenate([*(step[k].ravel() for step in steps), far[k]]) for k in (0, 1))
         fronts = Elimination.of(side * side, image1, image2).fronts
         entries.append(sum(len(each.images) * each.own * each.images.shape[1] for each in fronts) / side**2)
     assert entries[1] < 1.5 * entries[0]
+    assert entries[2] < 1.5 * entries[1]
