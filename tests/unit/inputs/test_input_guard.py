@@ -216,7 +216,7 @@ def test_what_is_in_a_folder_comes_in_natural_order_but_for_what_rdstitch_wrote(
     for name in ("f10.png", "f9.png", ".hidden.png", "notes.txt", "out.png"):
         _arriving(tmp_path / name) if name.endswith("png") else (tmp_path / name).write_text("")
     (tmp_path / "out.png.json").write_text('{"format": "rdstitch sidecar", "output": {"file": "out.png"}}')
-    arrivals = Arrivals(tmp_path, frames_folder=_nowhere, idle=0.01)
+    arrivals = Arrivals(tmp_path, frames_folder=_nowhere, idle=0.5)
     assert _names(iter(arrivals)) == ["f9.png", "f10.png"]
     assert arrivals.inputs == [str(tmp_path)]
 
