@@ -144,7 +144,7 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
     whole = [one for one in tried if one.clipped <= first.clipped]
     best = min(whole, key=lambda one: (one.faults, one.broken))
     broken = first.broken if first.layout.seams.seen else 0
-    if failed is None and best.faults == first.faults and not best.broken <= _CLEARLY * broken:
+    if failed is None and best.faults == first.faults and best.broken > _CLEARLY * broken:
         best = first
     if best.layout.seams.by_chance and not options.force:
         raise RefusedError(best.registration.with_messages([_BY_CHANCE]))
