@@ -44,7 +44,7 @@ class SeamTile:
     """One image where seams are looked at."""
 
     box: Box  # on the canvas of the tiles
-    grey: Float32Array  # (h, w)
+    grey: NDArray[Any]  # (h, w): uint8 of images of 8 bits, else float32
     inside: BoolArray  # (h, w)
 
 
@@ -209,7 +209,7 @@ def _smaller(tile: SeamTile) -> SeamTile:
     part = np.s_[y : y + rows * _COARSER, x : x + columns * _COARSER]
     left, top = (tile.box[0] + x) // _COARSER, (tile.box[1] + y) // _COARSER
     shape = rows, _COARSER, columns, _COARSER
-    grey = tile.grey[part].reshape(shape).mean(axis=(1, 3))
+    grey = tile.grey[part].reshape(shape).mean(axis=(1, 3), dtype=np.float32)
     inside: BoolArray = np.asarray(tile.inside[part].reshape(shape).all(axis=(1, 3)))
     return SeamTile((left, top, left + columns, top + rows), grey, inside)
 
@@ -288,7 +288,7 @@ def _windows(tile: SeamTile, whole: IntArray) -> Float32Array:
     """Windows (N, side, side) of a tile around places (N, 2) of the canvas."""
     side = 2 * _HALF + 1
     x, y = (whole - tile.box[:2] - _HALF).T
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(tile.grey, (side, side))[y, x])
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(tile.grey, (side, side))[y, x], dtype=np.float32)
 
 
 def _on_border(labels: NDArray[np.int32], label_size: float, pair: IntArray) -> Callable[[IntArray], BoolArray]:

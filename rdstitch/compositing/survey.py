@@ -127,6 +127,8 @@ def _seen(image: LoadedImage, warp: Warp) -> SeamTile:
     inside, opacity = geometry.inside, sample_opacity(image, geometry)
     grey = mean_of_channels(sample(image, geometry, "linear").astype(np.float32))
     grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), dtype=np.float32)
+    if image.pixels.dtype == np.uint8:
+        grey = np.rint(grey).astype(np.uint8)  # a quarter of the memory
     return SeamTile(warp.box, grey, inside if opacity is None else inside & (opacity > 0))
 
 
