@@ -27,7 +27,7 @@ from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.results.messages import Message, Severity
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
-from rdstitch.robust.posterior import EXACTNESS
+from rdstitch.robust.posterior import MODEL_ERROR
 
 _STEP = 1e-5
 """Of differences of λ, μ and ν."""
@@ -95,7 +95,7 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
     errors = whitened_errors(observations, adjusted.homographies, lens)
     squared = squared_lengths(errors)
     # No lens or plane is exact enough for matches that are off by less to disagree.
-    agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(observations.sigma(squared), EXACTNESS)) ** 2
+    agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(observations.sigma(squared), MODEL_ERROR)) ** 2
     left = coherence(observations, errors, observations.inliers(squared))
     relief = judge_relief(left, fit.model.name, len(observations))
     considered = lens_covariance

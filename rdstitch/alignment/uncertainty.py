@@ -23,11 +23,11 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.plane_marks import PlaneMarks
 from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.select import Posterior
-from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal
+from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, log_focal_deviation
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.choices import Purpose
 from rdstitch.robust.covariance import enlarged
-from rdstitch.robust.posterior import EXACTNESS, LENS
+from rdstitch.robust.posterior import LENS, MODEL_ERROR
 
 _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
 """Matches in all, and of each link at least, that say how high and how wide the hills are."""
@@ -158,7 +158,7 @@ def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *,
     one. Where the ground is ``rough`` that is known, and in the covariance.
     """
     count = len(problem.free_lens)
-    beside = beside_usual_focal(problem, fit)
+    beside = log_focal_deviation(problem, fit)
     if not rough and abs(beside) > UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
         adjuster = replace(problem, free_lens=np.ones_like(problem.free_lens)).adjuster_of(fit)
         together = adjuster.covariance(fit.adjusted)
@@ -201,7 +201,7 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
     seen = max(told - own, 1e-9 * told)
     variance = max(float(covariance[-1, -1]) - own / told**2, 1.0 / told) * (told / seen) ** 2
     weighed = prior.combined(value + prior.slope(value) / seen, math.sqrt(variance))
-    if abs(weighed - value) * float(np.median(problem.observations.scale1)) < EXACTNESS:
+    if abs(weighed - value) * float(np.median(problem.observations.scale1)) < MODEL_ERROR:
         return fit
     held = replace(problem, free_lens=np.zeros_like(problem.free_lens))
     lens = np.where(problem.free_lens, weighed, parameters.lens)

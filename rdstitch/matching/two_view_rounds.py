@@ -13,7 +13,7 @@ from rdstitch.executors import batches, in_order
 from rdstitch.features import Matcher, match_near
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
-from rdstitch.matching.candidate_pairs import pairs_that_matter
+from rdstitch.matching.candidate_pairs import select_pairs
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
 from rdstitch.matching.static_background import (
@@ -76,7 +76,7 @@ class Pairing:
             for pair, matches in shared.items()
             if len(matches) >= max(_MIN_PRESCREEN_MATCHES, _MIN_RELATIVE_MATCHES * most[[*pair]].min())
         }
-        return pairs_that_matter(promising, self.cameras)
+        return select_pairs(promising, self.cameras)
 
     def estimate(
         self,
