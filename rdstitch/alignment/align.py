@@ -114,7 +114,7 @@ def _lens_and_model(task: GivenImages) -> AdjustedImages:
     everything, relations = _observations(task.links, task.cameras, _matches_of_a_link(len(task.links), options))
     few = everything.thinned(thin_for_selection(len(task.links)))
     lens = _choose_lens(task, few, relations, known)
-    wrong, confirmed = cycle_consistency(lens.choice.pairwise, few, len(task.cameras))
+    wrong, confirmed = cycle_consistency(lens.pairwise, few, len(task.cameras))
     whole = _all_links(task, few, lens, _trust(few, confirmed), known, wrong)
     problem, images = whole.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
@@ -123,57 +123,48 @@ def _lens_and_model(task: GivenImages) -> AdjustedImages:
     if (doubt := check_attitudes(problem, options)) is not None:
         without = _lens_and_model(replace(task, options=doubt[0]))
         return replace(without, messages=(doubt[1], *without.messages))
-    choice = select_model(problem, options.models, lens.choice.refinements, options.purpose)
+    choice = select_model(problem, options.models, lens.refinements, options.purpose)
     choice, images, wrong = _drop_wrong_pairs(whole, problem, images, choice, wrong)
     problem, _ = whole.part(~wrong, images)
     choice = choose_over_relief(problem, choice, options.models, options.purpose)
     free = choice.fit.free_lens
     whole = replace(whole, observations=everything, free_lens=free, min_gain=MIN_GAIN)
-    problem, refined = replace(problem, free_lens=free), lens.choice.refined(free)
-    return AdjustedImages(task, images, ~wrong, whole, problem, choice, refined, lens.observable, lens.depth)
-
-
-@dataclass(frozen=True, eq=False)
-class _Lens:
-    """The lens that every link on its own shows."""
-
-    choice: LensChoice
-    observable: bool  # whether λ is, or is known
-    depth: bool  # whether it is not because what few images show has depth
+    problem, refined = replace(problem, free_lens=free), lens.refined(free)
+    return AdjustedImages(task, images, ~wrong, whole, problem, choice, refined)
 
 
 def _choose_lens(
     task: GivenImages, few: Observations, relations: Sequence[RadialHomography], known: CameraPriors
-) -> _Lens:
-    """Every link with a homography of its own: is λ seen, or could it be depth, and which lens is it."""
+) -> LensChoice:
+    """Of every link with a homography of its own: whether λ is seen, or could be depth, and which lens it is."""
 
     def fit(lens: FloatArray, free: BoolArray) -> BundleAdjustmentResult:
         return pairwise_homographies(few, relations_at(few, relations, lens), lens, free, known)
 
-    options, first = task.options, np.arange(len(LENS_STD)) == 0
+    options, first, none = task.options, np.arange(len(LENS_STD)) == 0, np.zeros(len(LENS_STD), dtype=np.bool_)
     # The images' points are already relative to the centre of the camera.
     given = np.array([*task.cameras[0].coefficients, 0.0, 0.0])
     if options.lens_known:
-        return _Lens(choose_lens(few, fit(given, first & False), (), known), True, False)
+        return choose_lens(few, fit(given, none), (), known)
     votes = vote([k.relation.distortion for k in task.links], [k.relation.distortion_std for k in task.links])
     pairwise = fit(np.where(first, np.nan_to_num(votes.distortion), 0.0), first)
     observable, depth = _observable(pairwise), False
     if few.image_count <= _FEW_VIEWS or not observable:
-        held = fit(given, first & False)
+        held = fit(given, none)
         depth = observable and _is_depth(pairwise, held)
         if depth or not observable:
             pairwise, observable = held, False
-    return _Lens(choose_lens(few, pairwise, options.lenses if observable else (), known), observable, depth)
+    choice = choose_lens(few, pairwise, options.lenses if observable else (), known)
+    return replace(choice, observable=observable, depth=depth)
 
 
 def _all_links(
-    task: GivenImages, few: Observations, lens: _Lens, trust: FloatArray, known: CameraPriors, wrong: BoolArray
+    task: GivenImages, few: Observations, lens: LensChoice, trust: FloatArray, known: CameraPriors, wrong: BoolArray
 ) -> Problem:
     """The problem of all images, with the reference that was asked for, or else a good one of those not ``wrong``."""
-    pairwise, reference = lens.choice.pairwise, task.options.reference
+    pairwise, reference = lens.pairwise, task.options.reference
     count, start = len(task.cameras), pairwise.parameters.lens
-    free = lens.choice.free
-    whole = Problem(few, pairwise.homographies, trust, count, reference, start, free, known, min_gain=FEW_GAIN)
+    whole = Problem(few, pairwise.homographies, trust, count, reference, start, lens.free, known, min_gain=FEW_GAIN)
     if reference is None:
         problem, images = whole.part(~wrong)
         reference = int(images[_full_size_reference(problem, [task.cameras[k] for k in images])])
@@ -199,7 +190,7 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
     held = adjust_to_map(problem, fit)
     problem, fit = held.problem, held.fit
     covariance, of_lens = covariances(problem, fit)
-    fit = weigh_lens(problem, fit, covariance) if chosen.observable else fit
+    fit = weigh_lens(problem, fit, covariance) if chosen.lens.observable else fit
     return replace(
         chosen,
         problem=problem,

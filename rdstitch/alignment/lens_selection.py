@@ -55,6 +55,8 @@ class LensChoice:
     # what may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
     # motion that is less regular. That μ is needed only pairs can say: it could stand for relief
     refinements: tuple[BoolArray, ...] = ()
+    observable: bool = True  # whether λ is observable, or known
+    depth: bool = False  # whether it is not because what few images show has depth
 
     def refined(self, free: BoolArray) -> Self:
         """With the parameters that were freed in the end."""
