@@ -93,7 +93,7 @@ class Pairing:
             return []
         known = self.estimation.distortion
         lens = distortion if known is None else known
-        registered = self._relate(chosen, self._match(chosen, "matching", shared or {}), lens, "registering pairs")
+        registered = self._estimate(chosen, self._match(chosen, "matching", shared or {}), lens, "registering pairs")
         return registered if known is not None or distortion is None else [_without_vote(pair) for pair in registered]
 
     def estimate_candidates(self, candidates: Sequence[Pair]) -> list[PairRegistration]:
@@ -131,7 +131,7 @@ class Pairing:
         weak = [k for k, pair in enumerate(pairs) if not pair.relation or pair.relation.inliers.sum() < _FEW_INLIERS]
         chosen = [(pairs[k].image1, pairs[k].image2) for k in weak]
         matched = [StoredMatches.of(match_pattern(self.features[i], self.features[j])) for i, j in chosen]
-        again = self._relate(chosen, matched, self.estimation.distortion, "matching a repeated pattern")
+        again = self._estimate(chosen, matched, self.estimation.distortion, "matching a repeated pattern")
         result = list(pairs)
         for k, pair in zip(weak, again, strict=True):
             inliers = pair.relation.inliers.sum()
@@ -156,7 +156,7 @@ class Pairing:
             known = pair.correspondences.indices[pair.relation.inliers]
             radius = _SEARCH_RADIUS * self.estimation.threshold
             matched.append(StoredMatches.of(match_near(features1, features2, expected, radius, known, self.ratio)))
-        return self._relate([pair.images for pair in pairs], matched, self.estimation.distortion)
+        return self._estimate([pair.images for pair in pairs], matched, self.estimation.distortion)
 
     def _match(
         self, pairs: Sequence[Pair], stage: str, shared: Mapping[Pair, StoredMatches] | None = None
@@ -173,7 +173,7 @@ class Pairing:
             self.progress(stage, len(done), len(pairs))
         return done
 
-    def _relate(
+    def _estimate(
         self,
         pairs: Sequence[Pair],
         matched: Sequence[StoredMatches],
