@@ -316,17 +316,10 @@ class _Answers:
 
 def _inliers(adjuster: BundleAdjuster, fit: Fit) -> Observations:
     """As many observations as say what the shape is, without those that the fit does not explain."""
-    few = adjuster.observations.thinned(max(_ENOUGH // max(len(adjuster.observations), 1), _MIN_MATCHES_PER_LINK))
+    few = adjuster.observations.thinned_to(_ENOUGH, _MIN_MATCHES_PER_LINK)
     squared = replace(adjuster, observations=few).squared(fit.adjusted.parameters)
     kept = squared <= (ALIGNMENT_WIDTH * fit.adjusted.sigma) ** 2
-    before = np.concatenate([[0], np.cumsum(kept)])
-    return replace(
-        few,
-        start=before[few.start],
-        points1=few.points1[kept],
-        points2=few.points2[kept],
-        relief=None if few.relief is None else few.relief[kept],
-    )
+    return few.rows(np.flatnonzero(kept), np.bincount(few.link[kept], minlength=len(few)))
 
 
 def _displacements(answers: _Answers, fit: Fit, count: int, cameras: Sequence[Camera]) -> FloatArray:
