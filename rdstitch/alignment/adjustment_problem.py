@@ -72,8 +72,9 @@ def independent_pairs(
     count = 2 * len(observations)
     start = Parameters(nearest_pairs(model, observations, homographies, shared, known.attitudes), shared, lens)
     freedom = FreeParameters.fixing(model, count, list(range(0, count, 2)), free_lens)
-    pairwise = observations.as_independent_pairs()
-    return BundleAdjuster(model, pairwise, freedom, known.of_camera(model, count), max_iterations=MAX_ITERATIONS), start
+    first = 2 * np.arange(len(observations))
+    apart = replace(observations, image1=first, image2=first + 1)
+    return BundleAdjuster(model, apart, freedom, known.of_camera(model, count), max_iterations=MAX_ITERATIONS), start
 
 
 def nearest_pairs(

@@ -204,8 +204,10 @@ def chain(
         for of, own in zip(images, (slice(size), slice(size, pair)), strict=True):
             # One row for each image: its block, its rows of the coupling, and its gradient.
             rows = np.concatenate([local[:, own, own], local[:, own, pair:], gradient[:, own, None]], axis=2)
+            # Summed over the links of each image.
             found, number = np.unique(of, return_inverse=True)
-            by_image[found] += _incidence(len(found), number.reshape(-1)) @ rows.reshape(len(rows), -1)
+            places, shape = (number.reshape(-1), np.arange(len(of))), (len(found), len(of))
+            by_image[found] += sparse.csr_array((np.ones(len(of)), places), shape=shape) @ rows.reshape(len(rows), -1)
         shared += local[:, pair:, pair:].sum(axis=0)
         gradient_shared += gradient[:, pair:].sum(axis=0)
     poses, coupling, gradient_poses = np.split(by_image.reshape(count, size, -1), [size, size + others], axis=2)
@@ -216,11 +218,6 @@ def chain(
     return SparseNormalEquations(
         elimination, free, poses, of_links[joined], coupling, shared, gradient_poses, gradient_shared
     )
-
-
-def _incidence(count: int, images: IntArray) -> "sparse.csr_array":
-    """Which of so many images each link has, (N, l): its product is the sum over the links of each image."""
-    return sparse.csr_array((np.ones(len(images)), (images, np.arange(len(images)))), shape=(count, len(images)))
 
 
 def link_derivatives(

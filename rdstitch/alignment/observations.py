@@ -143,8 +143,3 @@ class Observations:
     def thinned_to(self, total: int, least: int) -> Self:
         """About so many correspondences in all, and of each link at least so many, if there are."""
         return self.thinned(max(total // max(len(self), 1), least))
-
-    def as_independent_pairs(self) -> Self:
-        """Every link on its own: link l is between the images 2l and 2l + 1."""
-        first = 2 * np.arange(len(self))
-        return replace(self, image1=first, image2=first + 1)

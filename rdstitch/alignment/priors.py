@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
+from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, PlanarModel, X, Y
 from rdstitch.alignment.plane_marks import ControlPoints, PlaneMarks
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
@@ -62,10 +62,10 @@ class CameraPriors:
         Tilts are turned into what they do in the images with ``log_focal``, the prior one if not given.
         """
         known = self.of_camera(model, count)
-        if "psi" not in model.shared_names:
+        if not isinstance(model, PlanarModel):
             return known
         poses, precision = np.zeros_like(known.poses), np.zeros_like(known.poses)
-        free = list(getattr(model, "free", ()))
+        free = model.free
         focal = math.exp(self.log_focal if log_focal is None else log_focal)
         for axis, column in enumerate((PSI, THETA)):
             if column in free:

@@ -77,7 +77,10 @@ def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
     most, megapixels = options.limits
     image, detection, usable = _look(source, options, megapixels)
     shown, few = len(usable), len(usable) < _MIN_KEYPOINT_SHARE * most
-    faint = few and len(_usable(image, find(_weakened(image.grey), options))) <= _LASTING * shown
+    faint = False
+    if few:  # with differences of grey levels divided by the most that equalization multiplies them by
+        weakened = np.rint(image.grey / CLIP_LIMIT).astype(np.uint8)
+        faint = len(_usable(image, find(weakened, options))) <= _LASTING * shown
     if megapixels is not None and image.reduced and few:
         image, detection, usable = _look(source, options, CLOSER * megapixels)
     points, response = detection.points[usable], detection.response[usable]
@@ -92,11 +95,6 @@ def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
     scale = features.scale * float(np.sqrt(image.factor.prod()))
     points = image.to_full_size(features.points)
     return replace(features, points=points, scale=scale, image_size=image.full_size, shown=shown, faint=faint)
-
-
-def _weakened(grey: PixelArray) -> PixelArray:
-    """With differences of grey levels divided by the most that equalization multiplies them by."""
-    return np.rint(grey / CLIP_LIMIT).astype(np.uint8)
 
 
 def _look(

@@ -66,7 +66,8 @@ class Votes:
 
     def mahalanobis_residuals(self, expected: FloatArray | float) -> FloatArray:
         """How far each vote is from what is expected, (L, 2), in its standard deviations."""
-        return np.asarray(np.linalg.norm(self._whitened(self.distortion - expected), axis=1))
+        whitened = np.einsum("lij,lj->li", self._whitening, self.distortion - expected)
+        return np.asarray(np.linalg.norm(whitened, axis=1))
 
     def which(self, second: BoolArray) -> IntArray:
         """From which lens, 0 or 1, the two images of each pair come, shape (L, 2)."""
@@ -97,9 +98,6 @@ class Votes:
         """W (L, 2, 2), with W'W the inverse of each covariance."""
         covariance = self.covariance + _MIN_STD**2 * np.eye(2) + _COMMON_STD**2
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
-
-    def _whitened(self, values: FloatArray) -> FloatArray:
-        return np.asarray(np.einsum("lij,lj->li", self._whitening, values))
 
 
 def _votes(pairs: Sequence[PairRegistration], threshold: float) -> list[OwnLenses]:

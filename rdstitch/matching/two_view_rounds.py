@@ -94,7 +94,10 @@ class Pairing:
         known = self.estimation.distortion
         lens = distortion if known is None else known
         registered = self._estimate(chosen, self._match(chosen, "matching", shared or {}), lens, "registering pairs")
-        return registered if known is not None or distortion is None else [_without_vote(pair) for pair in registered]
+        if known is not None or distortion is None:
+            return registered
+        # λ that the others gave says nothing about λ.
+        return [replace(pair, relation=replace(pair.relation, distortion_std=np.inf)) for pair in registered]
 
     def estimate_candidates(self, candidates: Sequence[Pair]) -> list[PairRegistration]:
         """Estimate the candidate pairs that share something at first sight; all of them where none of those holds."""
@@ -196,8 +199,3 @@ class Pairing:
                 self.progress(stage, len(relations), len(pairs))
         every = zip(pairs, matched, relations, strict=True)
         return [PairRegistration(*images, matches, relation) for images, matches, relation in every]
-
-
-def _without_vote(pair: PairRegistration) -> PairRegistration:
-    """A pair whose λ was given by the others says nothing about λ."""
-    return replace(pair, relation=replace(pair.relation, distortion_std=np.inf))

@@ -182,21 +182,20 @@ def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> lis
     limit = np.inf if options.select_below is None else options.select_below
     few = search.best.inliers[solved].sum(axis=1) < limit
     fits: dict[int, PairFit] = {}
+    selection = PairSelection(
+        search.best.homography[solved],
+        search.best.distortion[solved],
+        data.take(solved),
+        None if tilts is None else tilts[solved],
+        noise=None,
+        threshold=threshold,
+        fixed_distortion=options.distortion is not None,
+    )
     planar = [PlanarPairModel(focal, std, tilts is not None, height_free=free) for free in (False, True)]
     for models, rows in ((planar, few), ([], ~few)):
-        members = solved[rows]
-        if not len(members):
-            continue
-        selection = PairSelection(
-            search.best.homography[members],
-            search.best.distortion[members],
-            data.take(members),
-            None if tilts is None else tilts[members],
-            None,
-            threshold,
-            options.distortion is not None,
-        )
-        fits.update(zip(members.tolist(), select_models(models, selection), strict=True))
+        if rows.any():
+            selected = select_models(models, selection.take(np.flatnonzero(rows)))
+            fits.update(zip(solved[rows].tolist(), selected, strict=True))
 
     result = []
     for row, pair in enumerate(pairs):

@@ -98,7 +98,7 @@ def descend(
         moved, possible = problems.retract(parameters, step)
         trial = problems.normal_equations(moved)
         better = possible & (trial.cost < problems.cost(current, trial))
-        damping = next_damping(damping, better)
+        damping = np.where(better, np.maximum(damping / 10.0, _MIN_DAMPING), damping * 20.0)  # Marquardt (1963)
         if better.any():
             parameters, current = np.where(better[:, None], moved, parameters), current.where(better, trial)
     if len(rows) == len(start):
@@ -106,11 +106,6 @@ def descend(
     result[rows] = parameters
     equations.put(rows, current)
     return result, equations
-
-
-def next_damping(damping: FloatArray, better: BoolArray) -> FloatArray:
-    """Damping of the next step, from that of a step and whether it made the loss smaller (Marquardt 1963)."""
-    return np.where(better, np.maximum(damping / 10.0, _MIN_DAMPING), damping * 20.0)
 
 
 def damping_by_gain(damping: float, failures: int, gain: float) -> tuple[float, int]:

@@ -1,6 +1,6 @@
 """Which model of the family describes each of many pairs: the least free one that explains the data."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
@@ -130,31 +130,32 @@ def _score(fitted: _Fitted, evidence: Evidence, row: IntArray, column: IntArray,
     return seen.cost + freedom_cost(equations.information.shape[1], seen.count) + equations.prior + lens
 
 
-def _finished(fitted: _Fitted, pairs: PairSelection, reasons: list[str]) -> Iterator[PairFit]:
+def _finished(fitted: _Fitted, pairs: PairSelection, reasons: list[str]) -> list[PairFit]:
     """The chosen model with its covariance, and without λ where that is not observable.
 
     ``fitted``: to all matches; ``pairs``: standing at the fits; ``reasons``: why this model was chosen, for each pair.
     """
-    described = [_described(fitted, pairs)]
-    std = np.zeros(len(reasons)) if pairs.fixed_distortion else np.sqrt(described[0][2][:, 0, 0])
-    known = [(0, row, deviation, reason) for row, (deviation, reason) in enumerate(zip(std, reasons, strict=True))]
+    covariance = pairs.problems(fitted.model).covariances(fitted.fits.parameters, fitted.equations)
+    std = np.zeros(len(reasons)) if pairs.fixed_distortion else np.sqrt(covariance[:, 0, 0])
+    result = _listed(fitted, covariance, std, reasons)
     unseen = np.flatnonzero(~(std < OBSERVABLE_STD))
     if len(unseen):
         level = replace(pairs.take(unseen), distortion=np.zeros(len(unseen)), fixed_distortion=True)
-        described.append(_described(level.fit(fitted.model), level))
-        for index, row in enumerate(unseen.tolist()):
-            why = f"{reasons[row]}; λ is not observable (standard deviation {std[row]:.2g}) and was set to 0"
-            known[row] = 1, index, np.inf, why
-    for which, row, deviation, why in known:
-        fits, errors, covariance = described[which]
-        distortion, state, homography = float(fits.distortion[row]), fits.state[row], fits.homography[row]
-        yield PairFit(fitted.model, state, homography, distortion, errors[row], covariance[row], float(deviation), why)
+        again = level.fit(fitted.model)
+        covariance = level.problems(fitted.model).covariances(again.fits.parameters, again.equations)
+        why = [
+            f"{reasons[row]}; λ is not observable (standard deviation {std[row]:.2g}) and was set to 0"
+            for row in unseen.tolist()
+        ]
+        for row, fit in zip(unseen.tolist(), _listed(again, covariance, np.full(len(why), np.inf), why), strict=True):
+            result[row] = fit
+    return result
 
 
-def _described(fitted: _Fitted, pairs: PairSelection) -> tuple[Fits, FloatArray, FloatArray]:
-    """Fits with their errors and covariances."""
-    model, fits, equations = fitted
-    return fits, equations.errors, pairs.problems(model).covariances(fits.parameters, equations)
+def _listed(fitted: _Fitted, covariance: FloatArray, std: FloatArray, reasons: list[str]) -> list[PairFit]:
+    model, fits, errors = fitted.model, fitted.fits, fitted.equations.errors
+    columns = fits.state, fits.homography, fits.distortion.tolist(), errors, covariance, std.tolist(), reasons
+    return [PairFit(model, *row) for row in zip(*columns, strict=True)]
 
 
 def rms_of(errors: FloatArray, threshold: float) -> FloatArray:
