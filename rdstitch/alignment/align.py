@@ -153,11 +153,11 @@ def _choose_lens(
     estimated = homography_apart(few, relations_at(few, relations, start), start, free, known)
     observable, depth = options.lens_known or _observable(estimated), False
     if not options.lens_known:
-        few_views = len(np.unique([few.image1, few.image2])) <= _FEW_VIEWS
+        few_views = few.image_count <= _FEW_VIEWS
         if few_views or not observable:
             given = _lens_of(task.cameras[0])
             held = homography_apart(few, relations_at(few, relations, given), given, none, known)
-            depth = observable and _is_depth(few, estimated, held)
+            depth = observable and _is_depth(estimated, held)
             observable &= not depth
     apart = estimated if observable else held
     choice = choose_lens(few, apart, options.lenses if observable else (), known)
@@ -290,16 +290,16 @@ def _lens_of(camera: Camera) -> FloatArray:
     return np.array([*camera.coefficients, 0.0, 0.0])
 
 
-def _is_depth(observations: Observations, bent: BundleAdjustmentResult, flat: BundleAdjustmentResult) -> bool:
+def _is_depth(bent: BundleAdjustmentResult, flat: BundleAdjustmentResult) -> bool:
     """Whether the depth of what a few images show may look like their lens: with λ free, and held.
 
     Depth changes most from one end of a view to the other, as the effect of a lens does: where it shows in the errors
     that are left, λ takes the blame for more of it than that.
     """
-    left = left_coherence(flat, observations)
+    left = left_coherence(flat)
     if left.correlation <= COHERENT_CORRELATION or left.relative_size <= LARGE_RELIEF:
         return False
-    with_lens = left_coherence(bent, observations)
+    with_lens = left_coherence(bent)
     return with_lens.correlation > COHERENT_CORRELATION and left.size < _LENS_OVER_DEPTH * with_lens.size
 
 

@@ -8,11 +8,9 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
-from rdstitch.alignment.bundle_adjustment import sigma_of
-from rdstitch.alignment.cycle_consistency import link_medians
-from rdstitch.alignment.frames import levelled
 from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
+from rdstitch.alignment.level_frame import levelled
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise import coherence, judge_relief
@@ -90,28 +88,25 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
         *fit.model.shared_names,
         *(name for name, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free),
     )
-    focal = float(np.exp(shared[-1])) if fit.model.one_camera else None
     lens_covariance = _lens_covariance(names, covariance)
     # What is reported is how far points are off, whatever moved them.
     observations = replace(problem.observations, relief=None)
     errors = whitened_errors(observations, adjusted.homographies, lens)
     squared = squared_lengths(errors)
-    sigma = sigma_of(squared[observations.scale_inliers_mask])
-    inliers = squared < (ALIGNMENT_WIDTH * sigma) ** 2
     # No lens or plane is exact enough for matches that are off by less to disagree.
-    agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(sigma, EXACTNESS)) ** 2
-    relief = judge_relief(coherence(observations, errors, inliers), fit.model.name, len(observations))
+    agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(observations.sigma(squared), EXACTNESS)) ** 2
+    left = coherence(observations, errors, observations.inliers(squared))
+    relief = judge_relief(left, fit.model.name, len(observations))
     considered = lens_covariance
     if adjustment.lens_covariance is not None and adjustment.observable and problem.free_lens[0]:
         considered = considered_covariance(problem, fit, adjustment.lens_covariance, rough=relief.found)
     tilt, tilt_std = ((float(values[0]), float(values[1])) if planar else None for values in (shared, std))
-    focal_std = None if focal is None else float(std[names.index("log_focal")]) * focal
 
     def adjusted_camera(camera: Camera) -> Camera:
         result = _with_lens(adjustment, camera, lens, (lens_covariance, considered))
-        if focal is not None and focal_std is not None:
-            size = camera.scale
-            result = result.with_focal(focal * size, "estimate", focal_std * size)
+        if fit.model.one_camera:
+            focal = fit.model.focal(adjusted.parameters.shared) * camera.scale
+            result = result.with_focal(focal, "estimate", float(std[names.index("log_focal")]) * focal)
         return replace(result, tilt=tilt, tilt_std=tilt_std)
 
     # Most images are of one camera.
@@ -131,12 +126,7 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
         model=fit.model.name,
         model_reason=adjustment.choice.reason,
         poses=poses,
-        tilt=tilt,
         tilt_spread=fit.tilt_spread,
-        focal=focal,
-        focal_std=focal_std,
-        distortion=reference_camera.nearest_distortion,
-        distortion_std=0.0 if reference_camera.distortion_std is None else reference_camera.distortion_std,
         lens=adjustment.lens.name,
         lens_reason=adjustment.lens.reason,
         parameters=names,
@@ -244,7 +234,7 @@ def _groups(adjustment: AdjustedImages) -> tuple[tuple[int, ...], ...]:
 def _link_fits(adjustment: AdjustedImages, squared: FloatArray, agreeing: BoolArray) -> tuple[LinkFit, ...]:
     """How well each link agrees, in the order of the links given."""
     observations = adjustment.problem.observations
-    medians = link_medians(squared, observations)
+    medians = observations.medians(np.sqrt(squared))
     images = adjustment.images
     rows = {
         frozenset((int(images[i]), int(images[j]))): row

@@ -165,16 +165,11 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
     A model that is too rigid leaves larger errors in all links; a wrong pair stands out. What is usual is what half of
     the matches have, not half of the links: many pairs far apart may show a vehicle only, with few matches each.
     """
-    typical = link_medians(squared, observations)
+    typical = observations.medians(np.sqrt(squared))
     usual = _weighted_median(typical, np.where(np.isfinite(typical), observations.matches, 0))
     least = _MIN_ERROR * np.sqrt(observations.scale1 * observations.scale2)
     outlying: BoolArray = ~(typical <= np.maximum(8.0 * usual, least))
     return outlying
-
-
-def link_medians(squared: FloatArray, observations: Observations) -> FloatArray:
-    """Median length of the errors of each link, pixels, shape (L,)."""
-    return observations.medians(np.sqrt(squared))
 
 
 def _weighted_median(values: FloatArray, weights: IntArray) -> float:

@@ -13,13 +13,11 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem, homography_apart
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
-from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import BoolArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD
-from rdstitch.robust.loss import ALIGNMENT_WIDTH
 from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, costs
 
 LENSES: dict[str, tuple[str, ...]] = {
@@ -83,7 +81,7 @@ def choose_lens(
         return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")
     if len(names) > 1 and len(observations) > _ENOUGH_LINKS:
         return _choose_by_some(observations, apart, names, known)
-    images = _images(observations)
+    images = observations.image_count
     few = len(names) > 1 and images < ENOUGH_IMAGES
     if few:
         names = [name for name in names if name != "division-center"]
@@ -99,8 +97,7 @@ def choose_lens(
         if name == "division3" and names[best] != "division2":
             break  # the next term of a series that is not needed
         fits.append(fit(free[index], fits[-1]))
-        errors = whitened_errors(observations, fits[-1].homographies, fits[-1].parameters.lens)
-        evidence = evidence_of(observations, errors)
+        evidence = evidence_of(observations, fits[-1].errors)
         rarer = 0.0 if names[best] == "division2" else TWENTY_TO_ONE  # a series that was cut off has a next term
         if _score(evidence, observations, fits[index]) + rarer < _score(evidence, observations, fits[best]):
             best = index
@@ -124,20 +121,9 @@ def _choose_by_some(
     return replace(choice, apart=apart)
 
 
-def _images(observations: Observations) -> int:
-    return len(np.unique(np.concatenate([observations.image1, observations.image2])))
-
-
-def leaves_noise(adjusted: BundleAdjustmentResult, observations: Observations) -> bool:
-    """Whether the errors of neighbours hardly agree, so that they are noise."""
-    return left_coherence(adjusted, observations).correlation < NO_COHERENCE
-
-
-def left_coherence(adjusted: BundleAdjustmentResult, observations: Observations) -> Coherence:
+def left_coherence(adjusted: BundleAdjustmentResult) -> Coherence:
     """How much the errors of neighbours agree that an adjustment leaves."""
-    errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
-    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
-    return coherence(observations, errors, inliers)
+    return coherence(adjusted.adjuster.observations, adjusted.errors, adjusted.inliers)
 
 
 def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
@@ -147,10 +133,10 @@ def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     it is smaller than its standard deviation it costs next to nothing, and left out where it is not it bends the image
     by a tenth of a pixel. Only where the errors are noise: over relief a motion model would take ν for the ground.
     """
-    adjusted, observations, finer = fit.adjusted, problem.observations, free_parameters("division3")
+    finer = free_parameters("division3")
     if problem.count < ENOUGH_IMAGES or (fit.free_lens != free_parameters("division2")).any():
         return problem, fit
-    if not leaves_noise(adjusted, observations):
+    if left_coherence(fit.adjusted).correlation >= NO_COHERENCE:
         return problem, fit
     return replace(problem, free_lens=finer), problem.extend(fit, finer)
 
@@ -162,7 +148,7 @@ def _score(evidence: Evidence, observations: Observations, fit: BundleAdjustment
     next term of a series, costs next to nothing, and never less.
     """
     lens, free = fit.parameters.lens, fit.adjuster.free.lens
-    seen = evidence.cost(whitened_errors(observations, fit.homographies, lens))
+    seen = evidence.cost(fit.errors)
     shared = 2.0 * len(observations.points1) / float(seen.count[0])
     relative = fit.covariance * shared / np.outer(LENS_STD[free], LENS_STD[free])
     narrowed = -np.log(np.clip(np.linalg.eigvalsh(relative), 1e-300, 1.0)).sum()

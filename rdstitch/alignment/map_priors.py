@@ -173,7 +173,7 @@ class _Control(_Side):
     def here(self, fit: Fit) -> ComplexArray:
         adjusted = fit.adjusted
         every = np.zeros((len(self.metres), 2))
-        focal = float(np.exp(adjusted.parameters.shared[-1]))
+        focal = fit.model.focal(adjusted.parameters.shared)
         marks = self.marks(every, np.zeros(len(every)))
         seen = marks.places(adjusted.matrices.matrices, adjusted.parameters.lens, focal)
         np.add.at(every, self.points.point, seen)
@@ -186,7 +186,7 @@ class _Control(_Side):
     def sightings(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
         parameters, marks = fit.adjusted.parameters, adjuster.priors.marks
         assert marks is not None
-        focal = float(np.exp(parameters.shared[-1]))
+        focal = fit.model.focal(parameters.shared)
         derivative = marks.equations(fit.adjusted.matrices, parameters.lens, adjuster.free.lens, focal)[1]
         return marks.image, derivative, marks.precision
 

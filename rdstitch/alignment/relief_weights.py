@@ -93,8 +93,7 @@ def _is_rough(problem: Problem, fit: Fit) -> bool:
 
     Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
     """
-    left = left_coherence(fit.adjusted, problem.observations)
-    return judge_relief(left, fit.model.name, len(problem.observations)).found
+    return judge_relief(left_coherence(fit.adjusted), fit.model.name, len(problem.observations)).found
 
 
 def _settled(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:

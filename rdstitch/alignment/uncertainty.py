@@ -88,7 +88,7 @@ def sandwich_covariances(
 def _relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> ReliefField:
     """What relief does, by as many matches of each link as show its waves."""
     observations = adjuster.observations
-    few = observations.thinned(max(_ENOUGH // max(len(observations), 1), _MIN_MATCHES_PER_LINK))
+    few = observations.thinned_to(_ENOUGH, _MIN_MATCHES_PER_LINK)
     share = len(few.points1) / max(len(observations.points1), 1)
     if share < 1.0:  # each counts for several beside the priors
         adjuster = replace(adjuster, observations=few, overdispersion=adjuster.overdispersion * share)
@@ -222,7 +222,7 @@ def lever_std(problem: Problem, fit: Fit) -> float:
     assert isinstance(model, PlanarModel)
     steps_of_poses, steps_of_shared = _relief(adjuster, fit.adjusted).steps()
     size, images = model.pose_size, np.arange(problem.count)
-    focal = float(np.exp(parameters.shared[2]))
+    focal = model.focal(parameters.shared)
     middles = PlaneMarks(images, np.zeros((len(images), 2)), np.zeros((len(images), 2)), np.ones(len(images)))
     derivative = middles.equations(fit.adjusted.matrices, parameters.lens, adjuster.free.lens, focal)[1]
     derivative[:, [0, 1], [model.free.index(column) for column in (X, Y)]] -= 1.0
@@ -266,7 +266,7 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
 def _jacobian(model: PlanarModel, poses: FloatArray, shared: FloatArray, reference: int, size: int) -> FloatArray:
     """Derivatives (N, 4, D + S) of x, y, height and yaw in the frame of the reference."""
     yaw, height = poses[reference, YAW], float(np.exp(poses[reference, LOG_HEIGHT]))
-    unit = 1.0 / (height * np.exp(shared[2]))
+    unit = 1.0 / (height * model.focal(shared))
     turn = unit * np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     jacobian = np.zeros((len(poses), 4, size))
     for place, column in enumerate(model.free):

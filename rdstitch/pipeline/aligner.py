@@ -9,10 +9,9 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
-from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cut_outs import common_size, cut_alignment, framed_camera, framed_link
-from rdstitch.alignment.frames import QuarterTurns
 from rdstitch.alignment.plane_marks import Sighting
+from rdstitch.alignment.quarter_turns import QuarterTurns
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
@@ -27,6 +26,7 @@ from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
+from rdstitch.robust.loss import sigma_of
 from rdstitch.system.cache import Cache
 from rdstitch.system.file_access import canonical_name
 from rdstitch.system.process_memory import return_freed_memory

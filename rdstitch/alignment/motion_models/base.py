@@ -29,7 +29,6 @@ class MotionModel(ABC):
     one_camera: bool = True
     # Whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one
     free_tilts: bool = False
-    # Whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one
     any_tilt: bool = False
 
     @property
@@ -48,6 +47,10 @@ class MotionModel(ABC):
     def shared_from_physical(self, physical: FloatArray) -> FloatArray:
         """The inverse of :meth:`physical_parameters`, also from those of a model with more of them."""
         return np.asarray(physical[len(physical) - len(self.shared_names) :], dtype=np.float64)
+
+    def focal(self, shared: FloatArray) -> float:
+        """Focal length of the one camera, half diagonals."""
+        return float(np.exp(shared[-1]))
 
     @abstractmethod
     def shared_starts(self, log_focal: float, tilt: Sequence[float], *, tilt_known: bool) -> list[FloatArray]:

@@ -166,9 +166,9 @@ def test_images_without_a_mask_among_others_are_named() -> None:
 @pytest.mark.parametrize(("relief", "severity"), [(True, "warning"), (False, "detail")])
 def test_free_homographies_are_doubted_where_neighbours_errors_agree(relief: bool, severity: str) -> None:
     ground = replace(FLAT.alignment.relief, found=relief)
-    found = evidence(registration(focal=None, relief=ground))
+    found = evidence(registration(parameters=(), relief=ground))
     assert [(own.kind, own.severity) for own in rules._free_homographies(found)] == [(Kind.FREE_HOMOGRAPHIES, severity)]
-    assert not list(rules._free_homographies(evidence(registration(2, focal=None, relief=ground))))
+    assert not list(rules._free_homographies(evidence(registration(2, parameters=(), relief=ground))))
 
 
 LARGEST = 0.02 * 500.0  # pixels that relief explains, of images with a diagonal of 500

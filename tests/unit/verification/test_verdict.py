@@ -203,7 +203,7 @@ def test_of_doubtful_pairs_on_which_nothing_depends_the_images_are_named() -> No
 
 def test_homographies_over_a_scene_with_depth_are_doubted_in_what_they_add_up_to(good: Registration) -> None:
     relief = replace(good.alignment.relief, found=True)
-    free = replace(good, alignment=replace(good.alignment, focal=None, relief=relief))
+    free = replace(good, alignment=replace(good.alignment, parameters=(), relief=relief))
     (message,) = (own for own in judge(free, THRESHOLD) if own.severity == "warning")
     assert "homography of its own" in message.text
     assert len(message.images) == 2
