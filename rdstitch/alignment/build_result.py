@@ -77,7 +77,7 @@ class AdjustedImages:
 def build_alignment(adjustment: AdjustedImages) -> Alignment:
     """The alignment, in the frame of the reference image.
 
-    A draft, which has no covariances, is not tested for its shape, and has the deviations of independent errors.
+    A draft, which has no covariances, has the deviations of independent errors.
     """
     problem, fit = adjustment.problem, adjustment.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)

@@ -211,10 +211,10 @@ as before."""
 
 
 def _bent(evidence: Evidence) -> bool:
-    """Whether what neighbours share leaves a plane that three or more images hold together bent by more than an inlier
-    may be off: it adds up, twice over three images. Seams hold over any ground where local alignment makes them.
+    """Whether what neighbours share shows a bent plane, even where seams hold: it adds up from image to image, and
+    tilts take most of it up.
     """
-    return evidence.flat and 2.0 * evidence.alignment.relief.size > limit("error") * evidence.threshold
+    return evidence.flat and evidence.alignment.relief.size > limit("bent") * evidence.threshold
 
 
 def _depth_seen(evidence: Evidence) -> bool:

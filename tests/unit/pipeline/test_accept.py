@@ -176,9 +176,6 @@ def test_a_draft_lacks_uncertainties(registered: tuple[Aligner, list[PairRegistr
     assert aligner.completed(complete) is complete
     first, second = draft.alignment, complete.alignment
     assert (first.model, first.lens == "division") == (second.model, False)
-    assert first.poses is not None
-    assert second.poses is not None
-    assert first.poses.covariance is None
-    assert second.poses.covariance is not None
+    assert first.distortion_std < second.distortion_std  # that of independent errors
     assert abs(first.distortion - second.distortion) < 3.0 * second.distortion_std
     np.testing.assert_allclose(first.homographies, second.homographies, atol=0.01)

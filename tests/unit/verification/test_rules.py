@@ -51,8 +51,8 @@ UNLIKE = evidence(TURNED.registration, alike=0.1)
         (evidence(TURNED.registration, Purpose.MOSAIC, alike=0.1), [Kind.RELIEF, Kind.ROUGH], []),
         # What local alignment hides along the seams of a plane leaves the whole bent.
         (evidence(FLAT.registration, Purpose.MOSAIC, alike=0.8), [Kind.RELIEF, Kind.ROUGH], [Kind.ROUGH]),
-        (_mosaic(2.9), [Kind.RELIEF], [Kind.RELIEF]),  # adds up to more than the threshold of 3 pixels
-        (_mosaic(1.4), [Kind.RELIEF], []),
+        (_mosaic(1.01), [Kind.RELIEF], [Kind.RELIEF]),  # a third of the threshold
+        (_mosaic(0.99), [Kind.RELIEF], []),
     ],
 )
 def test_what_is_said_aloud(found: Evidence, kinds: list[Kind], said: list[Kind]) -> None:
