@@ -72,8 +72,8 @@ def independent_pairs(
     count = 2 * len(observations)
     start = Parameters(nearest_pairs(model, observations, homographies, shared, known.attitudes), shared, lens)
     freedom = FreeParameters.fixing(model, count, list(range(0, count, 2)), free_lens)
-    apart = observations.as_independent_pairs()
-    return BundleAdjuster(model, apart, freedom, known.of_camera(model, count), max_iterations=MAX_ITERATIONS), start
+    pairwise = observations.as_independent_pairs()
+    return BundleAdjuster(model, pairwise, freedom, known.of_camera(model, count), max_iterations=MAX_ITERATIONS), start
 
 
 def nearest_pairs(
@@ -81,7 +81,7 @@ def nearest_pairs(
 ) -> FloatArray:
     """Poses of both images of every link, (2 L, ...), nearest to its homography (L, 3, 3); the first at the origin."""
     tilts = attitudes[np.stack([observations.image1, observations.image2], axis=1)].reshape(-1, 2)
-    matrices = model.origins(shared, tilts)
+    matrices = model.nominal_homographies(shared, tilts)
     matrices[1::2] = homographies @ matrices[0::2]
     return model.nearest_poses(matrices, shared, tilts)
 
@@ -170,7 +170,7 @@ class Problem:
         """
         if not others and not model.one_camera and self.count > _LONG_CHAIN:
             others = [self.fit(SIMILARITY)]
-        starts = [self.taken_over(model, other) for other in others]
+        starts = [self.start_from(model, other) for other in others]
         if model.any_tilt:
             starts.append(self._upgraded(model))
         elif not (others and model.free_tilts):
@@ -246,9 +246,9 @@ class Problem:
         o, attitudes = self.observations, self.camera_priors.attitudes
         shared, homographies = np.zeros(0), self.homographies
         if model.one_camera:
-            shared, homographies = self._links_apart(SIMILARITY if model.free_tilts else model, others, start)
+            shared, homographies = self._one_camera_links(SIMILARITY if model.free_tilts else model, others, start)
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
-        origin = model.origins(shared, attitudes[[tree.root]])[0]
+        origin = model.nominal_homographies(shared, attitudes[[tree.root]])[0]
         chained = tree.chained(homographies, o.image1, origin)
         return Parameters(model.nearest_poses(chained, shared, attitudes), shared, self.lens)
 
@@ -261,7 +261,7 @@ class Problem:
         shared = model.shared_from_physical(np.array([*upgraded.tilt, upgraded.log_focal]))
         return Parameters(upgraded.poses, shared, self.lens)
 
-    def _links_apart(
+    def _one_camera_links(
         self, model: MotionModel, others: Sequence[Fit], shared: FloatArray | None
     ) -> tuple[FloatArray, FloatArray]:
         """Shared parameters, and with these the homographies (L, 3, 3) under one camera that are nearest to the links.
@@ -283,7 +283,7 @@ class Problem:
         adjuster, start = self._best_trial(model)
         return adjuster.run(start)
 
-    def apart(self, model: MotionModel, trial: BundleAdjustmentResult) -> BundleAdjustmentResult:
+    def pairwise(self, model: MotionModel, trial: BundleAdjustmentResult) -> BundleAdjustmentResult:
         """All links on their own under one camera, which starts as a trial has it."""
         o, homographies, shared = self.observations, self.homographies, trial.parameters.shared
         adjuster, start = independent_pairs(
@@ -305,11 +305,11 @@ class Problem:
         adjuster, start = trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
         return replace(adjuster, min_gain=ROUGH_GAIN), start
 
-    def taken_over(self, model: MotionModel, other: Fit) -> Parameters:
+    def start_from(self, model: MotionModel, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""
         parameters = other.adjusted.parameters
         if isinstance(model, PlanarModel) and isinstance(other.model, PlanarModel):
-            return replace(parameters, poses=model.taken_over(other.model, parameters.poses, parameters.shared))
+            return replace(parameters, poses=model.start_from(other.model, parameters.poses, parameters.shared))
         shared = parameters.shared if model.one_camera else np.empty(0)
         poses = model.nearest_poses(other.adjusted.matrices.matrices, shared, self.camera_priors.attitudes)
         return Parameters(poses, shared, parameters.lens)
@@ -323,7 +323,7 @@ class Problem:
         return min(starts, key=lambda start: float(robust_cost(adjuster.squared(start), width).sum()))
 
 
-def homography_apart(
+def pairwise_homographies(
     observations: Observations, homographies: FloatArray, lens: FloatArray, free_lens: BoolArray, known: CameraPriors
 ) -> BundleAdjustmentResult:
     """Every link on its own with a homography: what is wrong with a link shows nowhere else."""

@@ -26,7 +26,7 @@ from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.results.messages import Message, Severity
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
-from rdstitch.robust.posterior import EXACTNESS
+from rdstitch.robust.posterior import MODEL_ERROR
 
 _STEP = 1e-5
 """Of differences of λ, μ and ν."""
@@ -64,8 +64,6 @@ class AdjustedImages:
     problem: Problem  # of those aligned, with the matches that they were adjusted by
     choice: ModelChoice
     lens: LensChoice  # the lens, with the distortion centre if the motion model freed it
-    observable: bool  # whether λ is observable, or known
-    depth: bool  # whether that is because what few images show has depth
     positions_disagree: str = ""  # why the positions were not used; empty where they were, or where there are none
     leverage: Mapping[int | str, float] = field(default_factory=dict)  # see Alignment
     messages: tuple[Message, ...] = ()  # on what was given
@@ -94,11 +92,11 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
     errors = whitened_errors(observations, adjusted.homographies, lens)
     squared = squared_lengths(errors)
     # No lens or plane is exact enough for matches that are off by less to disagree.
-    agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(observations.sigma(squared), EXACTNESS)) ** 2
+    agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(observations.sigma(squared), MODEL_ERROR)) ** 2
     left = coherence(observations, errors, observations.inliers(squared))
     relief = judge_relief(left, fit.model.name, len(observations))
     considered = lens_covariance
-    if adjustment.lens_covariance is not None and adjustment.observable and problem.free_lens[0]:
+    if adjustment.lens_covariance is not None and adjustment.lens.observable and problem.free_lens[0]:
         considered = considered_covariance(problem, fit, adjustment.lens_covariance, rough=relief.found)
     tilt, tilt_std = ((float(values[0]), float(values[1])) if planar else None for values in (shared, std))
 
@@ -167,7 +165,7 @@ def _with_lens(
     if estimated and result.sees_beyond_horizon:
         raise ImpossibleCameraError(f"with λ = {result.distortion:.3g} the corners would see behind the camera")
     lens_free = bool(adjustment.problem.free_lens.any())
-    shown = adjustment.observable and (adjustment.choice.fit.adjusted.converged or not lens_free)
+    shown = adjustment.lens.observable and (adjustment.choice.fit.adjusted.converged or not lens_free)
     std = _nearest_distortion_std(result, considered) if shown else math.inf
     return replace(result, distortion_std=std)
 
@@ -272,12 +270,12 @@ def _warnings(adjustment: AdjustedImages, camera: Camera, considered: FloatArray
     result: list[Message] = []
     # An image can be right whatever the lens is, and a path by what is known of the lens.
     image_only, severity = adjustment.given.options.purpose.picture, adjustment.given.options.purpose.unknown_lens
-    if adjustment.depth or not adjustment.observable:
+    if adjustment.lens.depth or not adjustment.lens.observable:
         cause, remedy = "the images hardly move, or only turn about the optical axis", "images that overlap by less"
-        if adjustment.depth:
+        if adjustment.lens.depth:
             cause, remedy = "what the images show has depth, which looks like a lens in so few of them", "more images"
         text = f"λ is not observable: {cause}; give λ, a camera file, or {remedy}"
-        grave: Severity = "failure" if adjustment.depth and not image_only else severity
+        grave: Severity = "failure" if adjustment.lens.depth and not image_only else severity
         result.append(Message(text, severity=grave, code="lambda-not-observable"))
     elif len(adjustment.images) < ENOUGH_IMAGES and adjustment.problem.free_lens.any():
         every = replace(camera, lens_covariance=tuple(map(tuple, considered.tolist())))

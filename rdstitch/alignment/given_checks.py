@@ -72,7 +72,7 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
     if not isinstance(fit.model, PlanarModel):
         return None
     if fit.model.free_tilts and not fit.model.any_tilt:  # whose prior draws tilts together
-        fit = bare.refine(POSE, bare.taken_over(POSE, fit))
+        fit = bare.refine(POSE, bare.start_from(POSE, fit))
     shown = _ShownTilts.of(bare, fit, free_mount=options.tilt is None)
     if known.delayed_attitudes is not None and (late := shown.delay(known.delayed_attitudes + known.tilt)) is not None:
         attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])

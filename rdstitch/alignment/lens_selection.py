@@ -11,7 +11,7 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import Fit, Problem, homography_apart
+from rdstitch.alignment.adjustment_problem import Fit, Problem, pairwise_homographies
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of
 from rdstitch.alignment.observations import Observations
@@ -50,11 +50,13 @@ class LensChoice:
 
     name: str  # a key of LENSES
     free: BoolArray  # (5,): its parameters among LENS_PARAMETERS
-    apart: BundleAdjustmentResult  # every link on its own with this lens
+    pairwise: BundleAdjustmentResult  # every link on its own with this lens
     reason: str  # one sentence
     # what may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
     # motion that is less regular. That μ is needed only pairs can say: it could stand for relief
     refinements: tuple[BoolArray, ...] = ()
+    observable: bool = True  # whether λ is observable, or known
+    depth: bool = False  # whether it is not because what few images show has depth
 
     def refined(self, free: BoolArray) -> Self:
         """With the parameters that were freed in the end."""
@@ -71,16 +73,16 @@ def free_parameters(name: str) -> BoolArray:
 
 
 def choose_lens(
-    observations: Observations, apart: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
+    observations: Observations, pairwise: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
 ) -> LensChoice:
     """Choose among lenses, keys of :data:`LENSES` from the simplest; none where the lens is given.
 
-    ``apart`` is every link on its own with a homography, and λ free unless the lens is given.
+    ``pairwise`` is every link on its own with a homography, and λ free unless the lens is given.
     """
     if not names:
-        return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")
+        return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), pairwise, "given")
     if len(names) > 1 and len(observations) > _ENOUGH_LINKS:
-        return _choose_by_some(observations, apart, names, known)
+        return _choose_by_some(observations, pairwise, names, known)
     images = observations.image_count
     few = len(names) > 1 and images < ENOUGH_IMAGES
     if few:
@@ -88,11 +90,13 @@ def choose_lens(
     free = [free_parameters(name) & ~(CENTER & few) for name in names]
 
     def fit(free: BoolArray, start: BundleAdjustmentResult) -> BundleAdjustmentResult:
-        return homography_apart(observations, start.homographies, start.parameters.lens, free, known)
+        return pairwise_homographies(observations, start.homographies, start.parameters.lens, free, known)
 
     if len(names) == 1:
-        return LensChoice(names[0], free[0], apart if names[0] == "division" else fit(free[0], apart), "as requested")
-    fits, best = [apart], 0
+        return LensChoice(
+            names[0], free[0], pairwise if names[0] == "division" else fit(free[0], pairwise), "as requested"
+        )
+    fits, best = [pairwise], 0
     for index, name in enumerate(names[1:], start=1):
         if name == "division3" and names[best] != "division2":
             break  # the next term of a series that is not needed
@@ -109,16 +113,18 @@ def choose_lens(
 
 
 def _choose_by_some(
-    observations: Observations, apart: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
+    observations: Observations, pairwise: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
 ) -> LensChoice:
     """The lens that evenly chosen links show, and every link on its own with it."""
-    start, simplest = apart.parameters.lens, free_parameters("division")
+    start, simplest = pairwise.parameters.lens, free_parameters("division")
     some = np.arange(0, len(observations), -(-len(observations) // _ENOUGH_LINKS))
     few = observations.subset(some)
-    choice = choose_lens(few, homography_apart(few, apart.homographies[some], start, simplest, known), names, known)
+    choice = choose_lens(
+        few, pairwise_homographies(few, pairwise.homographies[some], start, simplest, known), names, known
+    )
     if (choice.free != simplest).any():
-        apart = homography_apart(observations, apart.homographies, start, choice.free, known)
-    return replace(choice, apart=apart)
+        pairwise = pairwise_homographies(observations, pairwise.homographies, start, choice.free, known)
+    return replace(choice, pairwise=pairwise)
 
 
 def left_coherence(adjusted: BundleAdjustmentResult) -> Coherence:

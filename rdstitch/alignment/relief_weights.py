@@ -49,7 +49,7 @@ def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[st
     # From the least free one: a camera that is free to tilt has already followed the hills.
     for model in (SIMILARITY, TILTING):
         if model.name in names and not choice.fit.model.any_tilt:
-            start = problem.refine(model, problem.taken_over(model, fits[-1])) if fits else problem.fit(model)
+            start = problem.refine(model, problem.start_from(model, fits[-1])) if fits else problem.fit(model)
             problem, fit = _settled(problem, start)
             fits.append(fit)
     if not fits:

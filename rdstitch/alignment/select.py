@@ -179,7 +179,7 @@ def select_model(
             tried.append(posterior.of(problem.fit(turn)))
             continue
         trial = wide.trial(turn)
-        bound, shared = posterior.bound(turn, posterior.cost(wide.apart(turn, trial))), trial.parameters.shared
+        bound, shared = posterior.bound(turn, posterior.cost(wide.pairwise(turn, trial))), trial.parameters.shared
         if not planar or bound < posterior.bound(planar[0], posterior.least):
             tried.append(posterior.of(problem.fit(turn, shared=shared)))
         else:

@@ -26,7 +26,7 @@ from rdstitch.alignment.select import Posterior
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.choices import Purpose
 from rdstitch.robust.covariance import enlarged
-from rdstitch.robust.posterior import EXACTNESS, LENS
+from rdstitch.robust.posterior import LENS, MODEL_ERROR
 
 _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
 """Matches in all, and of each link at least, that say how high and how wide the hills are."""
@@ -205,7 +205,7 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
     seen = max(told - own, 1e-9 * told)
     variance = max(float(covariance[-1, -1]) - own / told**2, 1.0 / told) * (told / seen) ** 2
     weighed = prior.combined(value + prior.slope(value) / seen, math.sqrt(variance))
-    if abs(weighed - value) * float(np.median(problem.observations.scale1)) < EXACTNESS:
+    if abs(weighed - value) * float(np.median(problem.observations.scale1)) < MODEL_ERROR:
         return fit
     held = replace(problem, free_lens=np.zeros_like(problem.free_lens))
     lens = np.where(problem.free_lens, weighed, parameters.lens)

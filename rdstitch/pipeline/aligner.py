@@ -18,7 +18,7 @@ from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationEr
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.measurements import metres_around_median, positions_of
 from rdstitch.inputs.source import Source
-from rdstitch.matching.candidate_pairs import neighbours
+from rdstitch.matching.candidate_pairs import loop_closures
 from rdstitch.matching.copies import copies_of, distinct
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
@@ -216,9 +216,9 @@ def draft_with_loops(
     for _ in range(_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
         tried = {pair.images for pair in pairs}
-        loop_closures = neighbours(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
+        beside = loop_closures(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
         unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
-        more = pairing.estimate(sorted(unaligned.union(loop_closures)), distortion=alignment.distortion)
+        more = pairing.estimate(sorted(unaligned.union(beside)), distortion=alignment.distortion)
         selected = select_by_whole_lens(aligned, aligner.threshold)
         pairs = tuple(sorted([*(selected or pairs), *more], key=lambda pair: pair.images))
         if selected is None and not any(pair.relation for pair in more):

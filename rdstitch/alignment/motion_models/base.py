@@ -65,7 +65,7 @@ class MotionModel(ABC):
         return np.zeros((len(poses), self.pose_size))
 
     @abstractmethod
-    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+    def nominal_homographies(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """Homographies (N, 3, 3) of images at the origin of the plane, with the tilts (N, 2) given."""
 
     @abstractmethod

@@ -10,7 +10,7 @@ from rdstitch.alignment.noise import Coherence, coherence, evidence_of, judge_re
 from rdstitch.alignment.noise import independent_errors as independent
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import FloatArray
-from rdstitch.robust.posterior import EXACTNESS
+from rdstitch.robust.posterior import MODEL_ERROR
 from tests.alignment_stubs import SHIFT, independent_errors, observations
 
 
@@ -135,7 +135,7 @@ def test_what_cannot_be_transferred_is_infinitely_off() -> None:
     assert squared_lengths(np.array([[3.0, 4.0], [np.nan, 1.0]])).tolist() == [25.0, np.inf]
 
 
-@pytest.mark.parametrize(("sigma", "noise"), [(0.5, 0.5), (0.01, EXACTNESS)])
+@pytest.mark.parametrize(("sigma", "noise"), [(0.5, 0.5), (0.01, MODEL_ERROR)])
 def test_the_noise_is_the_scatter_or_what_no_model_is_exact_to(sigma: float, noise: float) -> None:
     errors = independent_errors(sigma=sigma)
     assert evidence_of(observations(errors), errors.reshape(-1, 2)).noise[0] == pytest.approx(noise, rel=0.05)
