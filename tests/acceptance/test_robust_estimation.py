@@ -25,8 +25,13 @@ def test_recall_and_distortion(outliers: float, motion: str, told: str) -> None:
     for seed in range(PAIRS // 2 if told == "nothing" else PAIRS):
         matches = correspondences(400, seed=seed, outliers=outliers, motion=motion)
         camera, truth = matches.truth.camera, matches.truth.motion
-        known = {"focal": camera.focal if "focal" in told else None, "tilt": truth.tilt if "tilt" in told else None}
-        found = rdstitch.estimate_radial_homography(matches.points1, matches.points2, camera.image_size, **known)
+        found = rdstitch.estimate_radial_homography(
+            matches.points1,
+            matches.points2,
+            camera.image_size,
+            focal=camera.focal if "focal" in told else None,
+            tilt=truth.tilt if "tilt" in told else None,
+        )
         recall.append((found.inliers & matches.inliers).sum() / matches.inliers.sum())
         error.append(abs(found.distortion - camera.distortion))
     assert np.median(recall) > 0.97

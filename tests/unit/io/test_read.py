@@ -145,7 +145,7 @@ class TestMetadata:
     ) -> None:
         exif = Image.Exif()
         exif[0x8769] = tags
-        told = {"xmp": f"<rdf:Description {xmp}/>".encode()} if xmp else {}
+        told: dict[str, Any] = {"xmp": f"<rdf:Description {xmp}/>".encode()} if xmp else {}
         Image.new("L", (width, width * 3 // 4)).save(tmp_path / "a.jpg", exif=exif, **told)
         assert read_metadata(tmp_path / "a.jpg").focal_px == pytest.approx(focal)
 
