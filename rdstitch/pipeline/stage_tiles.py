@@ -38,8 +38,9 @@ from rdstitch.stage.axes import with_axes_shown
 from rdstitch.stage.correlation import coarse_tile
 from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
+from rdstitch.stage.pair_candidates import SearchPlan
 from rdstitch.stage.positions import Scan, grid_from_arrays, grid_from_names, grid_from_table, grid_from_tiles
-from rdstitch.stage.register_tiles import SearchPlan, TileRegistration, register_tiles
+from rdstitch.stage.register_tiles import TileRegistration, register_tiles
 from rdstitch.stage.tile_frames import tile_frames
 from rdstitch.stage.tile_inputs import as_tiles
 from rdstitch.system.opencv_state import one_opencv_thread
