@@ -31,7 +31,7 @@ from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.straighten import turned_anew
-from rdstitch.results.messages import Message, told_once
+from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.messages import left_out as left_out_message
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
@@ -368,7 +368,7 @@ def _used(
 ) -> dict[int, Source]:
     """The images of the output, with their masks, by their number in the registration; at least one, or all."""
     if strict and left_out:
-        raise PartialResultError("; ".join(map(str, told_once(left_out.values()))))
+        raise PartialResultError("; ".join(map(str, merge_by_reason(left_out.values()))))
     used = {index: source for index, source in enumerate(sources) if source is not None}
     if not used:
         first = next(iter(left_out.values()))
