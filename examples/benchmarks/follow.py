@@ -29,7 +29,7 @@ from rdstitch.system.process_memory import peak_memory
 
 def path_of(frames: list[Pose]) -> Trajectory:
     """The path of the poses as they were given last: a better alignment gives earlier ones again."""
-    known = {frame.number: pose for frame in frames if frame.tracked and (pose := frame.tracked.pose)}
+    known = {frame.number: pose for frame in frames if (pose := frame.tracked.pose)}
     numbers = sorted(known)
     places = np.array([(known[k].x, known[k].y) for k in numbers])
     yaw, height = (np.array([getattr(known[k], name) for k in numbers]) for name in ("yaw", "height"))
@@ -74,8 +74,8 @@ def main(
             if len(poses) == frames // 3:
                 memory = peak_memory()
         whole = rdstitch.trajectory([images], None, options)[0] if end else None
-    placed = {frame.number for frame in poses if frame.tracked and frame.tracked.placement is not None}
-    unknown = [k for k, frame in enumerate(poses) if not (frame.tracked and frame.tracked.distortion_known)]
+    placed = {frame.number for frame in poses if frame.tracked.placement is not None}
+    unknown = [k for k, frame in enumerate(poses) if not frame.tracked.distortion_known]
     for name, rows in (("λ unknown", unknown), ("λ known", sorted({*range(len(poses))} - {*unknown}))):
         if rows:
             part = np.array(spent)[rows]
@@ -86,9 +86,8 @@ def main(
             print(f"a second), {1e3 * part.max():.0f} ms the slowest")
     for share in (0.05, 0.1, 0.25, 0.5, 1.0):
         tracked = poses[max(int(share * len(poses)) - 1, 0)].tracked
-        if tracked is not None:
-            print(f"after {share:4.0%} of the frames: λ - truth {tracked.distortion - DISTORTION:+.5f}", end=" ")
-            print(f"± {tracked.distortion_std:.5f}")
+        print(f"after {share:4.0%} of the frames: λ - truth {tracked.distortion - DISTORTION:+.5f}", end=" ")
+        print(f"± {tracked.distortion_std:.5f}")
     print(f"{len(placed)} of {frames} frames placed, along {truth.length:.0f} heights of the camera")
     for name, one in (("while driving", path_of(poses)), ("at the end", whole)):
         if one is not None:

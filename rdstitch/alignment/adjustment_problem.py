@@ -1,5 +1,6 @@
 """One connected set of images, the priors of its camera, and the adjustment of one model to it."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,19 +16,18 @@ from rdstitch.alignment.bundle_adjustment import (
     BundleAdjustmentResult,
     FreeParameters,
     Parameters,
-    sigma_of,
 )
 from rdstitch.alignment.link_equations import split_lens, squared_lengths, whitened_errors
 from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, SIMILARITY, THETA, MotionModel, PlanarModel
 from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import CameraPriors, Priors
+from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import RadialHomography, inverses, transfer
 from rdstitch.matching.match_graph import connected_components, spanning_tree
-from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
+from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost, sigma_of
 from rdstitch.solvers.homography import direct_linear
 
 MAX_ITERATIONS = 24
@@ -62,19 +62,18 @@ def independent_pairs(
     shared: FloatArray,
     lens: FloatArray,
     free_lens: BoolArray,
-    priors: Priors,
-    attitudes: FloatArray,
+    known: CameraPriors,
 ) -> tuple[BundleAdjuster, Parameters]:
     """Return the adjustment of every link on its own, with the shared parameters in common, and where it starts.
-    Of the links' homographies (L, 3, 3) at this lens, and of tilts that differ from the shared one by attitudes (N, 2),
-    radians. Priors on the poses are not used.
+
+    Of the links' homographies (L, 3, 3) at this lens. Of what is known of the camera, attitudes are taken as exact, and
+    nothing of the poses besides.
     """
     count = 2 * len(observations)
-    start = Parameters(nearest_pairs(model, observations, homographies, shared, attitudes), shared, lens)
-    known = replace(Priors.none(model, count), shared=priors.shared, lens=priors.lens)
+    start = Parameters(nearest_pairs(model, observations, homographies, shared, known.attitudes), shared, lens)
     freedom = FreeParameters.fixing(model, count, list(range(0, count, 2)), free_lens)
-    apart = observations.as_independent_pairs()
-    return BundleAdjuster(model, apart, freedom, known, max_iterations=MAX_ITERATIONS), start
+    pairwise = observations.as_independent_pairs()
+    return BundleAdjuster(model, pairwise, freedom, known.of_camera(model, count), max_iterations=MAX_ITERATIONS), start
 
 
 def nearest_pairs(
@@ -82,7 +81,7 @@ def nearest_pairs(
 ) -> FloatArray:
     """Poses of both images of every link, (2 L, ...), nearest to its homography (L, 3, 3); the first at the origin."""
     tilts = attitudes[np.stack([observations.image1, observations.image2], axis=1)].reshape(-1, 2)
-    matrices = model.origins(shared, tilts)
+    matrices = model.nominal_homographies(shared, tilts)
     matrices[1::2] = homographies @ matrices[0::2]
     return model.nearest_poses(matrices, shared, tilts)
 
@@ -171,7 +170,7 @@ class Problem:
         """
         if not others and not model.one_camera and self.count > _LONG_CHAIN:
             others = [self.fit(SIMILARITY)]
-        starts = [self.taken_over(model, other) for other in others]
+        starts = [self.start_from(model, other) for other in others]
         if model.any_tilt:
             starts.append(self._upgraded(model))
         elif not (others and model.free_tilts):
@@ -193,35 +192,30 @@ class Problem:
             spread = tilt_spread or _TILT_SPREAD_START
         else:
             spread = POSE_TILT_SPREAD if model.any_tilt and measured is None else measured or 0.0
-        overdispersion, rounds = self.overdispersion, 0
-
-        def revised(now: BundleAdjuster, parameters: Parameters, sigma: float, errors: FloatArray) -> BundleAdjuster:
-            """The adjuster with the scales that a solution shows; as it is where they hardly change."""
-            nonlocal spread, overdispersion, rounds
-            rounds += 1
+        overdispersion = self.overdispersion
+        adjusted = self.adjuster(model, spread, start.shared).run(start, rough=True)
+        for rounds in itertools.count(1):
+            # Attitudes are divided by the focal length.
+            again = model.free_tilts and measured is not None and rounds == 1
             if estimated and rounds <= _ROUNDS:
-                tilts = parameters.poses[:, [PSI, THETA]] * math.exp(parameters.shared[-1])
+                tilts = adjusted.parameters.poses[:, [PSI, THETA]] * model.focal(adjusted.parameters.shared)
                 former, spread = spread, max(float(np.sqrt(np.mean(tilts**2))), _MIN_TILT_SPREAD)
-                if abs(spread - former) > _SETTLED * former:
-                    return self.adjuster(model, spread, parameters.shared, overdispersion)
-            if model.free_tilts and measured is not None and rounds == 1:  # attitudes are divided by the focal length
-                return self.adjuster(model, spread, parameters.shared, overdispersion)
-            if sigma > _MISFIT * self._link_sigma and overdispersion == self.overdispersion:
-                inliers = squared_lengths(errors) <= (ALIGNMENT_WIDTH * sigma) ** 2
-                shared = shared_variance(self.observations, errors, inliers)
-                if shared > overdispersion:
-                    overdispersion = shared
-                    return self.adjuster(model, spread, parameters.shared, overdispersion)
-            return now
-
-        adjusted = self.adjuster(model, spread, start.shared).run(start, revised)
+                again = abs(spread - former) > _SETTLED * former
+            if not again and overdispersion == self.overdispersion and adjusted.sigma > _MISFIT * self._link_sigma:
+                shared = shared_variance(self.observations, adjusted.errors, adjusted.inliers)
+                overdispersion = max(overdispersion, shared)
+                again = overdispersion > self.overdispersion
+            if not again:
+                break
+            at = adjusted.parameters
+            adjusted = self.adjuster(model, spread, at.shared, overdispersion).run(at, rough=True)
         return Fit(model, adjusted, self.free_lens, spread if model.free_tilts else 0.0, overdispersion)
 
     @cached_property
     def _link_sigma(self) -> float:
         """Standard deviation of a coordinate of the errors of links on their own, pixels."""
         squared = squared_lengths(whitened_errors(self.observations, self.homographies, self.lens))
-        return sigma_of(squared[self.observations.scale_inliers_mask])
+        return self.observations.sigma(squared)
 
     def extend(self, fit: Fit, lens: BoolArray) -> Fit:
         """The same model with more of the lens free."""
@@ -252,9 +246,9 @@ class Problem:
         o, attitudes = self.observations, self.camera_priors.attitudes
         shared, homographies = np.zeros(0), self.homographies
         if model.one_camera:
-            shared, homographies = self._links_apart(SIMILARITY if model.free_tilts else model, others, start)
+            shared, homographies = self._one_camera_links(SIMILARITY if model.free_tilts else model, others, start)
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
-        origin = model.origins(shared, attitudes[[tree.root]])[0]
+        origin = model.nominal_homographies(shared, attitudes[[tree.root]])[0]
         chained = tree.chained(homographies, o.image1, origin)
         return Parameters(model.nearest_poses(chained, shared, attitudes), shared, self.lens)
 
@@ -267,7 +261,7 @@ class Problem:
         shared = model.shared_from_physical(np.array([*upgraded.tilt, upgraded.log_focal]))
         return Parameters(upgraded.poses, shared, self.lens)
 
-    def _links_apart(
+    def _one_camera_links(
         self, model: MotionModel, others: Sequence[Fit], shared: FloatArray | None
     ) -> tuple[FloatArray, FloatArray]:
         """Shared parameters, and with these the homographies (L, 3, 3) under one camera that are nearest to the links.
@@ -289,23 +283,21 @@ class Problem:
         adjuster, start = self._best_trial(model)
         return adjuster.run(start)
 
-    def apart(self, model: MotionModel, trial: BundleAdjustmentResult) -> BundleAdjustmentResult:
+    def pairwise(self, model: MotionModel, trial: BundleAdjustmentResult) -> BundleAdjustmentResult:
         """All links on their own under one camera, which starts as a trial has it."""
-        known, shared = self.camera_priors, trial.parameters.shared
-        priors = known.priors(model, self.count, _TILT_SPREAD_START)
+        o, homographies, shared = self.observations, self.homographies, trial.parameters.shared
         adjuster, start = independent_pairs(
-            model, self.observations, self.homographies, shared, self.lens, self.free_lens, priors, known.attitudes
+            model, o, homographies, shared, self.lens, self.free_lens, self.camera_priors
         )
         return replace(adjuster, min_gain=self.min_gain).run(start)
 
     def _best_trial(self, model: MotionModel) -> tuple[BundleAdjuster, Parameters]:
         """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
         known, links = self.camera_priors, len(self.observations)
-        priors = known.priors(model, self.count, _TILT_SPREAD_START)
         few = evenly_spaced(links, _TRIAL_LINKS)
         sample, homographies = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
         trials = [
-            independent_pairs(model, sample, homographies, shared, self.lens, self.free_lens, priors, known.attitudes)
+            independent_pairs(model, sample, homographies, shared, self.lens, self.free_lens, known)
             for shared in model.shared_starts(known.log_focal, known.tilt, tilt_known=known.tilt_known)
         ]
         squared = [adjuster.squared(start) for adjuster, start in trials]
@@ -313,11 +305,11 @@ class Problem:
         adjuster, start = trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
         return replace(adjuster, min_gain=ROUGH_GAIN), start
 
-    def taken_over(self, model: MotionModel, other: Fit) -> Parameters:
+    def start_from(self, model: MotionModel, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""
         parameters = other.adjusted.parameters
         if isinstance(model, PlanarModel) and isinstance(other.model, PlanarModel):
-            return replace(parameters, poses=model.taken_over(other.model, parameters.poses, parameters.shared))
+            return replace(parameters, poses=model.start_from(other.model, parameters.poses, parameters.shared))
         shared = parameters.shared if model.one_camera else np.empty(0)
         poses = model.nearest_poses(other.adjusted.matrices.matrices, shared, self.camera_priors.attitudes)
         return Parameters(poses, shared, parameters.lens)
@@ -331,14 +323,11 @@ class Problem:
         return min(starts, key=lambda start: float(robust_cost(adjuster.squared(start), width).sum()))
 
 
-def homography_apart(
+def pairwise_homographies(
     observations: Observations, homographies: FloatArray, lens: FloatArray, free_lens: BoolArray, known: CameraPriors
 ) -> BundleAdjustmentResult:
     """Every link on its own with a homography: what is wrong with a link shows nowhere else."""
-    priors = known.priors(HOMOGRAPHY, 0, 0.0)
-    adjuster, at = independent_pairs(
-        HOMOGRAPHY, observations, homographies, np.empty(0), lens, free_lens, priors, known.attitudes
-    )
+    adjuster, at = independent_pairs(HOMOGRAPHY, observations, homographies, np.empty(0), lens, free_lens, known)
     return adjuster.run(at)
 
 

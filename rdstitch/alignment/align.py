@@ -9,7 +9,7 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import (
     Fit,
     Problem,
-    homography_apart,
+    pairwise_homographies,
     relations_at,
     thin_for_selection,
 )
@@ -19,7 +19,7 @@ from rdstitch.alignment.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjus
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
 from rdstitch.alignment.lens_selection import LensChoice, choose_lens, left_coherence, with_third_coefficient
-from rdstitch.alignment.map_priors import hold_on_map
+from rdstitch.alignment.map_priors import adjust_to_map
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, independent_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors
@@ -32,7 +32,7 @@ from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationEr
 from rdstitch.geometry.camera import LENS_STD, Camera
 from rdstitch.geometry.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
 from rdstitch.geometry.radial_homography import RadialHomography
-from rdstitch.matching.distortion_consensus import Consensus, vote
+from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link, in_alternate_directions
 from rdstitch.robust.posterior import LENS
 
@@ -84,17 +84,17 @@ class AlignmentTask(GivenImages):
     @cached_property
     def draft(self) -> Alignment:
         """Model, lens and poses by a few matches of each link; deviations are those of independent errors."""
-        return build_alignment(self._chosen)
+        return build_alignment(self._selected)
 
     @cached_property
     def result(self) -> Alignment:
         """Adjusted to all matches."""
-        return build_alignment(_checked_focal(_adjusted(self._chosen), self.options))
+        return build_alignment(_checked_focal(_adjusted(self._selected), self.options))
 
     @cached_property
-    def _chosen(self) -> AdjustedImages:
+    def _selected(self) -> AdjustedImages:
         _check(self.cameras, self.links, self.options)
-        return _chosen(self)
+        return _lens_and_model(self)
 
 
 def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
@@ -108,69 +108,63 @@ def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
     return int(full[np.argmax(trust)])
 
 
-def _chosen(task: GivenImages) -> AdjustedImages:
+def _lens_and_model(task: GivenImages) -> AdjustedImages:
     """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
     options, known = task.options, task.options.camera_priors(task.cameras)
     everything, relations = _observations(task.links, task.cameras, _matches_of_a_link(len(task.links), options))
     few = everything.thinned(thin_for_selection(len(task.links)))
     lens = _choose_lens(task, few, relations, known)
-    wrong, confirmed = cycle_consistency(lens.choice.apart, few, len(task.cameras))
+    wrong, confirmed = cycle_consistency(lens.pairwise, few, len(task.cameras))
     whole = _all_links(task, few, lens, _trust(few, confirmed), known, wrong)
     problem, images = whole.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
     problem = replace(problem, overdispersion=shared)
     if (doubt := check_attitudes(problem, options)) is not None:
-        without = _chosen(replace(task, options=doubt[0]))
+        without = _lens_and_model(replace(task, options=doubt[0]))
         return replace(without, messages=(doubt[1], *without.messages))
-    choice = select_model(problem, options.models, lens.choice.refinements, options.purpose)
+    choice = select_model(problem, options.models, lens.refinements, options.purpose)
     choice, images, wrong = _drop_wrong_pairs(whole, problem, images, choice, wrong)
     problem, _ = whole.part(~wrong, images)
     choice = choose_over_relief(problem, choice, options.models, options.purpose)
     free = choice.fit.free_lens
     whole = replace(whole, observations=everything, free_lens=free, min_gain=MIN_GAIN)
-    problem, refined = replace(problem, free_lens=free), lens.choice.refined(free)
-    return AdjustedImages(task, images, ~wrong, whole, problem, choice, refined, lens.observable, lens.depth)
-
-
-@dataclass(frozen=True, eq=False)
-class _Lens:
-    """The lens that every link on its own shows."""
-
-    choice: LensChoice
-    free: BoolArray  # (5,): parameters of the lens that are to be estimated
-    observable: bool  # whether λ is, or is known
-    depth: bool  # whether it is not because what few images show has depth
+    problem, refined = replace(problem, free_lens=free), lens.refined(free)
+    return AdjustedImages(task, images, ~wrong, whole, problem, choice, refined)
 
 
 def _choose_lens(
     task: GivenImages, few: Observations, relations: Sequence[RadialHomography], known: CameraPriors
-) -> _Lens:
-    """Every link with a homography of its own: is λ seen, or could it be depth, and which lens is it."""
-    options, none = task.options, np.zeros(len(LENS_STD), dtype=np.bool_)
+) -> LensChoice:
+    """Of every link with a homography of its own: whether λ is seen, or could be depth, and which lens it is."""
+
+    def fit(lens: FloatArray, free: BoolArray) -> BundleAdjustmentResult:
+        return pairwise_homographies(few, relations_at(few, relations, lens), lens, free, known)
+
+    options, first, none = task.options, np.arange(len(LENS_STD)) == 0, np.zeros(len(LENS_STD), dtype=np.bool_)
+    # The images' points are already relative to the centre of the camera.
+    given = np.array([*task.cameras[0].coefficients, 0.0, 0.0])
+    if options.lens_known:
+        return choose_lens(few, fit(given, none), (), known)
     votes = vote([k.relation.distortion for k in task.links], [k.relation.distortion_std for k in task.links])
-    start, free = _lens_start(task.cameras, options, votes)
-    estimated = homography_apart(few, relations_at(few, relations, start), start, free, known)
-    observable, depth = options.lens_known or _observable(estimated), False
-    if not options.lens_known:
-        few_views = len(np.unique([few.image1, few.image2])) <= _FEW_VIEWS
-        if few_views or not observable:
-            given = _lens_of(task.cameras[0])
-            held = homography_apart(few, relations_at(few, relations, given), given, none, known)
-            depth = observable and _is_depth(few, estimated, held)
-            observable &= not depth
-    apart = estimated if observable else held
-    choice = choose_lens(few, apart, options.lenses if observable else (), known)
-    return _Lens(choice, choice.free if observable else none, observable, depth)
+    pairwise = fit(np.where(first, np.nan_to_num(votes.distortion), 0.0), first)
+    observable, depth = _observable(pairwise), False
+    if few.image_count <= _FEW_VIEWS or not observable:
+        held = fit(given, none)
+        depth = observable and _is_depth(pairwise, held)
+        if depth or not observable:
+            pairwise, observable = held, False
+    choice = choose_lens(few, pairwise, options.lenses if observable else (), known)
+    return replace(choice, observable=observable, depth=depth)
 
 
 def _all_links(
-    task: GivenImages, few: Observations, lens: _Lens, trust: FloatArray, known: CameraPriors, wrong: BoolArray
+    task: GivenImages, few: Observations, lens: LensChoice, trust: FloatArray, known: CameraPriors, wrong: BoolArray
 ) -> Problem:
     """The problem of all images, with the reference that was asked for, or else a good one of those not ``wrong``."""
-    apart, reference = lens.choice.apart, task.options.reference
-    count, start = len(task.cameras), apart.parameters.lens
-    whole = Problem(few, apart.homographies, trust, count, reference, start, lens.free, known, min_gain=FEW_GAIN)
+    pairwise, reference = lens.pairwise, task.options.reference
+    count, start = len(task.cameras), pairwise.parameters.lens
+    whole = Problem(few, pairwise.homographies, trust, count, reference, start, lens.free, known, min_gain=FEW_GAIN)
     if reference is None:
         problem, images = whole.part(~wrong)
         reference = int(images[_full_size_reference(problem, [task.cameras[k] for k in images])])
@@ -193,10 +187,10 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
     fit = from_another_start(problem, fit)
     if len(options.lenses) > 1:
         problem, fit = with_third_coefficient(problem, fit)
-    held = hold_on_map(problem, fit)
+    held = adjust_to_map(problem, fit)
     problem, fit = held.problem, held.fit
     covariance, of_lens = covariances(problem, fit)
-    fit = weigh_lens(problem, fit, covariance) if chosen.observable else fit
+    fit = weigh_lens(problem, fit, covariance) if chosen.lens.observable else fit
     return replace(
         chosen,
         problem=problem,
@@ -216,26 +210,26 @@ def from_another_start(problem: Problem, fit: Fit) -> Fit:
     return min((fit, problem.fit(fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
 
 
-def _checked_focal(told: AdjustedImages, given: AlignmentOptions) -> AdjustedImages:
+def _checked_focal(adjusted: AdjustedImages, given: AlignmentOptions) -> AdjustedImages:
     """Without the focal length that was given, where it gave way and the images by themselves show another one."""
-    if told.covariance is None or not is_strained(told.whole.camera_priors, told.choice.fit):
-        return told
-    task = told.given
+    if adjusted.covariance is None or not is_strained(adjusted.whole.camera_priors, adjusted.choice.fit):
+        return adjusted
+    task = adjusted.given
     cameras = [replace(camera, focal=None, focal_std=None, focal_source=None).with_focal() for camera in task.cameras]
     # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
     only_tilt = task.options.attitudes is None and task.options.tilt is not None
     options = replace(task.options, tilt=None) if only_tilt else task.options
     without = GivenImages(cameras, task.links, options)
     try:
-        shown = _adjusted(_chosen(without))
-        doubt = check_focal(task.cameras[shown.images[0]], shown.choice.fit, shown.covariance)
+        free = _adjusted(_lens_and_model(without))
+        doubt = check_focal(task.cameras[free.images[0]], free.choice.fit, free.covariance)
         if doubt is None:
-            return told
+            return adjusted
         if options is not given:  # what seemed to be wrong may have been so with the wrong focal length only
-            shown = _adjusted(_chosen(replace(without, options=given)))
+            free = _adjusted(_lens_and_model(replace(without, options=given)))
     except (RegistrationError, ImpossibleCameraError, np.linalg.LinAlgError):
-        return told  # by themselves the images determine nothing
-    return replace(shown, messages=(*shown.messages, doubt))
+        return adjusted  # by themselves the images determine nothing
+    return replace(free, messages=(*free.messages, doubt))
 
 
 def most_matches_read(links: int, options: AlignmentOptions) -> int | None:
@@ -277,37 +271,24 @@ def _trust(observations: Observations, confirmed: IntArray) -> FloatArray:
     return np.argsort(np.lexsort((observations.areas, matches))).astype(np.float64)
 
 
-def _lens_start(cameras: Sequence[Camera], options: AlignmentOptions, votes: Consensus) -> tuple[FloatArray, BoolArray]:
-    """Where the lens starts, and which of its parameters are free."""
-    first = np.arange(len(LENS_STD)) == 0
-    if options.lens_known:
-        return _lens_of(cameras[0]), np.zeros_like(first)
-    return np.where(first, votes.distortion if votes.votes else 0.0, 0.0), first
-
-
-def _lens_of(camera: Camera) -> FloatArray:
-    """The lens of a camera; the images' points are already relative to its centre."""
-    return np.array([*camera.coefficients, 0.0, 0.0])
-
-
-def _is_depth(observations: Observations, bent: BundleAdjustmentResult, flat: BundleAdjustmentResult) -> bool:
+def _is_depth(bent: BundleAdjustmentResult, flat: BundleAdjustmentResult) -> bool:
     """Whether the depth of what a few images show may look like their lens: with λ free, and held.
 
     Depth changes most from one end of a view to the other, as the effect of a lens does: where it shows in the errors
     that are left, λ takes the blame for more of it than that.
     """
-    left = left_coherence(flat, observations)
+    left = left_coherence(flat)
     if left.correlation <= COHERENT_CORRELATION or left.relative_size <= LARGE_RELIEF:
         return False
-    with_lens = left_coherence(bent, observations)
+    with_lens = left_coherence(bent)
     return with_lens.correlation > COHERENT_CORRELATION and left.size < _LENS_OVER_DEPTH * with_lens.size
 
 
-def _observable(apart: BundleAdjustmentResult) -> bool:
+def _observable(pairwise: BundleAdjustmentResult) -> bool:
     """Whether one homography a pair leaves λ well determined, at a value that a lens can have."""
-    distortion = float(apart.parameters.lens[0])
+    distortion = float(pairwise.parameters.lens[0])
     # Without what the prior says.
-    information = 1.0 / float(apart.covariance[0, 0]) - LENS[0].curvature(distortion)
+    information = 1.0 / float(pairwise.covariance[0, 0]) - LENS[0].curvature(distortion)
     return information > OBSERVABLE_STD**-2.0 and PLAUSIBLE_DISTORTION[0] < distortion < PLAUSIBLE_DISTORTION[1]
 
 

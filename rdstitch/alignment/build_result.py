@@ -8,11 +8,9 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
-from rdstitch.alignment.bundle_adjustment import sigma_of
-from rdstitch.alignment.cycle_consistency import link_medians
-from rdstitch.alignment.frames import levelled
 from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
+from rdstitch.alignment.level_frame import levelled
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise import coherence, judge_relief
@@ -29,7 +27,7 @@ from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.results.messages import Message, Severity
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
-from rdstitch.robust.posterior import EXACTNESS
+from rdstitch.robust.posterior import MODEL_ERROR
 
 _STEP = 1e-5
 """Of differences of λ, μ and ν."""
@@ -67,8 +65,6 @@ class AdjustedImages:
     problem: Problem  # of those aligned, with the matches that they were adjusted by
     choice: ModelChoice
     lens: LensChoice  # the lens, with the distortion centre if the motion model freed it
-    observable: bool  # whether λ is observable, or known
-    depth: bool  # whether that is because what few images show has depth
     positions_disagree: str = ""  # why the positions were not used; empty where they were, or where there are none
     leverage: Mapping[int | str, float] = field(default_factory=dict)  # see Alignment
     messages: tuple[Message, ...] = ()  # on what was given
@@ -91,28 +87,25 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
         *fit.model.shared_names,
         *(name for name, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free),
     )
-    focal = float(np.exp(shared[-1])) if fit.model.one_camera else None
     lens_covariance = _lens_covariance(names, covariance)
     # What is reported is how far points are off, whatever moved them.
     observations = replace(problem.observations, relief=None)
     errors = whitened_errors(observations, adjusted.homographies, lens)
     squared = squared_lengths(errors)
-    sigma = sigma_of(squared[observations.scale_inliers_mask])
-    inliers = squared < (ALIGNMENT_WIDTH * sigma) ** 2
     # No lens or plane is exact enough for matches that are off by less to disagree.
-    agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(sigma, EXACTNESS)) ** 2
-    relief = judge_relief(coherence(observations, errors, inliers), fit.model.name, len(observations))
+    agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(observations.sigma(squared), MODEL_ERROR)) ** 2
+    left = coherence(observations, errors, observations.inliers(squared))
+    relief = judge_relief(left, fit.model.name, len(observations))
     considered = lens_covariance
-    if adjustment.lens_covariance is not None and adjustment.observable and problem.free_lens[0]:
+    if adjustment.lens_covariance is not None and adjustment.lens.observable and problem.free_lens[0]:
         considered = considered_covariance(problem, fit, adjustment.lens_covariance, rough=relief.found)
     tilt, tilt_std = ((float(values[0]), float(values[1])) if planar else None for values in (shared, std))
-    focal_std = None if focal is None else float(std[names.index("log_focal")]) * focal
 
     def adjusted_camera(camera: Camera) -> Camera:
         result = _with_lens(adjustment, camera, lens, (lens_covariance, considered))
-        if focal is not None and focal_std is not None:
-            size = camera.scale
-            result = result.with_focal(focal * size, "estimate", focal_std * size)
+        if fit.model.one_camera:
+            focal = fit.model.focal(adjusted.parameters.shared) * camera.scale
+            result = result.with_focal(focal, "estimate", float(std[names.index("log_focal")]) * focal)
         return replace(result, tilt=tilt, tilt_std=tilt_std)
 
     # Most images are of one camera.
@@ -132,12 +125,7 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
         model=fit.model.name,
         model_reason=adjustment.choice.reason,
         poses=poses,
-        tilt=tilt,
         tilt_spread=fit.tilt_spread,
-        focal=focal,
-        focal_std=focal_std,
-        distortion=reference_camera.nearest_distortion,
-        distortion_std=0.0 if reference_camera.distortion_std is None else reference_camera.distortion_std,
         lens=adjustment.lens.name,
         lens_reason=adjustment.lens.reason,
         parameters=names,
@@ -155,7 +143,7 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
 def _shape(adjustment: AdjustedImages) -> ShapeTest | None:
     """Whether the whole may be bent, with the image's index among all."""
     fit = adjustment.choice.fit
-    if fit.model.on_sphere or not adjustment.observable or adjustment.covariance is None:
+    if fit.model.on_sphere or not adjustment.lens.observable or adjustment.covariance is None:
         return None
     images = adjustment.images
     judged = judge_shape(adjustment.problem, fit, [adjustment.given.cameras[k] for k in images])
@@ -189,7 +177,7 @@ def _with_lens(
     if estimated and result.sees_beyond_horizon:
         raise ImpossibleCameraError(f"with λ = {result.distortion:.3g} the corners would see behind the camera")
     lens_free = bool(adjustment.problem.free_lens.any())
-    shown = adjustment.observable and (adjustment.choice.fit.adjusted.converged or not lens_free)
+    shown = adjustment.lens.observable and (adjustment.choice.fit.adjusted.converged or not lens_free)
     std = _nearest_distortion_std(result, considered) if shown else math.inf
     return replace(result, distortion_std=std)
 
@@ -256,7 +244,7 @@ def _groups(adjustment: AdjustedImages) -> tuple[tuple[int, ...], ...]:
 def _link_fits(adjustment: AdjustedImages, squared: FloatArray, agreeing: BoolArray) -> tuple[LinkFit, ...]:
     """How well each link agrees, in the order of the links given."""
     observations = adjustment.problem.observations
-    medians = link_medians(squared, observations)
+    medians = observations.medians(np.sqrt(squared))
     images = adjustment.images
     rows = {
         frozenset((int(images[i]), int(images[j]))): row
@@ -294,12 +282,12 @@ def _warnings(adjustment: AdjustedImages, camera: Camera, considered: FloatArray
     result: list[Message] = []
     # An image can be right whatever the lens is, and a path by what is known of the lens.
     image_only, severity = adjustment.given.options.purpose.picture, adjustment.given.options.purpose.unknown_lens
-    if adjustment.depth or not adjustment.observable:
+    if adjustment.lens.depth or not adjustment.lens.observable:
         cause, remedy = "the images hardly move, or only turn about the optical axis", "images that overlap by less"
-        if adjustment.depth:
+        if adjustment.lens.depth:
             cause, remedy = "what the images show has depth, which looks like a lens in so few of them", "more images"
         text = f"λ is not observable: {cause}; give λ, a camera file, or {remedy}"
-        grave: Severity = "failure" if adjustment.depth and not image_only else severity
+        grave: Severity = "failure" if adjustment.lens.depth and not image_only else severity
         result.append(Message(text, severity=grave, code="lambda-not-observable"))
     elif len(adjustment.images) < ENOUGH_IMAGES and adjustment.problem.free_lens.any():
         every = replace(camera, lens_covariance=tuple(map(tuple, considered.tolist())))

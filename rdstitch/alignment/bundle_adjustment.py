@@ -4,7 +4,6 @@ Levenberg-Marquardt on a robust loss of the transfer errors in measured pixels, 
 of the loss follows the scatter of the errors, from wide to narrow, so that good links are not lost to a rough start.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -26,7 +25,7 @@ from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain
-from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
+from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 from rdstitch.robust.posterior import costs, curvatures, slopes
 
 MIN_GAIN = 1e-5
@@ -34,9 +33,6 @@ MIN_GAIN = 1e-5
 
 FEW_GAIN, ROUGH_GAIN = 1e-4, 1e-3
 """The same of a few matches of each pair; and where another descent goes on from there."""
-
-_MIN_SIGMA = 1e-3
-"""Pixels; a smaller one is not measurable, and errors are divided by it."""
 
 WIDEST_START = 0.05
 """Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is down-weighted."""
@@ -101,9 +97,19 @@ class BundleAdjustmentResult:
         return self.adjuster.of_links(self.matrices)
 
     @cached_property
+    def errors(self) -> FloatArray:
+        """Of each correspondence (M, 2), pixels, whitened; NaN where it cannot be transferred."""
+        return whitened_errors(self.adjuster.observations, self.homographies, self.parameters.lens)
+
+    @cached_property
     def squared(self) -> FloatArray:
-        """``|r|²`` of each correspondence (M,), px², whitened; inf where it cannot be transferred."""
-        return self.adjuster.squared(self.parameters)
+        """``|r|²`` of each correspondence (M,), px²; inf where it cannot be transferred."""
+        return squared_lengths(self.errors)
+
+    @property
+    def inliers(self) -> BoolArray:
+        """Correspondences (M,) that the adjustment explains."""
+        return self.squared <= (ALIGNMENT_WIDTH * self.sigma) ** 2
 
     @property
     def equations(self) -> LinkEquations:
@@ -141,9 +147,6 @@ _FIRST_DAMPING = 1e-6
 """Of the diagonal of the normal matrix. Focal length and tilts of many images are so weak together that a hundred times
 as much held them: of 300 frames the focal length stayed 13 % off, with a standard deviation of 2 %."""
 
-Revision = Callable[["BundleAdjuster", Parameters, float, FloatArray], "BundleAdjuster"]
-"""See :meth:`BundleAdjuster.run`."""
-
 
 @dataclass(frozen=True)
 class BundleAdjuster:
@@ -158,34 +161,26 @@ class BundleAdjuster:
     max_iterations: int = 60  # linearizations at most
     min_gain: float = MIN_GAIN  # expected relative fall of the cost that is worth another step
 
-    def run(self, start: Parameters, revise: Revision | None = None) -> BundleAdjustmentResult:
+    def run(self, start: Parameters, *, rough: bool = False) -> BundleAdjustmentResult:
         """Adjust.
 
-        ``revise``: takes the adjuster, a solution, its scatter and its whitened errors (M, 2) to the adjuster to go on
-        with; the same one ends the adjustment. Then the loss is as wide in the beginning as most links need, and again
-        after each revision; otherwise the scatter of the first errors decides.
+        From a ``rough`` start the loss is as wide in the beginning as most links need; otherwise the scatter of the
+        first errors decides.
         """
-
-        def widest(squared: FloatArray, sigma: float) -> float:
-            return max(self._rough_width(squared) if revise else 0.0, ALIGNMENT_WIDTH * sigma)
-
         squared = self.squared(start)
-        sigma, damping = self._sigma(squared), _FIRST_DAMPING
-        adjuster, wide, parameters, total, used = self, widest(squared, sigma), start, 0, 0
+        sigma, damping, parameters, used = self._sigma(squared), _FIRST_DAMPING, start, 0
+        wide = max(self._rough_width(squared) if rough else 0.0, ALIGNMENT_WIDTH * sigma)
         while True:
             last = wide <= ALIGNMENT_WIDTH * sigma * 1.05
-            descent = adjuster._descend(parameters, sigma, wide, damping, 12 if last else 4)
-            parameters, errors, damping = descent.parameters, descent.errors, descent.damping
-            squared, total, used = squared_lengths(errors), total + descent.iterations, used + descent.iterations
-            sigma, previous = self._sigma(squared), sigma
+            descent = self._descend(parameters, sigma, wide, damping, 12 if last else 4)
+            parameters, damping, used = descent.parameters, descent.damping, used + descent.iterations
+            squared, previous = squared_lengths(descent.errors), sigma
+            scatter, sigma = self.observations.sigma(squared), self._sigma(squared)
             wide = max(wide / 3.0, ALIGNMENT_WIDTH * sigma)
-            settled = abs(sigma - previous) <= 0.02 * previous and np.isfinite(self.scatter(squared))
+            settled = abs(sigma - previous) <= 0.02 * previous and np.isfinite(scatter)
             converged = bool(last and descent.converged and settled)
             if converged or used >= self.max_iterations:
-                revised = revise(adjuster, parameters, sigma, errors) if revise else adjuster
-                if revised is adjuster:
-                    return BundleAdjustmentResult(adjuster, parameters, sigma, converged, total)
-                adjuster, wide, used = revised, widest(squared, sigma), 0
+                return BundleAdjustmentResult(self, parameters, sigma, converged, used)
 
     def squared(self, parameters: Parameters) -> FloatArray:
         """``|r|²`` of each correspondence (M,), px², whitened; inf where it cannot be transferred."""
@@ -265,13 +260,9 @@ class BundleAdjuster:
         most = 1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95))
         return min(most, WIDEST_START * float(np.median(self.observations.scale2)))
 
-    def scatter(self, squared: FloatArray) -> float:
-        """Standard deviation of an error's coordinate, pixels; inf where most cannot be transferred."""
-        return sigma_of(squared[self.observations.scale_inliers_mask])
-
     def _sigma(self, squared: FloatArray) -> float:
-        """The same, or half a diagonal, from which a descent may find back."""
-        return min(self.scatter(squared), float(np.median(self.observations.scale2)))
+        """Standard deviation of an error's coordinate, or half a diagonal, from which a descent may find back."""
+        return min(self.observations.sigma(squared), float(np.median(self.observations.scale2)))
 
     def weight(self, sigma: float) -> float:
         """Of squared errors of this scatter: one over their variance, as far as they are independent."""
@@ -291,7 +282,7 @@ class BundleAdjuster:
         if (marks := self.priors.marks) is None:
             return known
         matrices = self.model.matrices(parameters.poses, parameters.shared).matrices
-        return known + marks.cost(matrices, parameters.lens, float(np.exp(parameters.shared[-1])))
+        return known + marks.cost(matrices, parameters.lens, self.model.focal(parameters.shared))
 
     def _normal_equations(self, state: _State, sigma: float) -> SparseNormalEquations:
         """Of the data at ``state``, and of the priors."""
@@ -321,7 +312,7 @@ class BundleAdjuster:
     def _of_marks(self, state: _State) -> ImageEquations | None:
         if (marks := self.priors.marks) is None:
             return None
-        focal = float(np.exp(state.parameters.shared[-1]))
+        focal = self.model.focal(state.parameters.shared)
         errors, derivative = marks.equations(state.matrices, state.parameters.lens, self.free.lens, focal)
         return ImageEquations(marks.image, derivative, errors, marks.precision)
 
@@ -332,11 +323,6 @@ class BundleAdjuster:
         whole = np.eye(size + lens)
         whole[:size, :size] = derivative
         return physical, whole
-
-
-def sigma_of(squared: FloatArray) -> float:
-    """Standard deviation of an error's coordinate, pixels, from the median of the squared lengths (M,), or inf."""
-    return max(float(np.sqrt(np.median(squared))) / RAYLEIGH_MEDIAN, _MIN_SIGMA) if len(squared) else _MIN_SIGMA
 
 
 def inverse_information(information: FloatArray) -> FloatArray:

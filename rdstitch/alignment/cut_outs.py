@@ -78,10 +78,6 @@ def cut_alignment(alignment: Alignment, sizes: Sequence[Size]) -> Alignment:
         alignment,
         cameras=cameras,
         homographies=homographies,
-        focal=None if alignment.focal is None else alignment.focal / reference,
-        focal_std=None if alignment.focal_std is None else alignment.focal_std / reference,
-        distortion=cameras[alignment.reference].nearest_distortion,
-        distortion_std=alignment.distortion_std * reference**2,
         covariance=units[:, None] * alignment.covariance * units,
     )
 

@@ -54,7 +54,7 @@ def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:
 
 
 def cycle_consistency(
-    apart: BundleAdjustmentResult, observations: Observations, count: int
+    pairwise: BundleAdjustmentResult, observations: Observations, count: int
 ) -> tuple[BoolArray, NDArray[np.intp]]:
     """Which links most of their triangles contradict.
 
@@ -63,11 +63,11 @@ def cycle_consistency(
     Takes every link on its own, with a homography, and the number of images; also gives how many of the triangles left
     with each link close, (L,).
     """
-    suspect = ~are_homographies(apart.homographies)
+    suspect = ~are_homographies(pairwise.homographies)
     corners = triangles(count, observations.image1, observations.image2)
     if not len(corners):
         return suspect, np.zeros(len(observations), dtype=np.intp)
-    bad = _open_triangles(apart, observations, corners)
+    bad = _open_triangles(pairwise, observations, corners)
     alive = np.isfinite(bad) & ~suspect[corners].any(axis=1)
     while True:
         weight = np.where(alive, np.where(bad > 0, 1.0, -1.0), 0.0)
@@ -80,11 +80,11 @@ def cycle_consistency(
         alive &= ~(corners == worst).any(axis=1)
 
 
-def _open_triangles(apart: BundleAdjustmentResult, observations: Observations, corners: IntArray) -> FloatArray:
+def _open_triangles(pairwise: BundleAdjustmentResult, observations: Observations, corners: IntArray) -> FloatArray:
     """1 for triangles that do not close, 0 for those that do, NaN where the points leave the images; shape (T,)."""
     backward = observations.image1 > observations.image2
-    homographies, covariance = _oriented(apart, backward)
-    distortion, higher, center = split_lens(apart.parameters.lens)
+    homographies, covariance = _oriented(pairwise, backward)
+    distortion, higher, center = split_lens(pairwise.parameters.lens)
     # In the image of lower index.
     probes = np.stack([_probes(observations, link, bool(backward[link])) for link in range(len(observations))])
 
@@ -141,12 +141,12 @@ def _probes(observations: Observations, link: int, backward: bool) -> FloatArray
     return np.resize(points[spread_choice(points, _PROBES)], (_PROBES, 2))
 
 
-def _oriented(apart: BundleAdjustmentResult, backward: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _oriented(pairwise: BundleAdjustmentResult, backward: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Homographies (L, 3, 3) from the image of lower index to the other, and their covariances (L, 9, 9)."""
     # What is no homography gets any value: its triangles do not count.
-    sound = are_homographies(apart.homographies)[:, None, None]
-    homographies = np.where(sound, apart.homographies, np.eye(3))
-    values, vectors = np.linalg.eigh(np.where(sound, apart.equations.gram[:, :9, :9] / apart.sigma**2, np.eye(9)))
+    sound = are_homographies(pairwise.homographies)[:, None, None]
+    homographies = np.where(sound, pairwise.homographies, np.eye(3))
+    values, vectors = np.linalg.eigh(np.where(sound, pairwise.equations.gram[:, :9, :9] / pairwise.sigma**2, np.eye(9)))
     floor = np.maximum(values[:, -1:] * 1e-12, 1e-300)
     inverse = 1.0 / np.maximum(values, floor)
     inverse[:, 0] = 0.0  # the scale of H, of which nothing depends
@@ -165,20 +165,13 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
     A model that is too rigid leaves larger errors in all links; a wrong pair stands out. What is usual is what half of
     the matches have, not half of the links: many pairs far apart may show a vehicle only, with few matches each.
     """
-    typical = link_medians(squared, observations)
+    typical = observations.medians(np.sqrt(squared))
     usual = _weighted_median(typical, np.where(np.isfinite(typical), observations.matches, 0))
     least = _MIN_ERROR * np.sqrt(observations.scale1 * observations.scale2)
     outlying: BoolArray = ~(typical <= np.maximum(8.0 * usual, least))
     return outlying
 
 
-def link_medians(squared: FloatArray, observations: Observations) -> FloatArray:
-    """Median length of the errors of each link, pixels, shape (L,)."""
-    return observations.medians(np.sqrt(squared))
-
-
 def _weighted_median(values: FloatArray, weights: IntArray) -> float:
     """The smallest of the values (L,) up to which half of the weights lie; 0 where all weights are."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order[np.searchsorted(total, total[-1] / 2.0)]]) if total[-1] > 0 else 0.0
+    return float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf")) if weights.any() else 0.0

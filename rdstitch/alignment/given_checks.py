@@ -72,7 +72,7 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
     if not isinstance(fit.model, PlanarModel):
         return None
     if fit.model.free_tilts and not fit.model.any_tilt:  # whose prior draws tilts together
-        fit = bare.refine(POSE, bare.taken_over(POSE, fit))
+        fit = bare.refine(POSE, bare.start_from(POSE, fit))
     shown = _ShownTilts.of(bare, fit, free_mount=options.tilt is None)
     if known.delayed_attitudes is not None and (late := shown.delay(known.delayed_attitudes + known.tilt)) is not None:
         attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
@@ -114,7 +114,7 @@ def check_focal(given: Camera, fit: Fit, covariance: FloatArray | None) -> Messa
     if not isinstance(fit.model, PlanarModel) or covariance is None or given.focal is None:
         return None
     place = fit.model.shared_names.index("log_focal")
-    focal, std = math.exp(float(fit.adjusted.parameters.shared[-1])) * given.scale, math.sqrt(covariance[place, place])
+    focal, std = fit.model.focal(fit.adjusted.parameters.shared) * given.scale, math.sqrt(covariance[place, place])
     odds = math.log(focal / given.focal) ** 2 / (2.0 * (std**2 + given.focal_log_std**2))
     if odds < _LOG_ODDS:
         return None
@@ -157,7 +157,7 @@ class _ShownTilts:
         normal = adjuster.normal_equations(adjusted)
         tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
         images = evenly_spaced(problem.count, _MAX_IMAGES)
-        focal = math.exp(adjusted.parameters.shared[-1])
+        focal = model.focal(adjusted.parameters.shared)
         rows = np.arange(2 * len(images))
         by_pose = np.zeros((*normal.gradient_poses.shape, len(rows)))
         by_shared = np.zeros((len(normal.gradient_shared), len(rows)))

@@ -11,15 +11,13 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import Fit, Problem, homography_apart
+from rdstitch.alignment.adjustment_problem import Fit, Problem, pairwise_homographies
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
-from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import BoolArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD
-from rdstitch.robust.loss import ALIGNMENT_WIDTH
 from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, costs
 
 LENSES: dict[str, tuple[str, ...]] = {
@@ -52,11 +50,13 @@ class LensChoice:
 
     name: str  # a key of LENSES
     free: BoolArray  # (5,): its parameters among LENS_PARAMETERS
-    apart: BundleAdjustmentResult  # every link on its own with this lens
+    pairwise: BundleAdjustmentResult  # every link on its own with this lens
     reason: str  # one sentence
     # what may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
     # motion that is less regular. That μ is needed only pairs can say: it could stand for relief
     refinements: tuple[BoolArray, ...] = ()
+    observable: bool = True  # whether λ is observable, or known
+    depth: bool = False  # whether it is not because what few images show has depth
 
     def refined(self, free: BoolArray) -> Self:
         """With the parameters that were freed in the end."""
@@ -73,34 +73,35 @@ def free_parameters(name: str) -> BoolArray:
 
 
 def choose_lens(
-    observations: Observations, apart: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
+    observations: Observations, pairwise: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
 ) -> LensChoice:
     """Choose among lenses, keys of :data:`LENSES` from the simplest; none where the lens is given.
 
-    ``apart`` is every link on its own with a homography, and λ free unless the lens is given.
+    ``pairwise`` is every link on its own with a homography, and λ free unless the lens is given.
     """
     if not names:
-        return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")
+        return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), pairwise, "given")
     if len(names) > 1 and len(observations) > _ENOUGH_LINKS:
-        return _choose_by_some(observations, apart, names, known)
-    images = _images(observations)
+        return _choose_by_some(observations, pairwise, names, known)
+    images = observations.image_count
     few = len(names) > 1 and images < ENOUGH_IMAGES
     if few:
         names = [name for name in names if name != "division-center"]
     free = [free_parameters(name) & ~(CENTER & few) for name in names]
 
     def fit(free: BoolArray, start: BundleAdjustmentResult) -> BundleAdjustmentResult:
-        return homography_apart(observations, start.homographies, start.parameters.lens, free, known)
+        return pairwise_homographies(observations, start.homographies, start.parameters.lens, free, known)
 
     if len(names) == 1:
-        return LensChoice(names[0], free[0], apart if names[0] == "division" else fit(free[0], apart), "as requested")
-    fits, best = [apart], 0
+        return LensChoice(
+            names[0], free[0], pairwise if names[0] == "division" else fit(free[0], pairwise), "as requested"
+        )
+    fits, best = [pairwise], 0
     for index, name in enumerate(names[1:], start=1):
         if name == "division3" and names[best] != "division2":
             break  # the next term of a series that is not needed
         fits.append(fit(free[index], fits[-1]))
-        errors = whitened_errors(observations, fits[-1].homographies, fits[-1].parameters.lens)
-        evidence = evidence_of(observations, errors)
+        evidence = evidence_of(observations, fits[-1].errors)
         rarer = 0.0 if names[best] == "division2" else TWENTY_TO_ONE  # a series that was cut off has a next term
         if _score(evidence, observations, fits[index]) + rarer < _score(evidence, observations, fits[best]):
             best = index
@@ -112,32 +113,23 @@ def choose_lens(
 
 
 def _choose_by_some(
-    observations: Observations, apart: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
+    observations: Observations, pairwise: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
 ) -> LensChoice:
     """The lens that evenly chosen links show, and every link on its own with it."""
-    start, simplest = apart.parameters.lens, free_parameters("division")
+    start, simplest = pairwise.parameters.lens, free_parameters("division")
     some = np.arange(0, len(observations), -(-len(observations) // _ENOUGH_LINKS))
     few = observations.subset(some)
-    choice = choose_lens(few, homography_apart(few, apart.homographies[some], start, simplest, known), names, known)
+    choice = choose_lens(
+        few, pairwise_homographies(few, pairwise.homographies[some], start, simplest, known), names, known
+    )
     if (choice.free != simplest).any():
-        apart = homography_apart(observations, apart.homographies, start, choice.free, known)
-    return replace(choice, apart=apart)
+        pairwise = pairwise_homographies(observations, pairwise.homographies, start, choice.free, known)
+    return replace(choice, pairwise=pairwise)
 
 
-def _images(observations: Observations) -> int:
-    return len(np.unique(np.concatenate([observations.image1, observations.image2])))
-
-
-def leaves_noise(adjusted: BundleAdjustmentResult, observations: Observations) -> bool:
-    """Whether the errors of neighbours hardly agree, so that they are noise."""
-    return left_coherence(adjusted, observations).correlation < NO_COHERENCE
-
-
-def left_coherence(adjusted: BundleAdjustmentResult, observations: Observations) -> Coherence:
+def left_coherence(adjusted: BundleAdjustmentResult) -> Coherence:
     """How much the errors of neighbours agree that an adjustment leaves."""
-    errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
-    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
-    return coherence(observations, errors, inliers)
+    return coherence(adjusted.adjuster.observations, adjusted.errors, adjusted.inliers)
 
 
 def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
@@ -147,10 +139,10 @@ def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     it is smaller than its standard deviation it costs next to nothing, and left out where it is not it bends the image
     by a tenth of a pixel. Only where the errors are noise: over relief a motion model would take ν for the ground.
     """
-    adjusted, observations, finer = fit.adjusted, problem.observations, free_parameters("division3")
+    finer = free_parameters("division3")
     if problem.count < ENOUGH_IMAGES or (fit.free_lens != free_parameters("division2")).any():
         return problem, fit
-    if not leaves_noise(adjusted, observations):
+    if left_coherence(fit.adjusted).correlation >= NO_COHERENCE:
         return problem, fit
     return replace(problem, free_lens=finer), problem.extend(fit, finer)
 
@@ -162,7 +154,7 @@ def _score(evidence: Evidence, observations: Observations, fit: BundleAdjustment
     next term of a series, costs next to nothing, and never less.
     """
     lens, free = fit.parameters.lens, fit.adjuster.free.lens
-    seen = evidence.cost(whitened_errors(observations, fit.homographies, lens))
+    seen = evidence.cost(fit.errors)
     shared = 2.0 * len(observations.points1) / float(seen.count[0])
     relative = fit.covariance * shared / np.outer(LENS_STD[free], LENS_STD[free])
     narrowed = -np.log(np.clip(np.linalg.eigvalsh(relative), 1e-300, 1.0)).sum()

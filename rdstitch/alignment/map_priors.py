@@ -7,6 +7,7 @@ stay away, the map does not count.
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -20,7 +21,7 @@ from rdstitch.alignment.plane_marks import PlaneMarks
 from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
-from rdstitch.robust.posterior import EXACTNESS
+from rdstitch.robust.posterior import MODEL_ERROR
 from rdstitch.robust.similarity_fit import OUTLYING, SimilarityFit, fit_similarity
 
 POSITION_STD = 3.0
@@ -44,7 +45,7 @@ _COMPLEX = np.array([1.0, 1.0j])
 
 
 @dataclass(frozen=True)
-class Held:
+class MapFit:
     """A fit with what the map says, or without, and why."""
 
     problem: Problem
@@ -57,22 +58,22 @@ class Held:
         return {key if isinstance(key, str) else int(images[key]): value for key, value in self.leverage.items()}
 
 
-def hold_on_map(problem: Problem, fit: Fit) -> Held:
+def adjust_to_map(problem: Problem, fit: Fit) -> MapFit:
     """Adjust again with positions and control points as priors, where there are enough of them, and they agree."""
     if not isinstance(fit.model, PlanarModel):
-        return Held(problem, fit)
-    every: list[_Side] = [_Control(problem, fit), _Positions(problem)]
+        return MapFit(problem, fit)
+    every: list[_KnownPlaces] = [_Control(problem, fit), _Positions(problem)]
     sides = [side for side in every if side.enough]
     disagreement = ""
     while sides:
-        held = _held(problem, fit, sides)
+        held = _adjusted(problem, fit, sides)
         if not held.disagreement:
             return replace(held, disagreement=disagreement)
         disagreement, sides = disagreement or held.disagreement, sides[1:]
-    return Held(problem, fit, disagreement)
+    return MapFit(problem, fit, disagreement)
 
 
-class _Side:
+class _KnownPlaces(ABC):
     """N places that are known on the map, and where a fit has them, in units of the poses."""
 
     metres: ComplexArray  # (N,): east - i north
@@ -80,21 +81,21 @@ class _Side:
     least: int
     name: str
 
-    def here(self, fit: Fit) -> ComplexArray:
-        """(N,)."""
-        raise NotImplementedError
+    @abstractmethod
+    def estimated(self, fit: Fit) -> ComplexArray:
+        """Where a fit has them, (N,)."""
 
+    @abstractmethod
     def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
-        """With the places at targets (N, 2), as surely as inverse variances (N,) say."""
-        raise NotImplementedError
+        """With priors on the places: their means (N, 2) and inverse variances (N,)."""
 
-    def sightings(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
+    @abstractmethod
+    def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
         """Images (M,), derivatives (M, 2, D + S + K) of places by their poses and the shared parameters, precision."""
-        raise NotImplementedError
 
-    def named(self) -> tuple[IntArray, Sequence[int | str]]:
-        """Which of N places each sighting (M,) is one of, and what these are called."""
-        raise NotImplementedError
+    @abstractmethod
+    def labels(self) -> tuple[IntArray, Sequence[int | str]]:
+        """Which of N places each row (M,) of the derivatives is of, and what these are called."""
 
     @property
     def enough(self) -> bool:
@@ -104,20 +105,20 @@ class _Side:
         middle = complex(np.median(self.metres.real), np.median(self.metres.imag))
         return float(np.median(np.abs(self.metres - middle) / self.std)) >= _MIN_SPREAD
 
-    def drawn(self, known: CameraPriors, fit: Fit) -> tuple[CameraPriors, SimilarityFit, float]:
+    def prior_from_map(self, known: CameraPriors, fit: Fit) -> tuple[CameraPriors, SimilarityFit, float]:
         """The prior by the places of a fit, the similarity to the map, and by how much errors exceed their std."""
-        here = self.here(fit)
-        similar = fit_similarity(here, self.metres, float(np.median(self.std)))
+        places = self.estimated(fit)
+        similar = fit_similarity(places, self.metres, float(np.median(self.std)))
         scale = similar.scale or 1e-300
         target = ((self.metres - similar.origin) / scale).view(np.float64).reshape(-1, 2)
-        count = len(here)
+        count = len(places)
         excess = float(np.median(similar.residuals / self.std)) / RAYLEIGH_MEDIAN * math.sqrt(count / (count - 2))
         excess = max(excess, 1.0)
         precision = similar.weights * (abs(scale) / (self.std * excess)) ** 2
         return self.prior(known, target, precision), similar, excess
 
 
-class _Positions(_Side):
+class _Positions(_KnownPlaces):
     least, name = _MIN_POSITIONS, "GPS positions"
 
     def __init__(self, problem: Problem) -> None:
@@ -126,16 +127,16 @@ class _Positions(_Side):
         self.metres = metres[self.known]
         self.std = np.where(np.isfinite(std), std, POSITION_STD)[self.known]
 
-    def here(self, fit: Fit) -> ComplexArray:
+    def estimated(self, fit: Fit) -> ComplexArray:
         places: ComplexArray = fit.adjusted.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX
         return places
 
     def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
-        places, surely = np.zeros((len(self.known), 2)), np.zeros(len(self.known))
-        places[self.known], surely[self.known] = target, precision
-        return replace(known, places=places, places_precision=surely)
+        places, weights = np.zeros((len(self.known), 2)), np.zeros(len(self.known))
+        places[self.known], weights[self.known] = target, precision
+        return replace(known, places=places, places_precision=weights)
 
-    def sightings(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
+    def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
         assert isinstance(fit.model, PlanarModel)
         image = np.flatnonzero(self.known)
         axes = [fit.model.free.index(column) for column in (X, Y)]
@@ -144,12 +145,12 @@ class _Positions(_Side):
         derivative[:, [0, 1], axes] = 1.0
         return image, derivative, adjuster.priors.poses_precision[image, axes[0]]
 
-    def named(self) -> tuple[IntArray, Sequence[int | str]]:
+    def labels(self) -> tuple[IntArray, Sequence[int | str]]:
         names = np.flatnonzero(self.known)
         return np.arange(len(names)), names.tolist()
 
 
-class _Control(_Side):
+class _Control(_KnownPlaces):
     least, name = _MIN_CONTROL, "ground control points"
 
     def __init__(self, problem: Problem, fit: Fit) -> None:
@@ -158,10 +159,10 @@ class _Control(_Side):
         self.count = np.bincount(known.point, minlength=len(known.names))
         self.std = known.std
         if len(self.metres) >= self.least:
-            here = self.here(fit)
-            usable = np.isfinite(here)
+            places = self.estimated(fit)
+            usable = np.isfinite(places)
             pixel = np.bincount(known.point, known.pixel) / np.maximum(self.count, 1)
-            scale = abs(fit_similarity(here[usable], self.metres[usable], 0.0).scale) if usable.sum() > 1 else 1.0
+            scale = abs(fit_similarity(places[usable], self.metres[usable], 0.0).scale) if usable.sum() > 1 else 1.0
             self.std = np.hypot(known.std, _CLICK * pixel * scale)
 
     def marks(self, target: FloatArray, precision: FloatArray) -> PlaneMarks:
@@ -170,10 +171,10 @@ class _Control(_Side):
         shared = (precision / np.maximum(self.count, 1))[known.point]
         return PlaneMarks(known.image, known.points, target[known.point], shared)
 
-    def here(self, fit: Fit) -> ComplexArray:
+    def estimated(self, fit: Fit) -> ComplexArray:
         adjusted = fit.adjusted
         every = np.zeros((len(self.metres), 2))
-        focal = float(np.exp(adjusted.parameters.shared[-1]))
+        focal = fit.model.focal(adjusted.parameters.shared)
         marks = self.marks(every, np.zeros(len(every)))
         seen = marks.places(adjusted.matrices.matrices, adjusted.parameters.lens, focal)
         np.add.at(every, self.points.point, seen)
@@ -183,35 +184,35 @@ class _Control(_Side):
     def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
         return replace(known, marks=self.marks(target, precision))
 
-    def sightings(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
+    def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
         parameters, marks = fit.adjusted.parameters, adjuster.priors.marks
         assert marks is not None
-        focal = float(np.exp(parameters.shared[-1]))
+        focal = fit.model.focal(parameters.shared)
         derivative = marks.equations(fit.adjusted.matrices, parameters.lens, adjuster.free.lens, focal)[1]
         return marks.image, derivative, marks.precision
 
-    def named(self) -> tuple[IntArray, Sequence[int | str]]:
+    def labels(self) -> tuple[IntArray, Sequence[int | str]]:
         return self.points.point, self.points.names
 
 
-def _held(problem: Problem, fit: Fit, sides: list[_Side]) -> Held:
+def _adjusted(problem: Problem, fit: Fit, sides: list[_KnownPlaces]) -> MapFit:
     """The fit with all of them, and which of the first ones the images contradict."""
     refined, free = fit, replace(problem.camera_priors, fix_frame=False)
     for _ in range(_ROUNDS):
-        before, known = [side.here(refined) for side in sides], free
+        before, known = [side.estimated(refined) for side in sides], free
         drawn = []
         for side in sides:
-            known, similar, excess = side.drawn(known, refined)
+            known, similar, excess = side.prior_from_map(known, refined)
             drawn.append((similar, excess))
         held = replace(problem, camera_priors=known)
         refined = held.refine(fit.model, refined.adjusted.parameters, fit.tilt_spread or None)
         moved = [
-            np.abs(side.here(refined) - was).max() * abs(similar.scale) / (np.median(side.std) * excess)
+            np.abs(side.estimated(refined) - was).max() * abs(similar.scale) / (np.median(side.std) * excess)
             for side, was, (similar, excess) in zip(sides, before, drawn, strict=True)
         ]
         if max(moved) < _SETTLED:
             break
-    growth = math.hypot(refined.adjusted.sigma, EXACTNESS) / math.hypot(fit.adjusted.sigma, EXACTNESS)
+    growth = math.hypot(refined.adjusted.sigma, MODEL_ERROR) / math.hypot(fit.adjusted.sigma, MODEL_ERROR)
     side, (similar, excess) = sides[0], drawn[0]
     off, usual = float(np.median(similar.residuals)), max(float(np.median(side.std)), POSITION_STD)
     why = ""
@@ -220,19 +221,20 @@ def _held(problem: Problem, fit: Fit, sides: list[_Side]) -> Held:
     elif not growth <= _MAX_GROWTH:
         why = f"with them the errors of the matches grow by {growth - 1.0:.0%}"
     if why:
-        return Held(problem, fit, f"the {side.name} contradict the images ({why}) and were not used for the alignment")
+        text = f"the {side.name} contradict the images ({why}) and were not used for the alignment"
+        return MapFit(problem, fit, text)
     fixed = replace(held, camera_priors=replace(held.camera_priors, fix_frame=True))
-    return Held(fixed, refined, "", _leverage(held, refined, sides))
+    return MapFit(fixed, refined, "", _leverage(held, refined, sides))
 
 
-def _leverage(problem: Problem, fit: Fit, sides: Sequence[_Side]) -> dict[int | str, float]:
-    """How far (0 to 1) what is known puts itself where the fit has it; see :meth:`_Side.named`."""
+def _leverage(problem: Problem, fit: Fit, sides: Sequence[_KnownPlaces]) -> dict[int | str, float]:
+    """How far (0 to 1) what is known puts itself where the fit has it; see :meth:`_KnownPlaces.labels`."""
     adjuster = problem.adjuster_of(fit)
     normal, (count, size) = adjuster.normal_equations(fit.adjusted), adjuster.free.poses.shape
     leverage: dict[int | str, float] = {}
     for side in sides:
-        image, derivative, precision = side.sightings(adjuster, fit)
-        item, names = side.named()
+        image, derivative, precision = side.jacobians(adjuster, fit)
+        item, names = side.labels()
         chosen = evenly_spaced(len(names), _MANY)
         gradients = np.zeros((count, size, len(chosen), 2))
         of_shared = np.zeros((len(normal.gradient_shared), len(chosen), 2))

@@ -10,14 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import misfitting_links
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.nearest_points import nearest_points
-from rdstitch.robust.loss import ALIGNMENT_WIDTH
 from rdstitch.robust.posterior import Evidence, overlap_cells
 
 _CELLS = (2, 3, 4)
@@ -46,10 +44,6 @@ class Coherence:
     correlation: float  # mean correlation of the residuals of nearest neighbours within a link
     size: float  # root mean square of the common part, pixels
     relative_size: float  # the same in diagonals of an image
-    # how many times fewer independent observations there are than correspondences; at least 1. The product of two
-    # things: the variance of the sum of the residuals in a part of an overlap, in units of that of independent ones;
-    # and the number of links per image, since every link counts the same measured points again
-    overdispersion: float
 
 
 def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray) -> Coherence:
@@ -57,29 +51,28 @@ def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray
     chosen = _sample(observations, inliers)
     residual = errors[chosen]
     if len(residual) < 2:
-        return Coherence(0.0, 0.0, 0.0, 1.0)
+        return Coherence(0.0, 0.0, 0.0)
     first, second = neighbours(observations, inliers)
     products = np.einsum("mi,mi->m", errors[first], errors[second])
     power = float(np.einsum("mi,mi->", residual, residual) / len(residual))
     common = float(products.mean()) if len(products) else 0.0
     size = float(np.sqrt(max(common, 0.0)))
-    return Coherence(
-        common / power if power > 0.0 else 0.0,
-        size,
-        size / (2.0 * float(np.median(observations.scale2))),
-        shared_variance(observations, errors, inliers),
-    )
+    correlation = common / power if power > 0.0 else 0.0
+    return Coherence(correlation, size, size / (2.0 * float(np.median(observations.scale2))))
 
 
 def shared_variance(observations: Observations, errors: FloatArray, inliers: BoolArray) -> float:
-    """The overdispersion of residuals (M, 2), see :class:`Coherence`."""
+    """The overdispersion of residuals (M, 2): how many times fewer independent ones there are than correspondences.
+
+    At least 1. The product of two things: the variance of the sum of the residuals in a part of an overlap, in units of
+    that of independent ones; and the number of links per image, since every link counts the same measured points again.
+    """
     chosen, links = _sample(observations, inliers), len(observations)
     if len(chosen) < 2:
         return 1.0
     link, points, residual = observations.link[chosen], observations.points1[chosen], errors[chosen]
-    images = len(np.unique([observations.image1, observations.image2]))
     worst = max(_overdispersion(link, points, residual, links, cells) for cells in _CELLS)
-    return worst * max(1.0, links / max(images - 1, 1))
+    return worst * max(1.0, links / max(observations.image_count - 1, 1))
 
 
 def neighbours(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:
@@ -149,10 +142,10 @@ def judge_relief(left: Coherence, model: str, links: int) -> ReliefTest:
 def evidence_of(observations: Observations, errors: FloatArray) -> Evidence:
     """What hypotheses on all links are compared by; the errors (M, 2), pixels, are those of links on their own."""
     squared = squared_lengths(errors)
-    inliers = squared < (ALIGNMENT_WIDTH * sigma_of(squared[observations.scale_inliers_mask])) ** 2
+    inliers = observations.inliers(squared)
     shared = min(max(coherence(observations, errors, inliers).correlation, 0.0), 0.9)
     power = float(squared[inliers].mean()) / 2.0 if inliers.any() else 0.0
-    images, links = len(np.unique([observations.image1, observations.image2])), max(len(observations), 1)
+    images, links = observations.image_count, max(len(observations), 1)
     return Evidence.of(
         observations.link,
         observations.points1,
@@ -169,7 +162,7 @@ def independent_errors(observations: Observations, homographies: FloatArray, len
     """
     errors = whitened_errors(observations, homographies, lens)
     squared = squared_lengths(errors)
-    inliers = squared < (ALIGNMENT_WIDTH * sigma_of(squared[observations.scale_inliers_mask])) ** 2
+    inliers = observations.inliers(squared)
     overdispersion = shared_variance(observations, errors, inliers)
     counted = inliers & ~misfitting_links(squared, observations)[observations.link]
     return overdispersion, max(2.0 * float(counted.sum()) / overdispersion, 2.0)

@@ -7,11 +7,11 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import Link, spread_choice
+from rdstitch.robust.loss import ALIGNMENT_WIDTH, sigma_of
 
 _CHUNK = 4096
 """Correspondences linearized at a time: what stays in cache."""
@@ -66,7 +66,20 @@ class Observations:
         return np.repeat(np.arange(len(self)), np.diff(self.start))
 
     @cached_property
-    def scale_inliers_mask(self) -> NDArray[np.bool_]:
+    def image_count(self) -> int:
+        """Number of images that have links."""
+        return len(np.unique([self.image1, self.image2]))
+
+    def sigma(self, squared: FloatArray) -> float:
+        """Standard deviation of an error's coordinate, pixels, by ``|r|²`` (M,); inf where most are."""
+        return sigma_of(squared[self.scale_inliers_mask])
+
+    def inliers(self, squared: FloatArray) -> BoolArray:
+        """Errors (M,) within the width of the loss, by ``|r|²`` (M,)."""
+        return squared < (ALIGNMENT_WIDTH * self.sigma(squared)) ** 2
+
+    @cached_property
+    def scale_inliers_mask(self) -> BoolArray:
         """Which correspondences, shape (M,), the scale of the errors is estimated from: all but those of static links.
 
         What stays where it is in the image is localised in the same pixel again, without the errors that a change of
@@ -105,35 +118,31 @@ class Observations:
         with np.errstate(invalid="ignore"):
             return np.where(counts > 0, (ends[0] + ends[1]) / 2.0, np.inf)
 
-    def subset(self, links: IntArray | NDArray[np.bool_], image_index: IntArray | None = None) -> Self:
+    def subset(self, links: IntArray | BoolArray, image_index: IntArray | None = None) -> Self:
         """Only some links; with ``image_index`` (N,) images get new numbers."""
         chosen = np.flatnonzero(links) if np.asarray(links).dtype == np.bool_ else np.asarray(links)
         counts = np.diff(self.start)[chosen]
-        start = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
-        rows = np.arange(start[-1]) + np.repeat(self.start[chosen] - start[:-1], counts)
+        rows = np.arange(counts.sum()) + np.repeat(self.start[chosen] - (np.cumsum(counts) - counts), counts)
+        of_links = {name: getattr(self, name)[chosen] for name in ("scale1", "scale2", "matches")}
         image1, image2 = self.image1[chosen], self.image2[chosen]
         if image_index is not None:
             image1, image2 = image_index[image1], image_index[image2]
-        return type(self)(
-            image1,
-            image2,
-            start,
-            self.points1[rows],
-            self.points2[rows],
-            self.scale1[chosen],
-            self.scale2[chosen],
-            self.matches[chosen],
-            self.reach,
-            None if self.relief is None else self.relief[rows],
-        )
+        return replace(self.rows(rows, counts), image1=image1, image2=image2, **of_links)
+
+    def rows(self, rows: IntArray, counts: IntArray) -> Self:
+        """Only some correspondences, so many (L,) of each link."""
+        start = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
+        relief = None if self.relief is None else self.relief[rows]
+        return replace(self, start=start, points1=self.points1[rows], points2=self.points2[rows], relief=relief)
 
     def thinned(self, most: int) -> Self:
         """Of each link at most about ``most`` correspondences, well spread over its overlap."""
         kept = [spread_choice(self.points1[a:b], most) + a for a, b in itertools.pairwise(self.start)]
-        rows = np.concatenate([np.empty(0, dtype=np.intp), *kept])
-        start = np.concatenate([[0], np.cumsum([len(k) for k in kept])]).astype(np.intp)
-        relief = None if self.relief is None else self.relief[rows]
-        return replace(self, start=start, points1=self.points1[rows], points2=self.points2[rows], relief=relief)
+        return self.rows(np.concatenate([np.empty(0, dtype=np.intp), *kept]), np.array([len(k) for k in kept]))
+
+    def thinned_to(self, total: int, least: int) -> Self:
+        """About so many correspondences in all, and of each link at least so many, if there are."""
+        return self.thinned(max(total // max(len(self), 1), least))
 
     def as_independent_pairs(self) -> Self:
         """Every link on its own: link l is between the images 2l and 2l + 1."""

@@ -61,15 +61,10 @@ class CameraPriors:
 
         Tilts are turned into what they do in the images with ``log_focal``, the prior one if not given.
         """
-        none = Priors.none(model, count)
-        tilts = map(exact, self.tilt) if self.tilt_known else (TILT, TILT)
-        focal_length = focal_prior(self.log_focal, self.log_focal_std, self.focal_source)
-        of_name = dict(zip(("psi", "theta", "log_focal"), (*tilts, focal_length), strict=True))
-        shared = tuple(of_name[name] for name in model.shared_names)
-        known = replace(none, shared=shared, lens=LENS)
+        known = self.of_camera(model, count)
         if "psi" not in model.shared_names:
             return known
-        poses, precision = np.zeros_like(none.poses), np.zeros_like(none.poses)
+        poses, precision = np.zeros_like(known.poses), np.zeros_like(known.poses)
         free = list(getattr(model, "free", ()))
         focal = math.exp(self.log_focal if log_focal is None else log_focal)
         for axis, column in enumerate((PSI, THETA)):
@@ -80,6 +75,14 @@ class CameraPriors:
             columns = [free.index(column) for column in (X, Y)]
             poses[:, columns], precision[:, columns] = self.places, self.places_precision[:, None]
         return replace(known, poses=poses, poses_precision=precision, marks=self.marks)
+
+    def of_camera(self, model: MotionModel, count: int) -> Priors:
+        """For ``count`` images, nothing on their poses."""
+        tilts = map(exact, self.tilt) if self.tilt_known else (TILT, TILT)
+        focal_length = focal_prior(self.log_focal, self.log_focal_std, self.focal_source)
+        of_name = dict(zip(("psi", "theta", "log_focal"), (*tilts, focal_length), strict=True))
+        poses = np.zeros((count, model.pose_size))
+        return Priors(tuple(of_name[name] for name in model.shared_names), LENS, poses, poses)
 
     def of(self, images: IntArray) -> "CameraPriors":
         """Of some of the images only."""

@@ -20,10 +20,9 @@ from rdstitch.alignment.linear_response import Fields, LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors, split_lens
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y
 from rdstitch.alignment.noise import apart, neighbours
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.division_model import distort, undistort
 from rdstitch.geometry.radial_homography import inverses, project
-from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _STEP = 1e-4
 """Heights, of differences."""
@@ -221,7 +220,7 @@ class ReliefField:
     def _pairs(self) -> list[tuple[IntArray, IntArray]]:
         """Pairs of inliers of a link, by the first of each: neighbours, and those at each of the greater distances."""
         adjusted, o = self.response.adjusted, self.response.adjuster.observations
-        inliers: BoolArray = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
+        inliers = adjusted.inliers
         nearest = np.unique(np.sort(np.stack(neighbours(o, inliers)), axis=0), axis=1)
         if not nearest.size:
             return []

@@ -49,7 +49,7 @@ def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[st
     # From the least free one: a camera that is free to tilt has already followed the hills.
     for model in (SIMILARITY, TILTING):
         if model.name in names and not choice.fit.model.any_tilt:
-            start = problem.refine(model, problem.taken_over(model, fits[-1])) if fits else problem.fit(model)
+            start = problem.refine(model, problem.start_from(model, fits[-1])) if fits else problem.fit(model)
             problem, fit = _settled(problem, start)
             fits.append(fit)
     if not fits:
@@ -93,8 +93,7 @@ def _is_rough(problem: Problem, fit: Fit) -> bool:
 
     Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
     """
-    left = left_coherence(fit.adjusted, problem.observations)
-    return judge_relief(left, fit.model.name, len(problem.observations)).found
+    return judge_relief(left_coherence(fit.adjusted), fit.model.name, len(problem.observations)).found
 
 
 def _settled(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:

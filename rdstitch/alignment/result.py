@@ -122,18 +122,8 @@ class Alignment:
         Why this model was taken.
     poses : PlanarPoses or None
         None for the general model; NaN for images left out.
-    tilt : (float, float) or None
-        (ψ, θ), radians, shared by all images (the mean one where the tilt varies).
     tilt_spread : float
         Standard deviation of the single images' tilts, radians; 0 where the model has none.
-    focal : float or None
-        Focal length in half diagonals; None for the general model.
-    focal_std : float or None
-        Its standard deviation in the same unit.
-    distortion, distortion_std : float
-        λ of the one-parameter lens nearest to the estimate
-        (:attr:`rdstitch.geometry.camera.Camera.nearest_distortion`), and its standard deviation; inf where it is not
-        observable, 0 where it was given.
     lens : str
         The lens that was found, a key of :data:`rdstitch.alignment.lens_selection.LENSES`.
     lens_reason : str
@@ -166,18 +156,13 @@ class Alignment:
     reference: int
     model: str
     model_reason: str
-    distortion: float
-    distortion_std: float
     rms: float
     links: tuple[LinkFit, ...]
     relief: ReliefTest
     lens: str = "division"
     lens_reason: str = "one parameter"
     poses: PlanarPoses | None = None
-    tilt: tuple[float, float] | None = None
     tilt_spread: float = 0.0
-    focal: float | None = None
-    focal_std: float | None = None
     parameters: tuple[str, ...] = ()
     covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     shape: ShapeTest | None = None
@@ -225,6 +210,33 @@ class Alignment:
         """Homography (3, 3) from undistorted normalized coordinates of one image to those of another."""
         product: FloatArray = np.linalg.solve(self.homographies[image2], self.homographies[image1])
         return product
+
+    @cached_property
+    def distortion(self) -> float:
+        """λ of the one-parameter lens nearest to that of the reference image, see :class:`rdstitch.Camera`."""
+        return self.cameras[self.reference].nearest_distortion
+
+    @property
+    def distortion_std(self) -> float:
+        """Its standard deviation; inf where it is not observable, 0 where it was given."""
+        return self.cameras[self.reference].distortion_std or 0.0
+
+    @property
+    def tilt(self) -> tuple[float, float] | None:
+        """(ψ, θ) of the reference image, radians, shared by all (the mean one where it varies); None without."""
+        return self.cameras[self.reference].tilt
+
+    @property
+    def focal(self) -> float | None:
+        """Focal length in half diagonals; None where the model has none."""
+        camera = self.cameras[self.reference]
+        return None if camera.focal is None or "log_focal" not in self.parameters else camera.focal / camera.scale
+
+    @property
+    def focal_std(self) -> float | None:
+        """Its standard deviation in the same unit."""
+        camera = self.cameras[self.reference]
+        return None if self.focal is None or camera.focal_std is None else camera.focal_std / camera.scale
 
     @property
     def lens_given(self) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
-from rdstitch.alignment.lens_selection import leaves_noise
+from rdstitch.alignment.lens_selection import NO_COHERENCE, left_coherence
 from rdstitch.alignment.link_equations import split_lens, whitened_errors
 from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.alignment.noise import evidence_of
@@ -130,8 +130,7 @@ class Posterior:
 
     def cost(self, adjusted: BundleAdjustmentResult) -> ErrorCost:
         """What the errors say that an adjustment leaves."""
-        errors = whitened_errors(self.problem.observations, adjusted.homographies, adjusted.parameters.lens)
-        return self.evidence.cost(errors)
+        return self.evidence.cost(adjusted.errors)
 
     def of(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
@@ -180,7 +179,7 @@ def select_model(
             tried.append(posterior.of(problem.fit(turn)))
             continue
         trial = wide.trial(turn)
-        bound, shared = posterior.bound(turn, posterior.cost(wide.apart(turn, trial))), trial.parameters.shared
+        bound, shared = posterior.bound(turn, posterior.cost(wide.pairwise(turn, trial))), trial.parameters.shared
         if not planar or bound < posterior.bound(planar[0], posterior.least):
             tried.append(posterior.of(problem.fit(turn, shared=shared)))
         else:
@@ -219,7 +218,7 @@ def _with_wider_lenses(
             fit = tried[index].fit
             wider = posterior.of(posterior.problem.extend(fit, lens | fit.free_lens))
             # A centre that is off bends a plane as rough ground bends the images; directions it does not bend.
-            shown = fit.model.on_sphere or leaves_noise(wider.fit.adjusted, posterior.problem.observations)
+            shown = fit.model.on_sphere or left_coherence(wider.fit.adjusted).correlation < NO_COHERENCE
             if wider.score < tried[index].score and shown:
                 tried[index] = wider
     return tried

@@ -38,7 +38,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.division_model import distort, undistort
 from rdstitch.geometry.radial_homography import inverses, project
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
-from rdstitch.robust.posterior import EXACTNESS
+from rdstitch.robust.posterior import MODEL_ERROR
 
 Correction = Callable[[FloatArray, IntArray, float], FloatArray]
 """Takes measured points (M, 2), half diagonals, the image of each (M,), and the size of the effect to the points that
@@ -206,7 +206,7 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
         extreme = predict(extreme_stds)
         if (extreme.shifts > large).any():
             doubtful, judged, off = True, extreme, extreme.shifts
-    beside = beside_usual_focal(problem, fit)
+    beside = log_focal_deviation(problem, fit)
     if not doubtful and abs(beside) > UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
         by_focal = np.delete(answers.shared[len(fit.adjusted.parameters.shared) - 1], np.s_[len(effects) : len(stds)])
         follow = answers.estimate(usual_stds)[1] @ by_focal  # all that moves with the focal length
@@ -226,7 +226,7 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
     )
 
 
-def beside_usual_focal(problem: Problem, fit: Fit) -> float:
+def log_focal_deviation(problem: Problem, fit: Fit) -> float:
     """By how much the logarithm of a fit's focal length exceeds what was known of it; 0 where no tilt shows one."""
     if not isinstance(fit.model, PlanarModel):
         return 0.0
@@ -261,12 +261,12 @@ class _Answers:
 
     @classmethod
     def of(cls, problem: Problem, fit: Fit, effects: Sequence[Effect]) -> Self:
-        """At a fit of the problem, by the inliers; no error says more than :data:`EXACTNESS` allows."""
+        """At a fit of the problem, by the inliers; no error says more than :data:`MODEL_ERROR` allows."""
         adjuster = problem.adjuster_of(fit)
         o = _inliers(adjuster, fit)
         adjuster, at = (
             replace(adjuster, observations=o),
-            replace(fit.adjusted, sigma=math.hypot(fit.adjusted.sigma, EXACTNESS)),
+            replace(fit.adjusted, sigma=math.hypot(fit.adjusted.sigma, MODEL_ERROR)),
         )
         normal, weight = adjuster.normal_equations(at, _NO_ROBUSTNESS), adjuster.weight(at.sigma)
         response = LinearResponse(adjuster, at, np.full(len(o.points1), weight), 1.0, normal)
@@ -316,17 +316,10 @@ class _Answers:
 
 def _inliers(adjuster: BundleAdjuster, fit: Fit) -> Observations:
     """As many observations as say what the shape is, without those that the fit does not explain."""
-    few = adjuster.observations.thinned(max(_ENOUGH // max(len(adjuster.observations), 1), _MIN_MATCHES_PER_LINK))
+    few = adjuster.observations.thinned_to(_ENOUGH, _MIN_MATCHES_PER_LINK)
     squared = replace(adjuster, observations=few).squared(fit.adjusted.parameters)
     kept = squared <= (ALIGNMENT_WIDTH * fit.adjusted.sigma) ** 2
-    before = np.concatenate([[0], np.cumsum(kept)])
-    return replace(
-        few,
-        start=before[few.start],
-        points1=few.points1[kept],
-        points2=few.points2[kept],
-        relief=None if few.relief is None else few.relief[kept],
-    )
+    return few.rows(np.flatnonzero(kept), np.bincount(few.link[kept], minlength=len(few)))
 
 
 def _displacements(answers: _Answers, fit: Fit, count: int, cameras: Sequence[Camera]) -> FloatArray:

@@ -23,11 +23,11 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.plane_marks import PlaneMarks
 from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.select import Posterior
-from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal
+from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, log_focal_deviation
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.choices import Purpose
 from rdstitch.robust.covariance import enlarged
-from rdstitch.robust.posterior import EXACTNESS, LENS
+from rdstitch.robust.posterior import LENS, MODEL_ERROR
 
 _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
 """Matches in all, and of each link at least, that say how high and how wide the hills are."""
@@ -86,7 +86,7 @@ def sandwich_covariances(
 def _relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> ReliefField:
     """What relief does, by as many matches of each link as show its waves."""
     observations = adjuster.observations
-    few = observations.thinned(max(_ENOUGH // max(len(observations), 1), _MIN_MATCHES_PER_LINK))
+    few = observations.thinned_to(_ENOUGH, _MIN_MATCHES_PER_LINK)
     share = len(few.points1) / max(len(observations.points1), 1)
     if share < 1.0:  # each counts for several beside the priors
         adjuster = replace(adjuster, observations=few, overdispersion=adjuster.overdispersion * share)
@@ -158,7 +158,7 @@ def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *,
     one. Where the ground is ``rough`` that is known, and in the covariance.
     """
     count = len(problem.free_lens)
-    beside = beside_usual_focal(problem, fit)
+    beside = log_focal_deviation(problem, fit)
     if not rough and abs(beside) > UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
         adjuster = replace(problem, free_lens=np.ones_like(problem.free_lens)).adjuster_of(fit)
         together = adjuster.covariance(fit.adjusted)
@@ -201,7 +201,7 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
     seen = max(told - own, 1e-9 * told)
     variance = max(float(covariance[-1, -1]) - own / told**2, 1.0 / told) * (told / seen) ** 2
     weighed = prior.combined(value + prior.slope(value) / seen, math.sqrt(variance))
-    if abs(weighed - value) * float(np.median(problem.observations.scale1)) < EXACTNESS:
+    if abs(weighed - value) * float(np.median(problem.observations.scale1)) < MODEL_ERROR:
         return fit
     held = replace(problem, free_lens=np.zeros_like(problem.free_lens))
     lens = np.where(problem.free_lens, weighed, parameters.lens)
@@ -218,7 +218,7 @@ def lever_std(problem: Problem, fit: Fit) -> float:
     assert isinstance(model, PlanarModel)
     steps_of_poses, steps_of_shared = _relief(adjuster, fit.adjusted).steps()
     size, images = model.pose_size, np.arange(problem.count)
-    focal = float(np.exp(parameters.shared[2]))
+    focal = model.focal(parameters.shared)
     middles = PlaneMarks(images, np.zeros((len(images), 2)), np.zeros((len(images), 2)), np.ones(len(images)))
     derivative = middles.equations(fit.adjusted.matrices, parameters.lens, adjuster.free.lens, focal)[1]
     derivative[:, [0, 1], [model.free.index(column) for column in (X, Y)]] -= 1.0
@@ -262,7 +262,7 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
 def _jacobian(model: PlanarModel, poses: FloatArray, shared: FloatArray, reference: int, size: int) -> FloatArray:
     """Derivatives (N, 4, D + S) of x, y, height and yaw in the frame of the reference."""
     yaw, height = poses[reference, YAW], float(np.exp(poses[reference, LOG_HEIGHT]))
-    unit = 1.0 / (height * np.exp(shared[2]))
+    unit = 1.0 / (height * model.focal(shared))
     turn = unit * np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     jacobian = np.zeros((len(poses), 4, size))
     for place, column in enumerate(model.free):

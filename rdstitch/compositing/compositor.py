@@ -102,6 +102,7 @@ def compose_to_file(
             metadata=replace(metadata or Metadata(size), xmp=photo_sphere_xmp(prepared.canvas)),
             quality=renderer.options.quality,
             background=renderer.options.background,
+            workers=prepared.tiles.workers,
         )
         check_format(path, layout)
         check_memory(path, size, renderer.options.max_memory)

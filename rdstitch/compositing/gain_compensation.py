@@ -33,6 +33,7 @@ from rdstitch.system.late_imports import sparse
 
 # Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.
 _CELLS, _MAX_CELLS = 16, 150_000
+_SAMPLES = 10  # pixels along each side of a cell that are looked at, at least, where it has so many
 # Integer samples outside this part of the range are clipped or mostly noise.
 _DARKEST, _BRIGHTEST = 0.02, 0.97
 
@@ -82,15 +83,18 @@ def compare_overlaps(survey: Survey) -> Cells | None:
         a, b, box, seen = survey.overlap(i, j)
         shares[index] = np.count_nonzero(seen) / min(areas[i], areas[j])
         side = max(2, round(max(*a.inside.shape, *b.inside.shape) / _CELLS))
-        lit = [cut(light[k], tile.box, box) for k, tile in ((i, a), (j, b))]
-        p, q = (cut(grey[k], tile.box, box) for k, tile in ((i, a), (j, b)))
-        burnt = [np.stack([each > 1 for each in lit] + [each > 2 for each in lit], axis=-1)]
-        moments = [np.stack([p, q, p * p, q * q, p * q], axis=-1)]
-        layers = [*(cut(tile.pixels, tile.box, box) for tile in (a, b)), *burnt, *moments]
+        step = max(1, side // _SAMPLES)
+        lit, (p, q), colours = (
+            [cut(values, tile.box, box)[::step, ::step] for values, tile in zip(both, (a, b), strict=True)]
+            for both in ((light[i], light[j]), (grey[i], grey[j]), (a.pixels, b.pixels))
+        )
+        burnt = np.stack([each > 1 for each in lit] + [each > 2 for each in lit], axis=-1)
+        moments = np.stack([p, q, p * p, q * q, p * q], axis=-1)
+        layers = np.concatenate([*colours, burnt, moments], axis=-1, dtype=np.float32)
         for which in filter(np.any, (lit[0] * lit[1] == 1, lit[0] * lit[1] > 1)):
-            means = _cell_means(which, layers, side)
+            means = _cell_means(which, layers, side // step)
             means = means[:: max(1, -(-len(means) * len(pairs) // _MAX_CELLS))]
-            means[:, :2] += box[:2]
+            means[:, :2] = step * means[:, :2] + box[:2]
             means_of_pairs.append((np.full(len(means), index), means))
     pair = np.concatenate([which for which, _ in means_of_pairs]) if means_of_pairs else np.zeros(0, dtype=np.intp)
     if not len(pair):
@@ -140,8 +144,8 @@ def _light(tile: SurveyTile) -> NDArray[np.uint8]:
     return np.asarray((tile.inside & (low > darkest)).astype(np.uint8) << clipped)
 
 
-def _cell_means(which: BoolArray, values: Sequence[NDArray[Any]], side: int) -> FloatArray:
-    """Mean x, y (pixels of the box) and values (h, w, K) of every cell of which more than half counts, (M, 2 + K...).
+def _cell_means(which: BoolArray, values: Float32Array, side: int) -> FloatArray:
+    """Mean x, y (pixels of the box) and values (h, w, K) of every cell of which more than half counts, (M, 2 + K).
 
     As products with matrices of ones and zeros, which are many times faster than sums along short axes.
     """
@@ -152,13 +156,10 @@ def _cell_means(which: BoolArray, values: Sequence[NDArray[Any]], side: int) -> 
     weight = which.astype(np.float32)
     count, x, y = (a @ weight @ b.T for a, b in ((rows, columns), (rows, across), (down, columns)))
     used = count > side**2 / 2
-    means = [x[used], y[used]]
-    for part in values:
-        # OpenCV masks, and NumPy's product sums, all channels at once.
-        chosen = cv2.copyTo(part.view(np.uint8) if part.dtype == np.bool_ else part, which.view(np.uint8))
-        along = (rows @ chosen.reshape(len(chosen), -1).astype(np.float32)).reshape(len(rows), which.shape[1], -1)
-        means.append((columns @ along)[used])
-    return np.column_stack(means) / count[used][:, None].astype(np.float64)
+    # OpenCV masks, and NumPy's product sums, all channels at once.
+    chosen = cv2.copyTo(values, which.view(np.uint8))
+    along = (rows @ chosen.reshape(len(chosen), -1)).reshape(len(rows), which.shape[1], -1)
+    return np.column_stack([x[used], y[used], (columns @ along)[used]]) / count[used][:, None].astype(np.float64)
 
 
 _SRGB_OFFSET = 0.055

@@ -6,7 +6,9 @@ The scans of JPEG strips are joined at restart markers, where nothing is carried
 import struct
 import tempfile
 import zlib
+from collections import deque
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,6 +59,7 @@ class ImageSpec:
     metadata: Metadata = field(default_factory=lambda: Metadata((1, 1)))  # colour profile, EXIF and resolution to keep
     quality: int = 95  # of JPEG and WebP, 1 to 100
     background: int = 0  # grey (0 to 255) of what is transparent, in a format without transparency
+    workers: int = 1  # threads that encode JPEG
 
     def __post_init__(self) -> None:
         if min(self.size) < 1 or self.channels < 1:
@@ -157,10 +160,10 @@ def _reread(spill: IO[bytes], size: tuple[int, int], kind: NDArray[Any]) -> Iter
 
 
 def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes | memoryview]:
-    """The pieces of a JPEG file, one strip in memory at a time; transparency becomes the background."""
+    """The pieces of a JPEG file, a strip for each worker in memory at a time; transparency becomes the background."""
     first = True
-    for samples, alpha in strips:
-        head, scan = _header_and_scan(_jpeg(spec, samples, alpha))
+    for data in _encoded(spec, strips):
+        head, scan = _header_and_scan(data)
         if first:
             yield from _embedded(_with_height(head, spec.size[1]), spec.metadata)
         else:
@@ -168,6 +171,21 @@ def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes | me
         yield scan
         first = False
     yield _END_OF_IMAGE
+
+
+def _encoded(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes]:
+    """Each strip as a JPEG file; with several workers, beside what makes the next strips."""
+    if spec.workers == 1:
+        yield from (_jpeg(spec, *strip) for strip in strips)
+        return
+    with ThreadPoolExecutor(spec.workers) as pool:
+        under_way: deque[Future[bytes]] = deque()
+        for strip in strips:
+            under_way.append(pool.submit(_jpeg, spec, *strip))
+            if len(under_way) > spec.workers:
+                yield under_way.popleft().result()
+        while under_way:
+            yield under_way.popleft().result()
 
 
 def _jpeg(spec: ImageSpec, samples: NDArray[np.generic], alpha: NDArray[np.uint8] | None) -> bytes:

@@ -74,7 +74,7 @@ def align_locally(
     *,
     pairs: int | None = None,
     on_sphere: bool = False,
-    edges: Callable[[int], FloatArray] = lambda image: np.empty((0, 2, 2)),
+    edges: Callable[[list[int]], Iterable[FloatArray]] = lambda images: [np.empty((0, 2, 2)) for _ in images],
 ) -> LocalAlignment:
     """Smooth displacement fields that bring matches of overlapping images together.
 
@@ -92,7 +92,8 @@ def align_locally(
     on_sphere : bool
         Whether the camera turned on the spot, so that ``homographies`` lead to directions.
     edges : callable
-        Gives the ends of straight edges in an image, (K, 2, 2) measured pixels. It is called where fields may be used.
+        Gives the ends of straight edges in each of some images, (K, 2, 2) measured pixels. It is called once, where
+        fields may be used.
     """
     images = ImagesOnSurface.of(cameras, homographies, on_sphere=on_sphere)
     if pairs is None:
@@ -146,13 +147,13 @@ def _seen(residual: FloatArray) -> float:
     return float(np.percentile(np.linalg.norm(residual, axis=1), _SEAMS))
 
 
-def _long_edges(edges: Callable[[int], FloatArray], cameras: Sequence[Camera]) -> dict[int, FloatArray]:
+def _long_edges(edges: Callable[[list[int]], Iterable[FloatArray]], cameras: Sequence[Camera]) -> dict[int, FloatArray]:
     """Those that a person sees to be straight, of some images."""
-    count, found = len(cameras), {}
-    for k in evenly_spaced(count, _MAX_IMAGES).tolist():
-        ends = edges(k)
-        found[k] = ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > _EDGE * 2.0 * cameras[k].scale]
-    return found
+    chosen = evenly_spaced(len(cameras), _MAX_IMAGES).tolist()
+    return {
+        k: ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > _EDGE * 2.0 * cameras[k].scale]
+        for k, ends in zip(chosen, edges(chosen), strict=True)
+    }
 
 
 def _bend(fields: PlacedFields, edges: dict[int, FloatArray]) -> float:

@@ -87,7 +87,7 @@ def _nearest_pairs(places: FloatArray, images: IntArray, most: int) -> set[tuple
     return {(i, j) for i, j in pairs.tolist() if i != j}
 
 
-def pairs_that_matter(
+def select_pairs(
     shared: Mapping[tuple[int, int], StoredMatches], cameras: Sequence[Camera]
 ) -> dict[tuple[int, int], StoredMatches]:
     """Of pairs that share something those that one of their images needs for its place.
@@ -115,7 +115,7 @@ def pairs_that_matter(
     return {pair: matches for pair, matches in shared.items() if pair in chosen}
 
 
-def neighbours(
+def loop_closures(
     cameras: Sequence[Camera], homographies: FloatArray, tried: set[tuple[int, int]], *, on_sphere: bool = False
 ) -> Pairs:
     """Pairs that the poses put over one another and that were not tried yet, where the match graph needs them.

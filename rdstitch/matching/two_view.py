@@ -77,8 +77,8 @@ def match_pairs(
     tasks: Sequence[MatchingTask], *, matcher: Matcher, how: tuple[float | str | None, ...], cache: Cache
 ) -> list[StoredMatches]:
     """Match the features of pairs; ``how`` stands for the matcher in the inputs of results."""
-    # Pairs that follow one another have an image in common.
-    load = lru_cache(maxsize=2)(StoredFeatures.load)
+    # Pairs that follow one another have an image in common, and the next ones its neighbours: a megabyte each.
+    load = lru_cache(maxsize=8)(StoredFeatures.load)
     result = []
     for one, two, known in tasks:
         inputs = (one.key(cache), two.key(cache), how, None if known is None else known.key(cache))

@@ -13,7 +13,7 @@ from rdstitch.executors import batches, in_order
 from rdstitch.features import Matcher, match_near
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
-from rdstitch.matching.candidate_pairs import pairs_that_matter
+from rdstitch.matching.candidate_pairs import select_pairs
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
 from rdstitch.matching.static_background import (
@@ -76,7 +76,7 @@ class Pairing:
             for pair, matches in shared.items()
             if len(matches) >= max(_MIN_PRESCREEN_MATCHES, _MIN_RELATIVE_MATCHES * most[[*pair]].min())
         }
-        return pairs_that_matter(promising, self.cameras)
+        return select_pairs(promising, self.cameras)
 
     def estimate(
         self,
@@ -93,7 +93,7 @@ class Pairing:
             return []
         known = self.estimation.distortion
         lens = distortion if known is None else known
-        registered = self._relate(chosen, self._match(chosen, "matching", shared or {}), lens, "registering pairs")
+        registered = self._estimate(chosen, self._match(chosen, "matching", shared or {}), lens, "registering pairs")
         return registered if known is not None or distortion is None else [_without_vote(pair) for pair in registered]
 
     def estimate_candidates(self, candidates: Sequence[Pair]) -> list[PairRegistration]:
@@ -131,7 +131,7 @@ class Pairing:
         weak = [k for k, pair in enumerate(pairs) if not pair.relation or pair.relation.inliers.sum() < _FEW_INLIERS]
         chosen = [(pairs[k].image1, pairs[k].image2) for k in weak]
         matched = [StoredMatches.of(match_pattern(self.features[i], self.features[j])) for i, j in chosen]
-        again = self._relate(chosen, matched, self.estimation.distortion, "matching a repeated pattern")
+        again = self._estimate(chosen, matched, self.estimation.distortion, "matching a repeated pattern")
         result = list(pairs)
         for k, pair in zip(weak, again, strict=True):
             inliers = pair.relation.inliers.sum()
@@ -156,7 +156,7 @@ class Pairing:
             known = pair.correspondences.indices[pair.relation.inliers]
             radius = _SEARCH_RADIUS * self.estimation.threshold
             matched.append(StoredMatches.of(match_near(features1, features2, expected, radius, known, self.ratio)))
-        return self._relate([pair.images for pair in pairs], matched, self.estimation.distortion)
+        return self._estimate([pair.images for pair in pairs], matched, self.estimation.distortion)
 
     def _match(
         self, pairs: Sequence[Pair], stage: str, shared: Mapping[Pair, StoredMatches] | None = None
@@ -173,7 +173,7 @@ class Pairing:
             self.progress(stage, len(done), len(pairs))
         return done
 
-    def _relate(
+    def _estimate(
         self,
         pairs: Sequence[Pair],
         matched: Sequence[StoredMatches],

@@ -9,17 +9,16 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
-from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cut_outs import common_size, cut_alignment, framed_camera, framed_link
-from rdstitch.alignment.frames import QuarterTurns
 from rdstitch.alignment.plane_marks import Sighting
+from rdstitch.alignment.quarter_turns import QuarterTurns
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.measurements import metres_around_median, positions_of
 from rdstitch.inputs.source import Source
-from rdstitch.matching.candidate_pairs import neighbours
+from rdstitch.matching.candidate_pairs import loop_closures
 from rdstitch.matching.copies import copies_of, distinct
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
@@ -27,6 +26,7 @@ from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
+from rdstitch.robust.loss import sigma_of
 from rdstitch.system.cache import Cache
 from rdstitch.system.file_access import canonical_name
 from rdstitch.system.process_memory import return_freed_memory
@@ -216,9 +216,9 @@ def draft_with_loops(
     for _ in range(_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
         tried = {pair.images for pair in pairs}
-        loop_closures = neighbours(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
+        beside = loop_closures(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
         unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
-        more = pairing.estimate(sorted(unaligned.union(loop_closures)), distortion=alignment.distortion)
+        more = pairing.estimate(sorted(unaligned.union(beside)), distortion=alignment.distortion)
         selected = select_by_whole_lens(aligned, aligner.threshold)
         pairs = tuple(sorted([*(selected or pairs), *more], key=lambda pair: pair.images))
         if selected is None and not any(pair.relation for pair in more):

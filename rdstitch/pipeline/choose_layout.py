@@ -109,7 +109,8 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
 
     def laid(candidate: Registration, local: LocalAlignment | None = None) -> LaidOut:
         whole = on_whole_pixels(with_frontal_reference(at_full_size(candidate), options, always=pano))
-        local = align_registration_locally(whole, options.local_alignment, edges) if local is None else local
+        if local is None:
+            local = align_registration_locally(whole, options.local_alignment, edges, options.threads)
         one = lay_out(whole, local, options.composite)
         return one if options.dry_run else replace(one, layout=one.layout.decided(options.composite, options.threads))
 

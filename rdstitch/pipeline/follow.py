@@ -6,7 +6,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -58,33 +58,6 @@ class FollowedPoses:
     height: float | None = None
     frame: TrajectoryFrame = "enu"
 
-    def unit(self, tracked: Tracked) -> float:
-        """How long the height of the first keyframe is: as given, else as odometry says, else one."""
-        return self.height or (tracked.unit if math.isfinite(tracked.unit) else 1.0)
-
-    def length_std(self, tracked: Tracked) -> float:
-        """Relative standard deviation that all lengths share."""
-        return tracked.length_std if self.height or not math.isfinite(tracked.unit) else tracked.unit_std
-
-    def fields(self, tracked: Tracked | None) -> dict[str, float | None]:
-        """x, y, yaw and height."""
-        if tracked is None or (pose := tracked.pose) is None:
-            return dict.fromkeys(("x", "y", "yaw_deg", "yaw", "height"))
-        unit = self.unit(tracked)
-        x, y = in_frame(pose.x * unit, pose.y * unit, self.frame)
-        yaw = {"yaw_deg": math.degrees(pose.yaw), "yaw": pose.yaw}
-        return {"x": x, "y": y, **yaw, "height": pose.height * unit}
-
-    def covariance(self, tracked: Tracked) -> FloatArray | None:
-        """Of x, y, height and yaw (4, 4), in the axes of the first image; with what all lengths share."""
-        if (pose := tracked.pose) is None or tracked.covariance is None:
-            return None
-        place = np.array([pose.x, pose.y, 0.0, 0.0])
-        shared, length = self.length_std(tracked), self.unit(tracked)
-        shared = 0.0 if math.isnan(shared) else shared
-        unit = np.array([length, length, length, 1.0])
-        return np.asarray((tracked.covariance + shared**2 * np.outer(place, place)) * np.outer(unit, unit))
-
 
 @dataclass(frozen=True)
 class Pose:
@@ -97,8 +70,8 @@ class Pose:
         In the video, camera or stream that it comes from, else in the order of arrival.
     timestamp : float
         s; NaN where not known.
-    tracked : Tracked or None
-        Its place and λ; None where it could not be read.
+    tracked : Tracked
+        Its place and λ, as far as they are known.
     reason : str
         Why there is no place; empty where there is one.
     poses : FollowedPoses
@@ -110,25 +83,36 @@ class Pose:
     name: str
     number: int
     timestamp: float
-    tracked: Tracked | None
+    tracked: Tracked = field(default_factory=Tracked)
     reason: str = ""
     poses: FollowedPoses = FollowedPoses()
     messages: tuple[Message, ...] = ()
 
     def __bool__(self) -> bool:
-        return self.tracked is not None and self.tracked.pose is not None
+        return self.tracked.pose is not None
+
+    @property
+    def unit(self) -> float:
+        """How long the height of the first keyframe is: as given, else as odometry says, else one."""
+        return self.poses.height or (self.tracked.unit if math.isfinite(self.tracked.unit) else 1.0)
+
+    @property
+    def length_std(self) -> float:
+        """Relative standard deviation that all lengths share, by the focal length; NaN where it is not known."""
+        by_odometry = not self.poses.height and math.isfinite(self.tracked.unit)
+        return self.tracked.unit_std if by_odometry else self.tracked.length_std
 
     @property
     def position(self) -> tuple[float, float, float] | None:
         """X, y and height above the plane, in the frame and unit of the tracker; None where there is no place."""
-        at = self.poses.fields(self.tracked)
-        x, y, height = at["x"], at["y"], at["height"]
-        return None if x is None or y is None or height is None else (x, y, height)
+        if (pose := self.tracked.pose) is None:
+            return None
+        return *in_frame(pose.x * self.unit, pose.y * self.unit, self.poses.frame), pose.height * self.unit
 
     @property
     def yaw(self) -> float | None:
         """Heading, radians, counterclockwise as seen from above; None where there is no place."""
-        return None if self.tracked is None or self.tracked.pose is None else self.tracked.pose.yaw
+        return None if self.tracked.pose is None else self.tracked.pose.yaw
 
     @property
     def covariance(self) -> FloatArray | None:
@@ -137,51 +121,58 @@ class Pose:
         Relative to the first keyframe, with the growth of the errors from keyframe to keyframe and the scale that all
         share.
         """
-        known = None if self.tracked is None else self.poses.covariance(self.tracked)
+        known = self._covariance
         return None if known is None else covariance_in_frame(known, self.poses.frame)
 
     @property
     def ros_covariance(self) -> FloatArray | None:
         """The same as messages of ROS have it, (6, 6); see :func:`rdstitch.export.trajectory_files.ros_covariance`."""
-        known = None if self.tracked is None else self.poses.covariance(self.tracked)
+        known = self._covariance
         return None if known is None else ros_covariance(known, self.poses.frame)
+
+    @property
+    def _covariance(self) -> FloatArray | None:
+        """In the axes of the first image."""
+        if (pose := self.tracked.pose) is None or self.tracked.covariance is None:
+            return None
+        place, unit = np.array([pose.x, pose.y, 0.0, 0.0]), np.array([self.unit] * 3 + [1.0])
+        shared = 0.0 if math.isnan(self.length_std) else self.length_std
+        return np.asarray((self.tracked.covariance + shared**2 * np.outer(place, place)) * np.outer(unit, unit))
 
     @property
     def map(self) -> int | None:
         """Number of the map that the pose belongs to: those of different maps have nothing in common."""
-        return None if self.tracked is None else self.tracked.map_number
+        return self.tracked.map_number
 
     @property
     def quality(self) -> float:
         """Share of the matches that agree, 0 to 1."""
-        return self.tracked.quality if self.tracked is not None and self else 0.0
-
-    @property
-    def length_std(self) -> float:
-        """Relative standard deviation that all lengths share, by the focal length; NaN where it is not known."""
-        return math.nan if self.tracked is None else self.poses.length_std(self.tracked)
+        return self.tracked.quality if self else 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """As a line of JSON takes it; null for what is not known."""
-        tracked = self.tracked
-        placement = None if tracked is None else tracked.placement
-        covariance = self.ros_covariance
+        tracked, covariance = self.tracked, self.ros_covariance
+        x, y, height = self.position or (None, None, None)
         return {
             "name": self.name,
             "frame": self.number,
             "timestamp": _known(self.timestamp),
-            **self.poses.fields(tracked),
+            "x": x,
+            "y": y,
+            "yaw_deg": None if self.yaw is None else math.degrees(self.yaw),
+            "yaw": self.yaw,
+            "height": height,
             "covariance": None if covariance is None else covariance.ravel().tolist(),
             "length_std": _known(self.length_std),
             "quality": self.quality,
-            "homography": None if placement is None else placement.homography.tolist(),
-            "lambda": None if tracked is None else _known(tracked.distortion),
-            "lambda_std": None if tracked is None else _known(tracked.distortion_std),
-            "lambda_known": tracked is not None and tracked.distortion_known,
-            "map": None if tracked is None else tracked.map_number,
-            "keyframe": tracked is not None and tracked.keyframe,
-            "inliers": 0 if tracked is None else tracked.inliers,
-            "revised": tracked is not None and tracked.revised,
+            "homography": None if tracked.placement is None else tracked.placement.homography.tolist(),
+            "lambda": _known(tracked.distortion),
+            "lambda_std": _known(tracked.distortion_std),
+            "lambda_known": tracked.distortion_known,
+            "map": tracked.map_number,
+            "keyframe": tracked.keyframe,
+            "inliers": tracked.inliers,
+            "revised": tracked.revised,
             "reason": self.reason,
             "messages": [str(message) for message in self.messages],
         }
@@ -221,9 +212,9 @@ def follow(
             continue
         poses_of_frame = tracker.register(frame, source, image, reason)
         yield from poses_of_frame
-        if source is not None and (result := poses_of_frame[-1].tracked) is not None:
+        if source is not None:
             if sketch is not None:
-                sketch.add(source, result)
+                sketch.add(source, poses_of_frame[-1].tracked)
             source.decoded_images.clear()
     yield from tracker.finish()
     if sketch is not None:
@@ -357,7 +348,7 @@ class Tracker:
         body: BodyPose | None = None,
     ) -> list[Pose]:
         """Register a frame that was read; it comes last, after those before it whose place is new."""
-        label = Pose(frame.path.name, frame.number or 0, math.nan, None, reason, self._poses)
+        label = Pose(frame.path.name, frame.number or 0, math.nan, Tracked(), reason, self._poses)
         if source is None or image is None:
             return [label]
         label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))

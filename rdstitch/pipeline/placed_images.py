@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Self
@@ -41,10 +42,12 @@ def align_registration_locally(
     registration: Registration,
     choice: LocalAlignmentMode,
     edges: Callable[[int], FloatArray] | None = None,
+    threads: int = 1,
 ) -> LocalAlignment:
     """Displacement fields of the images that are used, in their order, from the matches of all their pairs.
 
-    The registration is in pixels of the images; ``edges`` are those of an image that fields should not bend.
+    The registration is in pixels of the images; ``edges`` are those of an image that fields should not bend, looked for
+    in so many images at a time.
     """
     if choice == "off":
         return no_local_alignment("switched off")
@@ -60,6 +63,10 @@ def align_registration_locally(
         found = pair.correspondences
         return Match(int(position[pair.image1]), int(position[pair.image2]), found.points1, found.points2)
 
+    def edges_of(images: list[int]) -> list[FloatArray]:
+        with ThreadPoolExecutor(threads) as pool:
+            return list(pool.map(edges or (lambda k: straight_edges(registration.sources[k])), used[images].tolist()))
+
     cameras = [camera for camera, used in zip(alignment.cameras, alignment.used, strict=True) if used]
     used = np.flatnonzero(alignment.used)
     return align_locally(
@@ -69,7 +76,7 @@ def align_registration_locally(
         choice,
         pairs=len(pairs),
         on_sphere=alignment.on_sphere,
-        edges=lambda image: edges(int(used[image])) if edges else straight_edges(registration.sources[used[image]]),
+        edges=edges_of,
     )
 
 

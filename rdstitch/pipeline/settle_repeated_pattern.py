@@ -20,7 +20,7 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.options.feature_options import CLOSER, WORK_MEGAPIXELS
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
-from rdstitch.robust.verification import places
+from rdstitch.robust.chance import places
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE
 from rdstitch.verification.self_similarity import find_ambiguity

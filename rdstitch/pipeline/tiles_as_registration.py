@@ -29,7 +29,8 @@ def tiles_as_registration(sources: Sequence[Source], tiled: TileRegistration) ->
             f"none of {len(tiled.compared)} pairs of neighbours show the same where they should: the places "
             f"({tiled.grid.source}) or the overlap may be wrong; --search PX looks farther"
         )
-    cameras = [replace(source.camera, distortion=fitted.distortion) for source in sources]
+    distortion, std = fitted.distortion, fitted.distortion_std
+    cameras = [replace(source.camera, distortion=distortion, distortion_std=std) for source in sources]
     places = fitted.places - fitted.places[0]
     exact = _homographies(cameras, places)
     pairs, fits = zip(*(_pair(tiled, cameras, exact, number) for number in range(len(links.tiles))), strict=True)
@@ -44,8 +45,6 @@ def tiles_as_registration(sources: Sequence[Source], tiled: TileRegistration) ->
         reference=0,
         model="rigid",
         model_reason="a stage moves without turning",
-        distortion=fitted.distortion,
-        distortion_std=fitted.distortion_std,
         rms=rms,
         links=fits,
         relief=ReliefTest(False, 0.0, 0.0, "Taken to be flat: tiles on a stage."),

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.planar_motion import nearest_rotation
-from rdstitch.robust.verification import binomial_tail
+from rdstitch.robust.chance import binomial_tail
 
 _TOLERANCE = math.radians(1.0)  # between an edge and the line from its middle to its vanishing point
 _CROOKED = math.radians(0.2)  # standard deviation of edges that should be parallel, besides that of their ends

@@ -16,6 +16,7 @@ _SAMPLES = 200
 _CELLS = (16, 12)  # of the image, to say how much of it has matches
 _BAND = 2.0  # standard deviations on either side
 _TICKS = 6
+_BINS = 50  # of the histogram of votes
 
 
 def _across(shares: FloatArray, texts: list[str], title: str) -> list[Markup]:
@@ -95,21 +96,27 @@ def votes(registration: Registration) -> str:
         return section("Votes on λ", "λ was given: no pair voted.")
     relations = [pair.relation for pair in registration.pairs if pair.relation]
     consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
-    if consensus.votes == 0:
-        return section("Votes on λ", f"No pair voted: {consensus.reason}.")
+    if not len(consensus.votes):
+        why = "the camera hardly moves, or only turns about its axis"
+        return section("Votes on λ", f"No pair voted: none of {len(relations)} can see the distortion: {why}.")
+    agree = f"{int(consensus.agreeing.sum())} of them agree on {consensus.distortion:+.4f}"
     return section(
         "Votes on λ",
-        f"λ of {counted(consensus.votes, 'pair')}, weighted by the inverse of its variance ({consensus.reason}, "
+        f"λ of {counted(len(consensus.votes), 'pair')}, weighted by the inverse of its variance ({agree}, "
         f"scatter {consensus.scatter:.4f}). The red line is λ after the adjustment of all images.",
         _histogram(registration.alignment.distortion, consensus),
     )
 
 
 def _histogram(adjusted: float, consensus: Consensus) -> str:
-    low, high = min(consensus.edges[0], adjusted), max(consensus.edges[-1], adjusted)
+    values, center = consensus.votes, consensus.distortion
+    span = min(values.min(), center - 1e-3), max(values.max(), center + 1e-3)
+    shares, places = np.histogram(values, bins=_BINS, range=span, weights=consensus.std_of_votes**-2.0)
+    shares = shares / shares.sum()
+    low, high = min(places[0], adjusted), max(places[-1], adjusted)
     low, high = low - 0.02 * (high - low), high + 0.02 * (high - low)
-    *edges, at = (_LEFT + (np.r_[consensus.edges, adjusted] - low) / (high - low) * (_RIGHT - _LEFT)).tolist()
-    heights = (consensus.histogram / consensus.histogram.max() * (_BASE - _TOP)).tolist()
+    *edges, at = (_LEFT + (np.r_[places, adjusted] - low) / (high - low) * (_RIGHT - _LEFT)).tolist()
+    heights = (shares / shares.max() * (_BASE - _TOP)).tolist()
     parts = [
         element("rect", x=left, y=_BASE - tall, width=max(right - left - 0.5, 0.5), height=tall, fill=BLUE)
         for left, right, tall in zip(edges, edges[1:], heights, strict=False)
@@ -124,6 +131,6 @@ def _histogram(adjusted: float, consensus: Consensus) -> str:
             [f"{tick:.{digits}f}" for tick in np.linspace(low, high, _TICKS)],
             "λ (half diagonal)",
         ),
-        label(_LEFT, _TOP - 8, f"weight, up to {consensus.histogram.max():.0%}"),
+        label(_LEFT, _TOP - 8, f"weight, up to {shares.max():.0%}"),
     ]
     return drawing(_WIDTH, _HEIGHT, parts, "votes on λ")

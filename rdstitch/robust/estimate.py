@@ -12,12 +12,12 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography, are_homographies
 from rdstitch.options.estimation_options import EstimationOptions
+from rdstitch.robust.chance import MIN_PLACES, places, rejection_reason
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
 from rdstitch.robust.pair_models import PlanarPairModel
 from rdstitch.robust.ransac import ransac
-from rdstitch.robust.verification import MIN_PLACES, places, rejection_reason
 
 _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
 # matches, with padding, of the pairs in one batch: enough to hide Python's overhead, few enough for the caches

@@ -27,10 +27,18 @@ over 72 rendered pairs the median error of λ is 0.0017 at half that width, and 
 # Halved or doubled, it changes the median error of λ by a sixth at most.
 _MIN_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
 
+_MIN_SIGMA = 1e-3
+"""Pixels; a smaller one is not measurable, and errors are divided by it."""
+
 
 def normal_std(values: NDArray[Any]) -> float:
     """Standard deviation of normal numbers about 0, among which there may be others, by their median magnitude."""
     return float(np.median(np.abs(values))) / NORMAL_MEDIAN
+
+
+def sigma_of(squared: FloatArray) -> float:
+    """Standard deviation of an error's coordinate, pixels, from the median of the squared lengths (M,), or inf."""
+    return max(float(np.sqrt(np.median(squared))) / RAYLEIGH_MEDIAN, _MIN_SIGMA) if len(squared) else _MIN_SIGMA
 
 
 def noise_of(errors: FloatArray, threshold: FloatArray | float, fitted: int = 0) -> FloatArray:

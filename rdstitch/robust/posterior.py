@@ -51,7 +51,7 @@ from rdstitch.geometry.camera import LENS_STD
 TWENTY_TO_ONE = 6.0
 """What odds cost that are said beforehand: a richer lens is rarer, ``pano`` is for turns and ``mosaic`` for planes."""
 
-EXACTNESS = 0.1
+MODEL_ERROR = 0.1
 """Pixels: how exactly a lens and a plane can be described at all; smaller errors do not tell hypotheses apart."""
 
 _SIDE = 4
@@ -61,7 +61,7 @@ _FARTHEST = 0.02
 """Half diagonals: errors beyond count as this; a link that is off by less is no wrong pair."""
 
 _SIZES = 14
-"""Sizes of each part of the field that are tried, from :data:`EXACTNESS` to the farthest error."""
+"""Sizes of each part of the field that are tried, from :data:`MODEL_ERROR` to the farthest error."""
 
 _EXACT_STD = 1e-6
 
@@ -218,7 +218,7 @@ class Evidence:
             block,
             group[blocks // 4],
             np.bincount(cell).astype(np.float64),
-            np.maximum(noise, EXACTNESS),
+            np.maximum(noise, MODEL_ERROR),
             farthest_error(scale),
             np.ones(len(noise)) if weight is None else weight,
         )
@@ -233,7 +233,7 @@ class Evidence:
         sums = np.stack([np.bincount(self.cell, axis, len(self.counts)) for axis in kept.T], axis=1)
         mean = sums / self.counts[:, None]
         squared = np.einsum("ck,ck->c", mean, mean)
-        sizes = np.geomspace(EXACTNESS, np.maximum(self.farthest, 2.0 * EXACTNESS), _SIZES)
+        sizes = np.geomspace(MODEL_ERROR, np.maximum(self.farthest, 2.0 * MODEL_ERROR), _SIZES)
         coarse = np.concatenate([np.zeros((1, groups)), sizes])[:, self.group]
         best = ErrorCost(np.full(groups, np.inf), np.zeros(groups), np.full(groups, 2.0))
         every = np.arange(groups)

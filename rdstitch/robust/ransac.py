@@ -10,13 +10,13 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.options.estimation_options import EstimationOptions
+from rdstitch.robust.chance import MIN_PLACES
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel
 from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
-from rdstitch.robust.verification import MIN_PLACES
 from rdstitch.solvers.solutions import Solutions
 
 # Halved or doubled, none of these changes what is found, only the time.
@@ -95,19 +95,19 @@ def ransac(
     matches of a pair come first; ``tilts`` (B, 2, 2): known tilts (ψ, θ) of both images, radians.
     """
     quick = _subset(data)
-    lanes = [_Lane(solver, data, quick, ordered, tilts, options, index) for index, solver in enumerate(solvers)]
+    states = [_SolverState(solver, data, quick, ordered, tilts, options, index) for index, solver in enumerate(solvers)]
     best = Hypotheses.none(data)
     confident = np.zeros(len(data), dtype=np.bool_)
     active = np.arange(len(data))
     batch, hard = _FIRST_BATCH, active[:0]
     while len(active):
-        for lane, rows in [*((lane, hard) for lane in lanes[:-1]), (lanes[-1], active)]:
-            rows = rows[lane.drawn[rows] < lane.needed(best, rows, explore=True)]
-            left = options.max_iterations - np.sum([each.drawn[rows] for each in lanes], axis=0)
+        for one, rows in [*((one, hard) for one in states[:-1]), (states[-1], active)]:
+            rows = rows[one.drawn[rows] < one.needed(best, rows, explore=True)]
+            left = options.max_iterations - np.sum([each.drawn[rows] for each in states], axis=0)
             for size in np.unique(np.minimum(left, batch)).tolist():  # of each pair, whatever the others have drawn
-                lane.advance(best, rows[np.minimum(left, batch) == size], size)
-        needed = np.stack([lane.needed(best, active) for lane in lanes])
-        drawn = np.stack([lane.drawn[active] for lane in lanes])
+                one.advance(best, rows[np.minimum(left, batch) == size], size)
+        needed = np.stack([one.needed(best, active) for one in states])
+        drawn = np.stack([one.drawn[active] for one in states])
         explored = (drawn >= np.minimum(_MIN_EXPLORATION, needed)).all(axis=0)
         # Where the solver that assumes least is confident, nothing is left to explore.
         sure = (drawn[-1] >= needed[-1]) | (explored & (drawn >= needed).any(axis=0))
@@ -115,11 +115,11 @@ def ransac(
         going = ~sure & (drawn.sum(axis=0) < options.max_iterations)
         active, hard = active[going], active[going & (needed[-1] > _ALONE)]
         batch = min(2 * batch, _MAX_BATCH)
-    return Search(best, np.sum([lane.drawn for lane in lanes], axis=0), confident)
+    return Search(best, np.sum([one.drawn for one in states], axis=0), confident)
 
 
 @dataclass(eq=False)
-class _Lane:
+class _SolverState:
     """One minimal solver's share of the search."""
 
     solver: MinimalSolver

@@ -12,6 +12,8 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, at_delay, change_with_delay
+from rdstitch.matching.distortion_consensus import vote
+from rdstitch.matching.links import Link
 from rdstitch.robust import EstimationOptions
 from rdstitch.tracking.metric_plane import MetricPlane
 from rdstitch.tracking.placement import CameraPose
@@ -29,7 +31,7 @@ class CameraKnowledge:
     given: AlignmentOptions
     pair: EstimationOptions  # with λ, once it is known
     model: str  # of the motion
-    distortion: float | None
+    distortion: float  # NaN, inf: not known
     distortion_std: float
     length_std: float = math.nan  # of all lengths, relative
     given_length_std: float = math.nan  # the same when all frames were given last
@@ -45,7 +47,8 @@ class CameraKnowledge:
     @classmethod
     def of(cls, given: AlignmentOptions, pair: EstimationOptions) -> Self:
         """Before the first frame."""
-        return cls(given, pair, given.model, pair.distortion, math.inf if pair.distortion is None else 0.0)
+        distortion, std = (math.nan, math.inf) if pair.distortion is None else (pair.distortion, 0.0)
+        return cls(given, pair, given.model, distortion, std)
 
     @property
     def distortion_known(self) -> bool:
@@ -61,8 +64,7 @@ class CameraKnowledge:
         """That of a frame with the lens as it is known so far."""
         if self.lens_given:
             return camera
-        seen = self.distortion is not None and math.isfinite(self.distortion_std)
-        return camera.with_coefficients((self.distortion or 0.0) if seen else 0.0)
+        return camera.with_coefficients(self.distortion if math.isfinite(self.distortion_std) else 0.0)
 
     def given_plane(self, camera: Camera) -> MetricPlane | None:
         """What is given of the camera, where that suffices for metric poses from the second frame on."""
@@ -95,8 +97,45 @@ class CameraKnowledge:
         late = self.delay_std * float(change_with_delay(frame.attitude).max())
         return math.hypot(self.given.attitudes_std, late)
 
-    def learn(self, alignment: Alignment, keyframes: Sequence[TrackedFrame]) -> None:
+    def vote(self, links: Sequence[Link]) -> None:
+        """λ by the pairs alone, until there is an alignment."""
+        if not self.distortion_known:
+            relations = [link.relation for link in links]
+            consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
+            self.distortion, self.distortion_std = consensus.distortion, consensus.std
+
+    def cameras_for(self, keyframes: Sequence[TrackedFrame], focal_std: float | None) -> list[Camera]:
+        """Those of keyframes that are aligned, with the focal length of the map if it is to be kept so closely."""
+        cameras = [keyframe.camera.with_focal() for keyframe in keyframes]
+        if self.pair.distortion is not None and not self.lens_given:
+            cameras = [camera.with_coefficients(self.pair.distortion) for camera in cameras]
+        if self.focal is None or focal_std is None:
+            return cameras
+        focal = self.focal
+        return [c.with_focal(focal * c.scale, "file", focal_std * focal * c.scale) for c in cameras]
+
+    def options_for(self, keyframes: Sequence[TrackedFrame]) -> AlignmentOptions:
+        """Of an alignment of keyframes."""
+        attitudes = [attitude for keyframe in keyframes if (attitude := self.attitude(keyframe)) is not None]
+        measured, known = len(attitudes) == len(keyframes), self.distortion_known
+        std = max(self.attitude_std(keyframe) for keyframe in keyframes) if measured else self.given.attitudes_std
+        return replace(
+            self.given,
+            model=self.model,
+            lens="auto" if known else "division",
+            lens_known=known,
+            attitudes=np.array(attitudes) if measured else None,
+            delayed_attitudes=None,
+            attitudes_std=std,
+            pose_covariance=not known,
+        )
+
+    def learn(self, alignment: Alignment, keyframes: Sequence[TrackedFrame], *, keeps_focal: bool) -> None:
         """Keep what an alignment shows of the camera, for the frames to come."""
+        if not self.distortion_known and alignment.distortion_std < self.distortion_std:
+            self.distortion, self.distortion_std = alignment.distortion, alignment.distortion_std
+        if not keeps_focal:
+            self.focal, self.length_std = alignment.focal, alignment.length_std
         poses, tilt = alignment.poses, alignment.tilt
         self.shape_std = (0.0, 0.0)
         if poses is not None and poses.covariance is not None:

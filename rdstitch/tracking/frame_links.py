@@ -13,7 +13,8 @@ from rdstitch.features.corner_flow import matched_corners
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
-from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
+from rdstitch.robust import PairMatches, estimate_radial_homographies
+from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.placement import Placement
 from rdstitch.tracking.tracked_frame import MIN_INLIERS, TrackedFrame
 
@@ -54,9 +55,7 @@ def fitted_homography(
     return np.asarray(homography, dtype=np.float64), inliers
 
 
-def links_by_corners(
-    frame: TrackedFrame, others: Sequence[TrackedFrame], options: EstimationOptions, *, lens_given: bool
-) -> list[Link]:
+def links_by_corners(frame: TrackedFrame, others: Sequence[TrackedFrame], known: CameraKnowledge) -> list[Link]:
     """Links of keyframes with a frame whose place is about known."""
     if frame.place is None:
         return []
@@ -64,27 +63,19 @@ def links_by_corners(
         (other, *matched_corners(other.image, frame.image, frame.corners, partial(frame.motion_to, other)), None)
         for other in others
     ]
-    return _registered(frame, matched, options, lens_given=lens_given)
+    return _registered(frame, matched, known)
 
 
 def links_by_features(
-    frame: TrackedFrame,
-    others: Sequence[TrackedFrame],
-    match: Matcher,
-    options: EstimationOptions,
-    *,
-    lens_given: bool,
+    frame: TrackedFrame, others: Sequence[TrackedFrame], match: Matcher, known: CameraKnowledge
 ) -> list[Link]:
     """The same where nothing is known of its place."""
     found = [(other, match(other.features, frame.features)) for other in others]
-    matched: list[Matched] = [(other, m.points1, m.points2, -m.ratio) for other, m in found]
-    return _registered(frame, matched, options, lens_given=lens_given)
+    return _registered(frame, [(other, m.points1, m.points2, -m.ratio) for other, m in found], known)
 
 
-def _registered(
-    frame: TrackedFrame, matched: Sequence[Matched], options: EstimationOptions, *, lens_given: bool
-) -> list[Link]:
-    if options.distortion is None:
+def _registered(frame: TrackedFrame, matched: Sequence[Matched], known: CameraKnowledge) -> list[Link]:
+    if not known.distortion_known:
         pairs = [
             PairMatches(points1, points2, other.camera.with_focal(), frame.camera.with_focal(), quality)
             for other, points1, points2, quality in matched
@@ -92,14 +83,14 @@ def _registered(
         return [
             Link(other.number, frame.number, points1[fit.inliers], points2[fit.inliers], fit)
             for (other, points1, points2, _), fit in zip(
-                matched, estimate_radial_homographies(pairs, options), strict=True
+                matched, estimate_radial_homographies(pairs, known.pair), strict=True
             )
             if fit and fit.inliers.sum() >= MIN_INLIERS
         ]
     links = []  # where the lens is known, a homography of undistorted points
     for other, points1, points2, _ in matched:
         assert other.place is not None
-        camera, camera2 = (camera_beside(one, other.place, lens_given=lens_given) for one in (other, frame))
+        camera, camera2 = (camera_beside(one, other.place, lens_given=known.lens_given) for one in (other, frame))
         homography, inliers = fitted_homography(camera2, camera, points2, points1, MATCH_ERROR)
         # A few wrong matches do not make a link: a homography takes four of any.
         if homography is None or inliers.sum() < MIN_INLIERS + _WRONG * len(points1):

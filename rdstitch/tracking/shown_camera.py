@@ -149,21 +149,10 @@ def _fitted(pairs: SeenPairs, start: FloatArray, free: list[int]) -> tuple[Float
 
 
 def judged_focal(stated_std: float, shown: float, shown_std: float) -> tuple[float, float]:
-    """How far a given focal length may be off, and how likely it is wrong.
+    """Root mean square error of the logarithm of a given focal length, and the probability that it is wrong.
 
-    It is right within what was stated of it, or wrong by anything; see :data:`WRONG_GIVEN_FOCAL`.
-
-    Parameters
-    ----------
-    stated_std : float
-        Of the logarithm of the given focal length.
-    shown, shown_std : float
-        By how much the images show a longer one, as a logarithm, and its standard deviation; inf where they do not.
-
-    Returns
-    -------
-    float, float
-        Root mean square of the error of its logarithm; probability.
+    It is right within ``stated_std``, or wrong by anything (:data:`WRONG_GIVEN_FOCAL`); the images show one that is
+    ``shown`` longer, as a logarithm, with a standard deviation that is inf where they show none.
     """
     share, far = WRONG_GIVEN_FOCAL
     logs, squares = [], []

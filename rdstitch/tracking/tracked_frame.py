@@ -24,16 +24,16 @@ _GRID = 8  # points a side by which it is measured how much two frames share
 class Tracked:
     """The result of one frame."""
 
-    number: int  # of the frame, in the order of arrival
-    placement: Placement | None  # where it lies on the plane of its map; None where that is not known
+    number: int = -1  # of the frame, in the order of arrival; -1 where it could not be read
+    placement: Placement | None = None  # where it lies on the plane of its map; None where that is not known
     # distortion, distortion_std: λ by all frames up to this one, half-diagonal frame; NaN and inf where it cannot be
     # seen
-    distortion: float
-    distortion_std: float
-    distortion_known: bool  # whether λ was given, or is so certain that it is kept from now on
-    map_number: int  # maps have no common plane: a new one begins where the track was lost
-    keyframe: bool
-    inliers: int  # matches with the last keyframes that agree
+    distortion: float = math.nan
+    distortion_std: float = math.inf
+    distortion_known: bool = False  # whether λ was given, or is so certain that it is kept from now on
+    map_number: int | None = None  # maps have no common plane: a new one begins where the track was lost
+    keyframe: bool = False
+    inliers: int = 0  # matches with the last keyframes that agree
     revised: bool = False  # whether the frame had come before, and has its place, or another one, only now
     quality: float = 0.0  # share of the matches that agree
     # (4, 4): of x, y, height and yaw, in units of the first keyframe's height and radians, relative to that; without
@@ -63,6 +63,7 @@ class TrackedFrame:
     body: BodyPose | None = None  # by odometry
     place: Placement | None = None  # relative to the other keyframes, from the first one on
     aligned: bool = False  # whether that is on the plane of the map
+    keyframe: bool = False
     covariance: FloatArray | None = None
     quality: float = 0.0
     static: Callable[[FloatArray], BoolArray] = lambda points: np.zeros(len(points), dtype=np.bool_)
@@ -78,6 +79,10 @@ class TrackedFrame:
         """Features, by which it is matched where one does not."""
         features = self.detect(self.image)
         return features.take(np.flatnonzero(~self.static(features.points)))
+
+    def unplace(self) -> None:
+        """Forget its place."""
+        self.place, self.aligned, self.covariance = None, False, None
 
     @property
     def seen_from(self) -> tuple[complex, float, BodyPose | None] | None:

@@ -29,7 +29,6 @@ class MotionModel(ABC):
     one_camera: bool = True
     # Whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one
     free_tilts: bool = False
-    # Whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one
     any_tilt: bool = False
 
     @property
@@ -49,6 +48,10 @@ class MotionModel(ABC):
         """The inverse of :meth:`physical_parameters`, also from those of a model with more of them."""
         return np.asarray(physical[len(physical) - len(self.shared_names) :], dtype=np.float64)
 
+    def focal(self, shared: FloatArray) -> float:
+        """Focal length of the one camera, half diagonals."""
+        return float(np.exp(shared[-1]))
+
     @abstractmethod
     def shared_starts(self, log_focal: float, tilt: Sequence[float], *, tilt_known: bool) -> list[FloatArray]:
         """Shared parameters (S,) near enough to any usual ones for an adjustment to converge from the nearest."""
@@ -62,7 +65,7 @@ class MotionModel(ABC):
         return np.zeros((len(poses), self.pose_size))
 
     @abstractmethod
-    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+    def nominal_homographies(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """Homographies (N, 3, 3) of images at the origin of the plane, with the tilts (N, 2) given."""
 
     @abstractmethod

@@ -38,7 +38,7 @@ class HomographyModel(MotionModel):
         growth = np.eye(3) + change @ (np.eye(3) + change / 2.0)  # exp to second order
         return _unit_determinant(growth @ poses.reshape(-1, 3, 3))
 
-    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+    def nominal_homographies(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The identity."""
         return np.tile(np.eye(3), (len(attitudes), 1, 1))
 

@@ -110,13 +110,13 @@ class PlanarModel(MotionModel):
         result[:, [PSI, THETA]] = self._tilts(poses, shared) + shared[:2] * focal
         return result
 
-    def taken_over(self, other: "PlanarModel", poses: FloatArray, shared: FloatArray) -> FloatArray:
+    def start_from(self, other: "PlanarModel", poses: FloatArray, shared: FloatArray) -> FloatArray:
         """Poses (N, 6) of another planar model in the units of this one."""
         result = poses.copy()
         result[:, [PSI, THETA]] = self._tilted(other._tilts(poses, shared), shared)[:, [PSI, THETA]]
         return result
 
-    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+    def nominal_homographies(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """``diag(f, f, 1) R_i``."""
         poses = self._tilted(attitudes, shared)
         matrices: FloatArray = self.matrices(poses, shared).matrices
@@ -125,7 +125,7 @@ class PlanarModel(MotionModel):
     def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The nearest poses, given how the tilts of the images differ from the shared one."""
         poses = self._tilted(attitudes, shared)
-        motion = inverses(self.origins(shared, attitudes)) @ homographies
+        motion = inverses(self.nominal_homographies(shared, attitudes)) @ homographies
         poses[:, YAW], translation, height = nearest_in_plane(motion)
         poses[:, [X, Y]] = translation * np.exp(shared[2])
         if LOG_HEIGHT in self.free:

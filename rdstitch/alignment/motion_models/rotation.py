@@ -53,7 +53,7 @@ class RotationModel(MotionModel):
         turned: FloatArray = rotation_from_vector(step) @ poses.reshape(-1, 3, 3)
         return turned.reshape(-1, 9)
 
-    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+    def nominal_homographies(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """``diag(f, f, 1)``."""
         focal = _focal(shared)
         return np.tile(np.diag([focal, focal, 1.0]), (len(attitudes), 1, 1))

@@ -7,12 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from examples.worlds.alignment_scenes import Scene, grid, scene
-from rdstitch.alignment.adjustment_problem import independent_pairs, relations_at
+from rdstitch.alignment.adjustment_problem import pairwise_homographies, relations_at
+from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links, triangles
-from rdstitch.alignment.motion_models import HOMOGRAPHY, Y
+from rdstitch.alignment.motion_models import Y
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import BoolArray
 from rdstitch.geometry.camera import LENS_PARAMETERS
 from rdstitch.matching.links import Link
@@ -99,17 +99,9 @@ def _apart(given: Scene, links: list[Link]) -> tuple[BundleAdjustmentResult, Obs
     observations = Observations.from_links(links, given.cameras)
     lens = np.zeros(len(LENS_PARAMETERS))
     lens[0] = given.distortion
-    adjuster, start = independent_pairs(
-        HOMOGRAPHY,
-        observations,
-        relations_at(observations, [link.relation for link in links], lens),
-        np.empty(0),
-        lens,
-        lens != 0.0,
-        Priors.none(HOMOGRAPHY, 0),
-        np.zeros((9, 2)),
-    )
-    return adjuster.run(start), observations
+    relations = relations_at(observations, [link.relation for link in links], lens)
+    known = AlignmentOptions().camera_priors(given.cameras)
+    return pairwise_homographies(observations, relations, lens, lens != 0.0, known), observations
 
 
 def test_a_fit_that_ran_away_is_suspected_and_says_nothing_of_others() -> None:

@@ -12,7 +12,7 @@ import pytest
 from examples.worlds.alignment_scenes import Scene, aligned, grid, scene
 from examples.worlds.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
 from rdstitch.alignment import LENSES, Alignment, AlignmentOptions, lens_selection
-from rdstitch.alignment.adjustment_problem import homography_apart
+from rdstitch.alignment.adjustment_problem import pairwise_homographies
 from rdstitch.alignment.lens_description import describe_lens, radius_std
 from rdstitch.alignment.lens_selection import LensChoice, free_parameters
 from rdstitch.alignment.observations import Observations
@@ -64,9 +64,9 @@ def test_some_of_very_many_links_show_the_lens(monkeypatch: pytest.MonkeyPatch) 
 
     def noted(seen: Observations, *others: Any) -> Any:
         sizes.append(len(seen))
-        return homography_apart(seen, *others)
+        return pairwise_homographies(seen, *others)
 
-    monkeypatch.setattr(lens_selection, "homography_apart", noted)
+    monkeypatch.setattr(lens_selection, "pairwise_homographies", noted)
     monkeypatch.setattr(lens_selection, "_ENOUGH_LINKS", len(given.links) // 2)
     found = aligned(given)
     assert found.lens == every.lens

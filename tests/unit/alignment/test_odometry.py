@@ -130,8 +130,8 @@ def test_offline_and_live_give_metres_and_bridge_what_shows_nothing(drive: Seque
 def test_a_height_of_one_is_a_height() -> None:
     known = Tracked(0, None, DISTORTION, 0.0, True, 0, True, 0, length_std=0.01, unit=0.3, unit_std=0.05)
     for given, length, std in ((None, 0.3, 0.05), (1.0, 1.0, 0.01)):
-        poses = rdstitch.FollowedPoses(given)
-        assert (poses.unit(known), poses.length_std(known)) == (length, std)
+        pose = rdstitch.Pose("", 0, 0.0, known, poses=rdstitch.FollowedPoses(given))
+        assert (pose.unit, pose.length_std) == (length, std)
 
 
 def test_odometry_is_read_from_tum_and_refused_by_line(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from examples.worlds.alignment_scenes import aligned, grid, scene
 from examples.worlds.lens_scenes import SIZE, lens_scene
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
 from rdstitch.alignment.motion_models import SIMILARITY
-from rdstitch.alignment.noise import coherence
+from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Priors
 from rdstitch.alignment.uncertainty import sandwich_covariances
@@ -60,7 +60,7 @@ def _miss(seed: int, shared_keypoints: bool) -> float:
         observations,
         FreeParameters.fixing(SIMILARITY, 6, [0], np.arange(len(LENS_STD)) == 0),
         replace(Priors.none(SIMILARITY, 6), shared=KNOWN),
-        coherence(observations, np.zeros((int(start[-1]), 2)), np.ones(int(start[-1]), dtype=np.bool_)).overdispersion,
+        shared_variance(observations, np.zeros((int(start[-1]), 2)), np.ones(int(start[-1]), dtype=np.bool_)),
     )
     found = adjuster.run(Parameters(poses, shared, np.array([-0.2, 0.0, 0.0, 0.0, 0.0])))
     (covariance,) = sandwich_covariances(adjuster, found, [np.arange(4)])

@@ -73,7 +73,8 @@ def test_strips_do_not_matter(tmp_path_factory: pytest.TempPathFactory, suffix: 
     pixels = _image(height, width, 3, np.uint8)
     alpha = np.where(pixels[..., 0] > 60, 255, 0).astype(np.uint8)
     write_image(folder / f"whole.{suffix}", pixels, alpha)
-    layout = ImageSpec((width, height), 3, np.dtype(np.uint8), transparent=True, metadata=Metadata((width, height)))
+    metadata, workers = Metadata((width, height)), data.draw(st.integers(1, 3))
+    layout = ImageSpec((width, height), 3, np.dtype(np.uint8), transparent=True, metadata=metadata, workers=workers)
     starts = [0]
     while starts[-1] < height:
         starts.append(starts[-1] + 256 * data.draw(st.integers(1, 3)))

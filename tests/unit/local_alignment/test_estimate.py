@@ -347,7 +347,7 @@ def test_registered_turns_are_aligned_locally() -> None:
         model="rotation",
     )
     assert align_registration_locally(given, "off").fields == ()
-    fields = align_registration_locally(given, "auto").fields
+    fields = align_registration_locally(given, "auto", threads=2).fields
     assert [f.values.tolist() for f in fields] == [
         f.values.tolist() for f in align_locally(found, CAMERAS[:4], matrices, on_sphere=True).fields
     ]
@@ -364,7 +364,7 @@ def test_fields_that_bend_straight_edges_more_than_they_mend_are_left_out() -> N
     starts = [(x, y, 40.0 * k) for k in (-1, 0, 1) for x in (20, 300) for y in range(60, 460, 20)]
     ends = np.array([[(x, y), (x + 300.0, y + rise)] for x, y, rise in starts])
     on = align_locally(found, CAMERAS, homographies(sequence))
-    off = align_locally(found, CAMERAS, homographies(sequence), edges=lambda image: ends)
+    off = align_locally(found, CAMERAS, homographies(sequence), edges=lambda images: [ends] * len(images))
     assert len(on.fields) == 6
     worst = max(float(np.percentile(field.bends(ends), 95)) for field in on.fields)
     assert worst > 1.0

@@ -12,7 +12,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features import Features
 from rdstitch.features.keypoints import Descriptors
 from rdstitch.geometry.camera import Camera
-from rdstitch.matching.candidate_pairs import CANDIDATES, EXHAUSTIVE_UP_TO, neighbours, pairs_that_matter
+from rdstitch.matching.candidate_pairs import CANDIDATES, EXHAUSTIVE_UP_TO, loop_closures, select_pairs
 from rdstitch.matching.candidate_pairs import first_pairs as _first_pairs
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.system.cache import Cache
@@ -125,8 +125,8 @@ def test_images_that_overlap_by_a_fifth_are_neighbours(overlap: float, found: li
     width, height = 639 / lens.scale, 479 / lens.scale
     x = (0.5 - size * (overlap - 0.5)) * width
     shifted = np.array([[size, 0.0, x], [0.0, size, (1 - size) * height / 4], [0.0, 0.0, 1.0]])
-    assert neighbours([lens, lens], np.stack([np.eye(3), shifted]), set()) == found
-    assert neighbours([lens, lens], np.stack([np.eye(3), shifted]), {(0, 1)}) == []
+    assert loop_closures([lens, lens], np.stack([np.eye(3), shifted]), set()) == found
+    assert loop_closures([lens, lens], np.stack([np.eye(3), shifted]), {(0, 1)}) == []
 
 
 def _shared_by_squares(side: int) -> dict[tuple[int, int], StoredMatches]:
@@ -147,7 +147,7 @@ def _shared_by_squares(side: int) -> dict[tuple[int, int], StoredMatches]:
 def test_of_many_overlapping_pairs_each_image_keeps_a_few_all_around_it() -> None:
     side = 7
     shared = _shared_by_squares(side)
-    chosen = pairs_that_matter(shared, [Camera((400, 400))] * side**2)
+    chosen = select_pairs(shared, [Camera((400, 400))] * side**2)
     degree = np.bincount(np.ravel(list(chosen)), minlength=side**2)
     assert len(shared) > 12 * side**2
     assert degree.min() >= 6
@@ -166,7 +166,7 @@ def test_a_weak_partner_on_the_other_side_is_kept_before_a_strong_one_on_the_sam
     many = np.tile(right, (4, 1))
     shared |= {(i, j): stored(many, many) for i in range(1, 12) for j in range(i + 1, 12)}
     shared[0, 12] = stored(left, left)
-    chosen = pairs_that_matter(shared, [Camera((400, 400))] * 13)
+    chosen = select_pairs(shared, [Camera((400, 400))] * 13)
     assert (0, 12) in chosen
     assert sum(0 in pair for pair in chosen) == 6
 
@@ -176,7 +176,7 @@ def test_neighbours_with_partners_in_common_are_not_tried_again_but_loops_are_cl
     count = 20
     homographies = np.tile(np.eye(3), (count, 1, 1))
     tried = {(i, j) for i in range(count) for j in range(i + 1, min(i + 7, count))}
-    found = neighbours([Camera((640, 480))] * count, homographies, tried)
+    found = loop_closures([Camera((640, 480))] * count, homographies, tried)
     assert found
     assert all(j - i > 12 or i < 6 or j > count - 7 for i, j in found)
 
@@ -186,7 +186,7 @@ def test_of_a_turn_neighbours_are_those_that_see_a_part_of_each_other(focal: flo
     """A full circle: the next images, as far as their angle of view reaches, also across where the circle closes."""
     count, camera = 36, Camera((640, 480))
     turned = Rotation.from_rotvec(np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None] * [0, 1, 0]).as_matrix()
-    found = neighbours([camera] * count, turned @ np.diag([1.0, 1.0, focal]), set(), on_sphere=True)
+    found = loop_closures([camera] * count, turned @ np.diag([1.0, 1.0, focal]), set(), on_sphere=True)
     half = np.degrees(np.arctan2(320.0, focal * camera.scale))
     reach = min(5, int(2.0 * half * 0.8 // 10.0))
     assert reach >= 1

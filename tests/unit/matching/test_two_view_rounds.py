@@ -10,7 +10,7 @@ import pytest
 from rdstitch.arrays import FloatArray
 from rdstitch.features import Correspondences, Features, match
 from rdstitch.geometry.camera import Camera
-from rdstitch.matching.candidate_pairs import neighbours
+from rdstitch.matching.candidate_pairs import loop_closures
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features
 from rdstitch.matching.two_view import PairRegistration
@@ -148,9 +148,9 @@ def test_a_few_matches_beside_hundreds_do_not_pass_the_prescreen() -> None:
 
 def test_images_behind_the_horizon_have_no_neighbours() -> None:
     beyond = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
-    assert neighbours([LENS] * 3, np.stack([beyond] * 3), set()) == []
-    assert neighbours([LENS] * 3, np.stack([np.eye(3), beyond, beyond]), set()) == []
-    assert neighbours([LENS] * 3, np.stack([np.eye(3), np.eye(3), beyond]), set()) == [(0, 1)]
+    assert loop_closures([LENS] * 3, np.stack([beyond] * 3), set()) == []
+    assert loop_closures([LENS] * 3, np.stack([np.eye(3), beyond, beyond]), set()) == []
+    assert loop_closures([LENS] * 3, np.stack([np.eye(3), np.eye(3), beyond]), set()) == [(0, 1)]
 
 
 def test_with_a_static_background_every_candidate_pair_is_compared() -> None:

@@ -26,7 +26,6 @@ from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, ground, sequence_over
 from rdstitch.tracking import Tracker as FrameTracker
 from rdstitch.tracking import TrackingOptions
-from rdstitch.tracking import tracker as tracker_module
 
 HEIGHT = 0.8
 
@@ -182,8 +181,8 @@ def _rows(tracker: rdstitch.Tracker, images: Iterable[NDArray[np.uint8]]) -> lis
 def test_a_focal_length_that_the_images_contradict_is_replaced_and_lengths_are_as_uncertain_until_then(
     late: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tracker_module, "_FIRST_DELAY", 1 + late)
-    monkeypatch.setattr(tracker_module, "_ALIGNMENT_DELAY", 8 + late)
+    monkeypatch.setattr("rdstitch.tracking.map_refinement._FIRST_DELAY", 1 + late)
+    monkeypatch.setattr("rdstitch.tracking.map_refinement._DELAY", 8 + late)
     lens = Camera((320, 240), DISTORTION, focal=256.0)
     poses = drive_poses(lens, "turn", 24, overlap=0.75, tilt=(0.12, -0.07))
     images = sequence_over(partial(ground, seed=3), lens, poses).frames()
@@ -222,8 +221,8 @@ def test_an_alignment_that_fails_is_survived(drive: Sequence, monkeypatch: pytes
     def fails(*_: object) -> None:
         raise ImpossibleCameraError("a lens that cannot be")
 
-    monkeypatch.setattr(tracker_module, "align", fails)
-    monkeypatch.setattr(tracker_module, "_ALIGNMENT_DELAY", 1)
+    monkeypatch.setattr("rdstitch.tracking.map_refinement.align", fails)
+    monkeypatch.setattr("rdstitch.tracking.map_refinement._DELAY", 1)
     options = TrackingOptions(EstimationOptions(distortion=DISTORTION), AlignmentOptions(tilt=TILT, lens_known=True))
     tracker = FrameTracker(options, lambda image: detect(image.grey), match, ThreadPoolExecutor(1))
     for image in drive.frames():

@@ -9,9 +9,9 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import transfer
 from rdstitch.robust import estimate_radial_homography
+from rdstitch.robust.chance import MIN_PLACES, binomial_tail, places, rejection_reason
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
-from rdstitch.robust.verification import MIN_PLACES, binomial_tail, places, rejection_reason
 from rdstitch.solvers.solutions import Solutions
 
 SMALL, LARGE = Camera((300, 400)), Camera((600, 800))

@@ -21,7 +21,7 @@ from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, sequence_over
 from rdstitch.tracking import Placement, PlaneSimilarity, Preview, Tracked, Tracker, TrackingOptions
-from rdstitch.tracking import tracker as module
+from rdstitch.tracking.state import TrackState
 
 SIZE = (320, 240)
 DISTORTION = -0.25
@@ -127,7 +127,7 @@ def test_keyframes_that_came_before_the_map_are_given_their_place_later(tracked:
 
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_WINDOW", 10)
+    monkeypatch.setattr("rdstitch.tracking.keyframe_map._WINDOW", 10)
     tracker = _tracker(DISTORTION)
     for frame in _frames(_drive(40, overlap=0.6, path="line")):
         tracker.add(frame, Camera(SIZE))
@@ -162,15 +162,29 @@ def test_a_frame_of_something_else_has_no_place_and_the_next_one_has() -> None:
 
 
 def test_a_new_map_begins_where_the_track_is_lost_for_good(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_MAX_LOST_FRAMES", 3)
+    monkeypatch.setattr("rdstitch.tracking.state._MAX_LOST_FRAMES", 3)
     frames, tracker = _frames(_drive(8)), _tracker()
     elsewhere = _frames(_drive(13, path="line"), world=7)
     before = [tracker.add(frame, Camera(SIZE))[-1] for frame in frames]
     after = [tracker.add(frame, Camera(SIZE))[-1] for frame in elsewhere]
     assert {result.map_number for result in before} == {0}
-    assert [result.placement for result in after[: module._MAX_LOST_FRAMES]] == [None] * module._MAX_LOST_FRAMES
+    assert [result.placement for result in after[:3]] == [None] * 3
     assert after[-1].map_number == 1
     assert after[-1].placement is not None
+
+
+def test_a_track_is_initialised_lost_and_found_or_begun_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rdstitch.tracking.state._MAX_LOST_FRAMES", 2)
+    first, lost = TrackState(3), TrackState(3).unplaced()
+    assert first.initialising
+    assert (first.lost, lost.lost, lost.placed()) == (False, True, first)
+    assert lost.next_map(1, all_searched=False) == first  # instead of a keyframe that no frame shows
+    assert lost.next_map(2, all_searched=True) is None
+    tracking = lost.with_plane()
+    assert (tracking.initialising, tracking.lost) == (False, True)
+    assert tracking.next_map(1, all_searched=True) is None
+    assert tracking.unplaced().next_map(1, all_searched=False) is None
+    assert tracking.unplaced().next_map(1, all_searched=True) == TrackState(4)
 
 
 def test_frames_without_features_are_none_to_wait_for() -> None:
@@ -222,12 +236,12 @@ def test_a_frame_that_corners_place_is_not_lost_where_they_make_no_link(
     tracker = _tracker(DISTORTION, lambda image: detect(image.grey, FeatureOptions(max_features=600)))
     for image in video[1][:30]:
         tracker.add(prepare(View(image), None), Camera(SIZE))
-    monkeypatch.setattr(tracker, "_links", lambda _: [])
+    monkeypatch.setattr("rdstitch.tracking.tracker.links_with_map", lambda *_: [])
     later = [tracker.add(prepare(View(image), None), Camera(SIZE))[-1] for image in video[1][30:36]]
     assert any(result.inliers for result in later)
     assert all(result.inliers > 0 for result in later if result.placement is not None)
-    assert tracker._lost == 0
-    numbers = [frame.number for frame, *_ in tracker._between]
+    assert not tracker._map.state.lost
+    numbers = [frame.number for frame, *_ in tracker._map.between]
     assert len(set(numbers)) == len(numbers)
 
 

@@ -161,7 +161,7 @@ def test_images_without_a_mask_among_others_are_named() -> None:
 
 @pytest.mark.parametrize(("doubtful", "severity"), [(True, "warning"), (False, "detail")])
 def test_free_homographies_are_doubted_where_their_errors_have_a_pattern(doubtful: bool, severity: str) -> None:
-    found = evidence(registration(focal=None, shape=replace(SHAPE, image=1, doubtful=doubtful)))
+    found = evidence(registration(parameters=(), shape=replace(SHAPE, image=1, doubtful=doubtful)))
     assert [(own.kind, own.severity) for own in rules._shape(found)] == [(Kind.SHAPE_UNKNOWN, severity)]
 
 

@@ -209,7 +209,7 @@ def test_a_doubtful_shape_names_the_image_and_the_size(good: Registration) -> No
     assert message.images == (str(good.sources[2].path),)
     assert "about 10 pixels" in message.text
     assert judge(bent, THRESHOLD, Purpose.CALIBRATE) == ()
-    free = replace(good, alignment=replace(alignment, focal=None))
+    free = replace(good, alignment=replace(alignment, parameters=()))
     (message,) = judge(free, THRESHOLD)
     assert "homography of its own" in message.text
 

@@ -1,0 +1,161 @@
+"""The last keyframes aligned among themselves while further frames come: λ, the model, and better places."""
+
+import math
+import weakref
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotYet
+from dataclasses import dataclass, replace
+from importlib import import_module
+
+import numpy as np
+
+from rdstitch.alignment import Alignment, align
+from rdstitch.results.messages import Message
+from rdstitch.tracking.keyframe_map import KeyframeMap
+from rdstitch.tracking.placement import Placement, PlaneSimilarity
+from rdstitch.tracking.tracked_frame import TrackedFrame
+
+_IMPORTS = "scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial"  # of alignments
+_FIRST = 5  # keyframes that the first alignment takes
+_GROWTH = 1.5  # from one alignment to the next, while λ is not known
+_INTERVAL = 24  # keyframes from one alignment to the next afterwards
+_FIRST_DELAY, _DELAY = 1, 8  # keyframes after which one is taken over, before λ is known and afterwards
+_EXACT = 1e-4  # of the logarithm of a focal length that an alignment keeps
+_SAME_LENGTHS = 0.1  # of their standard deviation: change of all lengths that leaves the places of earlier frames
+_MATCHES = 80  # of a link, that the alignment uses
+
+
+@dataclass(frozen=True)
+class _Window:
+    """Keyframes that are being aligned."""
+
+    keyframes: list[TrackedFrame]
+    alignment: Future[Alignment]
+    keeps_focal: bool
+
+
+class MapRefinement:
+    """One alignment at a time. Where it is waited for (``patient``), the same frames give the same poses."""
+
+    def __init__(self, executor: Executor, *, patient: bool, tell: Callable[[Message], None]) -> None:
+        self.patient, self._tell = patient, tell
+        # The first alignment is small, and starting a process takes longer.
+        self._executor = self._first_executor = executor
+        if not patient:
+            self._first_executor = ThreadPoolExecutor(1)
+            weakref.finalize(self, self._first_executor.shutdown, wait=False, cancel_futures=True)
+            for name in _IMPORTS:  # now: nothing that follows should wait for them
+                import_module(name)
+        self.start_map()
+
+    def start_map(self) -> None:
+        """Forget what belongs to the last map."""
+        self._next = _FIRST
+        self._taken_over_at = 0  # keyframes seen from which on the alignment is
+        self.drop()
+
+    def drop(self) -> None:
+        """Do not take over the alignment that is under way."""
+        self._window: _Window | None = None
+
+    def begin_if_due(self, frames: KeyframeMap) -> None:
+        """Begin the next alignment of a map to which a keyframe was added, if it is time for it."""
+        if frames.seen + 1 < self._next or self._window is not None:
+            return
+        lens_known = frames.known.distortion_known
+        grown = max(2, round(self._next * (_GROWTH - 1.0)))
+        self._next += _INTERVAL if lens_known else min(grown, _INTERVAL)
+        # At a keyframe and not when it is done: so that time does not decide on the result.
+        self._taken_over_at = frames.seen + (_DELAY if lens_known and frames.state.has_plane else _FIRST_DELAY)
+        self.begin(frames)
+
+    def begin(self, frames: KeyframeMap) -> None:
+        """Begin to align the last keyframes among themselves."""
+        window, known, keeps_focal = list(frames.keyframes), frames.known, frames.keeps_focal
+        executor = self._executor if frames.state.has_plane else self._first_executor
+        options = replace(known.options_for(window), most=_MATCHES, reference=None)
+        cameras = known.cameras_for(window, _EXACT if keeps_focal else None)
+        place = {keyframe.number: index for index, keyframe in enumerate(window)}
+        links = [replace(link, image1=place[link.image1], image2=place[link.image2]) for link in frames.links]
+        self._window = _Window(window, executor.submit(align, cameras, links, options), keeps_focal)
+
+    def take_over(self, frames: KeyframeMap, patience: float | None) -> list[TrackedFrame]:
+        """Take over what has been aligned; frames whose places are new, those between keyframes among them.
+
+        It is waited for so many seconds at most, None for as long as it takes.
+        """
+        window = self._window
+        if window is None:
+            return []
+        try:
+            alignment = window.alignment.result(patience)
+        except NotYet:
+            return []
+        except Exception as error:  # noqa: BLE001 - what one window cannot do the next one may
+            self.drop()
+            self._tell(Message(f"an alignment of the last keyframes failed ({error}); the next one is tried"))
+            return []
+        self.drop()
+        for message in alignment.messages:
+            if message.severity in ("warning", "note"):
+                self._tell(message)
+        if alignment.on_sphere:
+            self._tell(Message("the camera turns on the spot: there is no path"))
+            return []
+        waiting = {number for number, frame in frames.frames.items() if not frame.aligned}
+        longer = _placed(frames, window, alignment)
+        frames.known.learn(alignment, window.keyframes, keeps_focal=window.keeps_focal)
+        if frames.known.plane is not None:  # until there is a window, errors have nothing to grow from
+            reached = np.zeros((4, 4))
+            for keyframe in frames.keyframes:
+                if keyframe.aligned:
+                    reached = keyframe.covariance = reached if keyframe.covariance is None else keyframe.covariance
+        used = {k.number for k, one in zip(window.keyframes, alignment.used, strict=True) if one}
+        for keyframe in frames.keyframes:
+            if keyframe.number not in used:
+                frames.settle(keyframe)
+        # What was said of the lengths before is replaced, so that all lengths of a map are wrong by the same.
+        anew = not window.keeps_focal and abs(math.log(longer)) > _SAME_LENGTHS * frames.known.length_std
+        return frames.revise(None if anew else waiting)
+
+    def is_waited_for(self, seen: int) -> bool:
+        """Whether the alignment is taken over when so many keyframes have been seen."""
+        return self.patient and seen >= self._taken_over_at
+
+
+def _placed(frames: KeyframeMap, window: _Window, alignment: Alignment) -> float:
+    """Place keyframes on the map as they were aligned; how much longer lengths become."""
+    aligned = zip(window.keyframes, alignment.cameras, alignment.homographies, alignment.used, strict=True)
+    placed = [(keyframe, Placement(camera, h, alignment.focal)) for keyframe, camera, h, used in aligned if used]
+    move, longer = _to_map(placed)
+    first, placement = placed[0]
+    if frames.whole and first.number == frames.keyframes[0].number and (pose := placement.pose) is not None:
+        move = PlaneSimilarity.to_origin(pose)  # the others are relative to it
+    frames.state = frames.state.with_plane()
+    for keyframe, placement in placed:
+        keyframe.place, keyframe.aligned = move.applied(placement), True
+    return longer
+
+
+def _to_map(placed: Sequence[tuple[TrackedFrame, Placement]]) -> tuple[PlaneSimilarity, float]:
+    """From the plane of an alignment to that of the map, which the first one defines; how much longer lengths become.
+
+    The unit of lengths is the height of the first keyframe: heights stay as they are, whatever focal length they are
+    computed by.
+    """
+    shared = [(new, keyframe.place) for keyframe, new in placed if keyframe.aligned and keyframe.place is not None]
+    if not shared:
+        pose = placed[0][1].pose
+        return PlaneSimilarity(1.0, 0.0) if pose is None else PlaneSimilarity.to_origin(pose), 1.0
+    news, olds = zip(*shared, strict=True)
+    move = PlaneSimilarity.between(news, olds)
+    poses = [(one.pose, two.pose) for one, two in shared]
+    known = [(new, old) for new, old in poses if new is not None and old is not None]
+    if len(known) < len(poses):
+        return move, 1.0
+    larger = float(np.median([old.height / new.height for new, old in known]))
+    longer = larger / abs(move.turn)
+    turn = move.turn * longer
+    now, then = (np.mean([complex(pose.x, pose.y) for pose in side]) for side in zip(*known, strict=True))
+    return PlaneSimilarity(turn, complex(longer * then - turn * now)), longer
