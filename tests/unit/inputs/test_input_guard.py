@@ -63,12 +63,12 @@ def test_what_another_process_read_must_have_been_the_same(tmp_path: Path) -> No
     for guard in (here, same):
         with guard.reading(path):
             pass
-    here.learn(same.notes_on([path]))
+    here.merge(same.state_of([path]))
     os.utime(path, ns=(0, 0))
     with later.reading(path):
         pass
     with pytest.raises(InputError, match=r"a\.bmp: has changed during the run"):
-        here.learn(later.notes_on([path]))
+        here.merge(later.state_of([path]))
 
 
 def test_a_file_that_is_being_written_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
