@@ -174,10 +174,6 @@ def test_free_homographies_are_doubted_where_neighbours_errors_agree(relief: boo
 LARGEST = 0.02 * 500.0  # pixels that relief explains, of images with a diagonal of 500
 
 
-def _kinds(findings: Any) -> list[Kind]:
-    return [finding.kind for finding in findings]
-
-
 @pytest.mark.parametrize(
     ("rms", "alike", "relief", "kind"),
     [
@@ -201,7 +197,7 @@ def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kin
     cameras = (CAMERA, Camera((40, 30)), CAMERA)
     found = evidence(registration(rms=rms, relief=ground, cameras=cameras), alike=alike)
     findings = list(rules._errors(found))
-    assert _kinds(findings) == ([] if kind is None else [kind])
+    assert [finding.kind for finding in findings] == ([] if kind is None else [kind])
     for finding in findings:
         assert finding.severity == ("warning" if kind == Kind.ROUGH else "failure")
         assert finding.values == pytest.approx({"rms": rms, "threshold": 3.0}, nan_ok=True)
