@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rdstitch.errors import RdstitchError as RdstitchError
     from rdstitch.geometry.camera import Camera as Camera
     from rdstitch.geometry.radial_homography import RadialHomography as RadialHomography
+    from rdstitch.options.apply_options import ApplyOptions as ApplyOptions
     from rdstitch.options.composite_options import CompositeOptions as CompositeOptions
     from rdstitch.options.feature_options import FeatureOptions as FeatureOptions
     from rdstitch.options.files_beside import FilesBeside as FilesBeside
@@ -75,6 +76,7 @@ _HOMES = {
         "rdstitch.results.registration": "Registration",
         "rdstitch.report": "write_report",
         "rdstitch.robust": "estimate_radial_homography",
+        "rdstitch.options.apply_options": "ApplyOptions",
         "rdstitch.options.tile_options": "TileOptions",
         "rdstitch.results.stitch_result": "StitchResult",
     }.items()

@@ -143,10 +143,10 @@ def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = Fal
 
 def report_applied(result: "Recomposition", reporter: Reporter) -> None:
     """What the user must know of images that were applied, and what was made of them, or would be."""
-    from rdstitch.results.messages import told_once
+    from rdstitch.results.messages import merge_by_reason
 
     reporter.finish()
-    for missing in told_once(result.left_out.values()):
+    for missing in merge_by_reason(result.left_out.values()):
         reporter.warn(str(missing))
     for message in result.messages:
         reporter.tell(message)
@@ -185,10 +185,10 @@ def report_registration(
 
 def warn_of(registration: "Registration", reporter: Reporter) -> None:
     """What the user must know of a registration."""
-    from rdstitch.results.messages import of_severity, told_once
+    from rdstitch.results.messages import merge_by_reason, of_severity
 
     alignment = registration.alignment
-    for message in told_once((*registration.failures, *registration.warnings, *registration.left_out)):
+    for message in merge_by_reason((*registration.failures, *registration.warnings, *registration.left_out)):
         reporter.warn(str(message))
     for message in (*of_severity(registration.messages, "note"), *of_severity(registration.messages, "detail")):
         reporter.tell(message)

@@ -14,9 +14,8 @@ from rdstitch.alignment.level_frame import levelled
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise import coherence, judge_relief
-from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, ShapeTest, Unused
+from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, Unused
 from rdstitch.alignment.select import ModelChoice
-from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.alignment.uncertainty import considered_covariance, lever_std, pose_covariances
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ImpossibleCameraError
@@ -76,7 +75,7 @@ class AdjustedImages:
 def build_alignment(adjustment: AdjustedImages) -> Alignment:
     """The alignment, in the frame of the reference image.
 
-    A draft, which has no covariances, is not tested for its shape, and has the deviations of independent errors.
+    A draft, which has no covariances, has the deviations of independent errors.
     """
     problem, fit = adjustment.problem, adjustment.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
@@ -133,21 +132,10 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
         rms=float(np.sqrt(squared[agreeing].mean())) if agreeing.any() else math.nan,
         links=_link_fits(adjustment, squared, agreeing),
         relief=relief,
-        shape=_shape(adjustment),
         leverage=adjustment.leverage,
         lever_std=lever_std(problem, fit) if relief.found and planar and adjustment.covariance is not None else 0.0,
         messages=(*_warnings(adjustment, reference_camera, considered), *adjustment.messages),
     )
-
-
-def _shape(adjustment: AdjustedImages) -> ShapeTest | None:
-    """Whether the whole may be bent, with the image's index among all."""
-    fit = adjustment.choice.fit
-    if fit.model.on_sphere or not adjustment.lens.observable or adjustment.covariance is None:
-        return None
-    images = adjustment.images
-    judged = judge_shape(adjustment.problem, fit, [adjustment.given.cameras[k] for k in images])
-    return replace(judged, image=int(images[judged.image]))
 
 
 def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray:

@@ -82,21 +82,6 @@ class ReliefTest:
     explanation: str  # one sentence; what it means for λ
 
 
-@dataclass(frozen=True)
-class ShapeTest:
-    """Whether the overlaps hold the shape of the whole, or it may be off where they agree."""
-
-    doubtful: bool  # an image may be off by more than is tolerable
-    shown: bool  # the errors show that something is left out; otherwise the images only fail to exclude it
-    gain: float  # by how many squared standard deviations the errors would be smaller with what is left out
-    image: int  # the image that may be off the most
-    # shift, shift_std: how far that image would move with what is left out, and the standard deviation of that, pixels;
-    # up to one homography of the whole. The latter grows with ``gain``: what is left out is more than what was tried
-    shift: float
-    shift_std: float
-    cause: str  # what is most likely to be left out
-
-
 @dataclass(frozen=True, repr=False, kw_only=True, eq=False)
 class Alignment:
     """All images registered as one.
@@ -137,8 +122,6 @@ class Alignment:
     links : tuple of LinkFit
         In the order of the links given.
     relief : ReliefTest
-    shape : ShapeTest or None
-        None for a turn on the spot, and where λ is not observable.
     leverage : mapping
         How far (0 to 1) what is known of the map puts itself where the alignment has it: positions by the index of
         their image, control points by name.
@@ -165,7 +148,6 @@ class Alignment:
     tilt_spread: float = 0.0
     parameters: tuple[str, ...] = ()
     covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    shape: ShapeTest | None = None
     leverage: Mapping[int | str, float] = field(default_factory=dict)
     lever_std: float = 0.0
     messages: tuple[Message, ...] = ()

@@ -23,7 +23,6 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.plane_marks import PlaneMarks
 from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.select import Posterior
-from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, log_focal_deviation
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.choices import Purpose
 from rdstitch.robust.covariance import enlarged
@@ -31,6 +30,9 @@ from rdstitch.robust.posterior import LENS, MODEL_ERROR
 
 _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
 """Matches in all, and of each link at least, that say how high and how wide the hills are."""
+
+_UNLIKELY_FOCAL = 4.0
+"""Standard deviations of what is known of a focal length beyond which it may stand for something else."""
 
 _SINGULAR = 1e-12
 """Least eigenvalue of a correlation matrix of parameters."""
@@ -157,13 +159,15 @@ def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *,
     A focal length that next to no lens has bends the images with something else, and λ may be what goes with the usual
     one. Where the ground is ``rough`` that is known, and in the covariance.
     """
-    count = len(problem.free_lens)
-    beside = log_focal_deviation(problem, fit)
-    if not rough and abs(beside) > UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
+    count, deviation = len(problem.free_lens), 0.0
+    if isinstance(fit.model, PlanarModel):
+        log_focal = float(fit.model.physical_parameters(fit.adjusted.parameters.shared)[0][-1])
+        deviation = log_focal - problem.camera_priors.log_focal
+    if not rough and abs(deviation) > _UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
         adjuster = replace(problem, free_lens=np.ones_like(problem.free_lens)).adjuster_of(fit)
         together = adjuster.covariance(fit.adjusted)
         focal = len(fit.model.shared_names) - 1
-        moved = together[-count:, focal] * (beside / together[focal, focal])
+        moved = together[-count:, focal] * (deviation / together[focal, focal])
         covariance = covariance + np.outer(moved, moved)
     if problem.count == 2 and isinstance(fit.model, PlanarModel):
         covariance = _with_free_motion(problem, fit, covariance, rough=rough)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -98,8 +97,15 @@ def plan_panorama(
     seen = seen_directions(cameras, directions)
     chosen = choose_projection(seen) if projection == "auto" else PROJECTIONS[projection]
     if chosen == PLANE:
-        how: dict[str, Any] = {"scale": scale, "rotate": rotate, "reference": reference, "names": names}
-        return plan_canvas(cameras, directions, max_stretch=max_stretch, **how)
+        return plan_canvas(
+            cameras,
+            directions,
+            scale=scale,
+            rotate=rotate,
+            reference=reference,
+            names=names,
+            max_stretch=max_stretch,
+        )
     called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
     lengths = np.linalg.norm(directions, axis=1)
     focal = lengths[:, 2] / lengths[:, 0] * [camera.scale for camera in cameras]

@@ -11,7 +11,7 @@ from rdstitch.system.file_access import file_state, is_url, remote_status
 
 _Stamp = tuple[int, int] | str
 
-GuardNotes = tuple[dict[Path, _Stamp | None], dict[Path, str]]
+GuardState = tuple[dict[Path, _Stamp | None], dict[Path, str]]
 """Stamps of files, and why they may be damaged."""
 
 
@@ -55,13 +55,13 @@ class InputGuard:
         return [Message(self.damaged[path], (str(path),), code="damaged") for path in sorted(self.damaged)]
 
     @property
-    def complaints(self) -> list[Message]:
+    def warnings(self) -> list[Message]:
         """The same, and what was left out as unreadable: what may be why a run failed."""
         reasons = {path: reason.removeprefix(f"{path}: ") for path, reason in self.unreadable.items()}
         left_out = [Message(reasons[path], (str(path),), "left out") for path in sorted(reasons)]
         return [*left_out, *self.messages]
 
-    def notes_on(self, paths: Iterable[Path]) -> GuardNotes:
+    def state_of(self, paths: Iterable[Path]) -> GuardState:
         """What was noticed of some files, for the guard of another process."""
         known = [path for path in paths if path in self._stamps]
         return (
@@ -69,7 +69,7 @@ class InputGuard:
             {path: self.damaged[path] for path in known if path in self.damaged},
         )
 
-    def learn(self, notes: GuardNotes) -> None:
+    def merge(self, notes: GuardState) -> None:
         """Take over what a guard in another process has noticed, where files must have been the same."""
         stamps, damaged = notes
         for path, stamp in stamps.items():

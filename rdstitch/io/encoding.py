@@ -28,6 +28,7 @@ Strip = tuple[NDArray[Any], NDArray[np.uint8] | None]
 
 # Strips but the last have a multiple of this many rows: what JPEG (128) and TIFF tiles (256) need.
 STRIP_ROWS = 256
+_ENCODERS = 2  # threads at the most: each has a strip in memory, and keeps up with ten workers that make strips
 _HALVED_ROWS = 32  # that are reduced at a time, even
 
 _EXIF_HEADER = b"Exif\0\0"
@@ -59,7 +60,7 @@ class ImageSpec:
     metadata: Metadata = field(default_factory=lambda: Metadata((1, 1)))  # colour profile, EXIF and resolution to keep
     quality: int = 95  # of JPEG and WebP, 1 to 100
     background: int = 0  # grey (0 to 255) of what is transparent, in a format without transparency
-    workers: int = 1  # threads that encode JPEG
+    workers: int = 1  # threads that may encode
 
     def __post_init__(self) -> None:
         if min(self.size) < 1 or self.channels < 1:
@@ -160,7 +161,7 @@ def _reread(spill: IO[bytes], size: tuple[int, int], kind: NDArray[Any]) -> Iter
 
 
 def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes | memoryview]:
-    """The pieces of a JPEG file, a strip for each worker in memory at a time; transparency becomes the background."""
+    """The pieces of a JPEG file, three strips in memory at a time; transparency becomes the background."""
     first = True
     for data in _encoded(spec, strips):
         head, scan = _header_and_scan(data)
@@ -178,11 +179,11 @@ def _encoded(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes]:
     if spec.workers == 1:
         yield from (_jpeg(spec, *strip) for strip in strips)
         return
-    with ThreadPoolExecutor(spec.workers) as pool:
+    with ThreadPoolExecutor(min(spec.workers, _ENCODERS)) as pool:
         under_way: deque[Future[bytes]] = deque()
         for strip in strips:
             under_way.append(pool.submit(_jpeg, spec, *strip))
-            if len(under_way) > spec.workers:
+            if len(under_way) > _ENCODERS:
                 yield under_way.popleft().result()
         while under_way:
             yield under_way.popleft().result()

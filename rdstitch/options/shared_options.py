@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
+from rdstitch.choices import ChannelOrder
 from rdstitch.options.option import Option
 
 Every = Annotated[
@@ -14,6 +15,9 @@ Every = Annotated[
         most=1_000_000,
         none="auto",
     ),
+]
+ArrayChannels = Annotated[
+    ChannelOrder, Option("Order of the channels of arrays that come in or go out.", command_line=False)
 ]
 Topic = Annotated[str | None, Option("Image topic of a ROS bag.", "NAME")]
 Mask = Annotated[

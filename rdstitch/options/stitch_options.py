@@ -5,13 +5,13 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Self
 
-from rdstitch.choices import CameraFormat, ChannelOrder, LensName, LocalAlignmentMode, ModelName
+from rdstitch.choices import CameraFormat, LensName, LocalAlignmentMode, ModelName
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.estimation_options import EstimationOptions, RansacOptions
 from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.options.option import documented, option
-from rdstitch.options.shared_options import Distortion, DryRun, Mask, Overwrite, Strict, Topic, Workers
+from rdstitch.options.shared_options import ArrayChannels, Distortion, DryRun, Mask, Overwrite, Strict, Topic, Workers
 from rdstitch.system.machine import processor_count
 
 if TYPE_CHECKING:
@@ -99,9 +99,7 @@ class StitchOptions(RansacOptions):
         None, "Points like those of --gcp that are compared with the map, and take no part in it.", "FILE"
     )
     mask: Mask = None
-    channel_order: ChannelOrder = option(
-        "bgr", "Order of the channels of arrays that come in or go out.", command_line=False
-    )
+    channel_order: ArrayChannels = "bgr"
     exclude: tuple[str, ...] = option(
         (), "Exclude the image of this name, or all that match a pattern like 'img_49*'; repeatable.", "NAME"
     )

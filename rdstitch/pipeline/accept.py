@@ -13,7 +13,7 @@ from rdstitch.errors import PartialResultError, RegistrationError
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
-from rdstitch.results.messages import Message, names_of, told_once
+from rdstitch.results.messages import Message, merge_by_reason, names_of
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
 from rdstitch.verification.evidence import Evidence
@@ -71,7 +71,7 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
     if accepted.failures and not options.force:  # of the alignment itself
         raise RefusedError(at_full_size(accepted))
     if options.strict and accepted.left_out:
-        raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
+        raise PartialResultError("; ".join(map(str, merge_by_reason(accepted.left_out))))
     return accepted
 
 

@@ -11,9 +11,8 @@ from msgspec import UNSET
 from msgspec.structs import replace as replace_fields
 
 from rdstitch.arrays import FloatArray
-from rdstitch.choices import ChannelOrder, MatchBy
 from rdstitch.compositing import CompositeOptions
-from rdstitch.errors import ArgumentError, InputError, PartialResultError
+from rdstitch.errors import InputError, PartialResultError
 from rdstitch.export.georeference import Georeference
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.camera_record import CameraRecord, camera_record, lens_fields
@@ -23,6 +22,7 @@ from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.band_lens import BandLens, band_lens
 from rdstitch.pipeline.compose import Layout, check_world_files, compose_images, image_files, plainly_viewed, write_page
@@ -31,7 +31,7 @@ from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.straighten import turned_anew
-from rdstitch.results.messages import Message, told_once
+from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.messages import left_out as left_out_message
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
@@ -144,9 +144,6 @@ def _resized_std(then: CameraRecord, focal: float | None) -> float | None:
     return std * (focal / former) if std and former and focal else None
 
 
-_MATCHES = ("auto", "name", "order")
-
-
 @one_opencv_thread()
 def apply(
     sidecar: str | Path,
@@ -154,17 +151,9 @@ def apply(
     output: str | Path | None = None,
     composite: CompositeOptions | None = None,
     *,
-    match: MatchBy = "auto",
-    mask: str | Path | None = None,
-    flat_field: str | Path = "off",
-    every: int | None = 1,
-    topic: str | None = None,
-    workers: int = 0,
-    overwrite: bool = False,
-    strict: bool = False,
-    dry_run: bool = False,
-    channel_order: ChannelOrder = "bgr",
+    options: ApplyOptions | None = None,
     progress: Progress = silent,
+    **fields: Any,
 ) -> Recomposition:
     """Compose images by a registration that was found before; only the lens of another band is estimated.
 
@@ -179,29 +168,10 @@ def apply(
         Image to write, with a sidecar of its own beside it; without it the image is in the result.
     composite : CompositeOptions, optional
         Those of the sidecar if not given.
-    match : str
-        Which image takes whose place. "name": the one of the same file name, of the same name before the suffix, or of
-        the same part that varies (V07_RED.jpg, V07_NIR.jpg). "order": the one at the same position of equally many.
-        "auto": by name, else the one that was taken at the same time, else at the same position.
-    mask : path, optional
-        Image, or folder of them, that is dark where the images do not count.
-    flat_field : str or path
-        Illumination that is taken out: "off", "auto" by what the images have in common, or an image file.
-    every : int, optional
-        Look among every n-th frame of videos and ROS bags; None: among those that show new ground.
-    topic : str, optional
-        Of the images in ROS bags; None: the only one.
-    workers : int
-        Images worked on at the same time; 0: as many as there are cores.
-    overwrite : bool
-        Replace existing outputs.
-    strict : bool
-        Fail when an image that the registration used is missing or cannot be read.
-    dry_run : bool
-        Only plan; nothing is written.
-    channel_order : str
-        Of arrays: "bgr" or "rgb".
+    options : ApplyOptions, optional
     progress : callable
+    **fields
+        Fields of the options, instead of those in ``options``: ``apply(sidecar, images, match="order")``.
 
     Returns
     -------
@@ -215,69 +185,107 @@ def apply(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    if match not in _MATCHES:
-        raise ArgumentError(f"unknown way to match {match!r}; choose one of {', '.join(_MATCHES)}")
+    options = replace(options or ApplyOptions(), **fields)
     saved = read_sidecar(sidecar)
-    options = composite or saved.composite
-    doubts = [Message(mismatch)] if (mismatch := mismatch_with_image(saved)) else []
-    if strict and doubts:
-        raise InputError(doubts[0].text)
-    given = as_inputs(images, channel_order)
-    stage = saved.record.stage
-    if stage is not None:
+    mismatch = mismatch_with_image(saved)
+    if options.strict and mismatch:
+        raise InputError(mismatch)
+    given = as_inputs(images, options.channel_order)
+    if saved.record.stage is not None:
         given = with_position_folders(given)
-    with found_images(given, output=output, every=every, topic=topic) as listed, Outputs(overwrite) as outputs:
+    with (
+        found_images(given, output=output, every=options.every, topic=options.topic) as listed,
+        Outputs(options.overwrite) as outputs,
+    ):
         if output is not None:
-            check_outputs(image_files(check_suffix(output)), overwrite, [*listed.files, sidecar])
-        given_frames: Sequence[Frame] = listed.frames
-        if stage is not None:
-            given_frames, _, said = tile_frames(given_frames, stage.z, stage.time)
-            doubts += said
-        chosen, matched, said = counterparts(saved, given_frames, match)
-        doubts += said
-        guard = InputGuard(strict)
-        sources, left_out = _sources(saved, chosen, guard, options.max_memory)
-        used = _used(saved, sources, left_out, mask, strict=strict)
-        if stage is not None and stage.pixel_um is not None:
-            used = {k: replace(s, metadata=replace(s.metadata, pixel_size=stage.pixel_um)) for k, s in used.items()}
-        if flat_field != "off":
-            check_size(list(used.values()))
-            corrected, said = with_flat_field(list(used.values()), flat_field)
-            used = dict(zip(used, corrected, strict=True))
-            doubts += said
+            check_outputs(image_files(check_suffix(output)), options.overwrite, [*listed.files, sidecar])
+        composite = composite or saved.composite
+        chosen = _chosen(saved, listed.frames, options, composite.max_memory)
         if output is not None:
-            check_world_files([output], list(used.values()), overwrite)
-        frames = {index: frame for index, frame in enumerate(chosen) if index in used and frame is not None}
-        # Channels of a microscope have their places in common, not their content.
-        lens, said = (None, []) if stage is not None else _lens_of_band(saved, frames, used, progress)
-        doubts += said
-        if lens is not None:
-            used = {index: replace(source, camera=lens.camera(source.camera)) for index, source in used.items()}
-        placed, said = turned_anew(_placed(saved, used, lens), options, saved.composite)
-        doubts += said
-        if (grid := _same_grid(saved, used, options)) is not None:
-            placed, options = replace(placed, grid=grid), replace(options, crop="none")
-        reference = saved.images[saved.reference].name
+            check_world_files([output], list(chosen.used.values()), options.overwrite)
+        layout, composite, said = _laid_out(saved, chosen, composite, progress)
         settings = StitchOptions(
-            composite=options, reference=reference, channel_order=channel_order, workers=workers, dry_run=dry_run
+            composite=composite,
+            reference=saved.images[saved.reference].name,
+            channel_order=options.channel_order,
+            workers=options.workers,
+            dry_run=options.dry_run,
         )
-        run = Run(settings, output, progress=StageTimer(progress))
-        composed, said = compose_images(Layout.of(placed, options), run, outputs)
+        composed, notes = compose_images(layout, Run(settings, output, progress=StageTimer(progress)), outputs)
+        sources = dict(zip(chosen.used, layout.placed.sources, strict=True))
         result = Recomposition(
             saved=saved,
-            sources=tuple(map(used.get, range(len(sources)))),
-            matched=matched,
-            left_out=left_out,
-            placed=placed,
-            messages=(*doubts, *listed.messages, *guard.messages, *said),
+            sources=tuple(map(sources.get, range(len(saved.images)))),
+            matched=chosen.matched,
+            left_out=chosen.left_out,
+            placed=layout.placed,
+            messages=(
+                *([Message(mismatch)] if mismatch else []),
+                *chosen.messages,
+                *said,
+                *listed.messages,
+                *chosen.guard.messages,
+                *notes,
+            ),
             **composed.fields,
         )
-        if dry_run or output is None:
+        if options.dry_run or output is None:
             return result
-        page = partial(plainly_viewed, result.canvas, [source.name for source in used.values()])
+        page = partial(plainly_viewed, result.canvas, [source.name for source in layout.placed.sources])
         result = replace(result, messages=(*result.messages, *write_page(result, outputs, page)))
         outputs.write(f"{output}.json", json_bytes(applied_sidecar(result)))
         return result
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """The given images, by the numbers of those whose places they take."""
+
+    frames: Mapping[int, Frame]
+    used: Mapping[int, Source]  # with their cameras, masks and flat field
+    left_out: Mapping[int, Message]
+    matched: MatchedBy
+    guard: InputGuard
+    messages: Sequence[Message]
+
+
+def _chosen(
+    saved: SavedRegistration, frames: Sequence[Frame], options: ApplyOptions, max_memory: int | None
+) -> _Chosen:
+    """Which of the given images take whose places, read and corrected."""
+    messages: list[Message] = []
+    stage, guard = saved.record.stage, InputGuard(options.strict)
+    if stage is not None:
+        frames, _, messages = tile_frames(frames, stage.z, stage.time)
+    chosen, matched, said = counterparts(saved, frames, options.match)
+    messages += said
+    sources, left_out = _sources(saved, chosen, guard, max_memory)
+    used = _used(saved, sources, left_out, options.mask, strict=options.strict)
+    if stage is not None and stage.pixel_um is not None:
+        used = {k: replace(s, metadata=replace(s.metadata, pixel_size=stage.pixel_um)) for k, s in used.items()}
+    if options.flat_field != "off":
+        check_size(list(used.values()))
+        corrected, said = with_flat_field(list(used.values()), options.flat_field)
+        used = dict(zip(used, corrected, strict=True))
+        messages += said
+    of_used = {index: frame for index, frame in enumerate(chosen) if index in used and frame is not None}
+    return _Chosen(of_used, used, left_out, matched, guard, messages)
+
+
+def _laid_out(
+    saved: SavedRegistration, chosen: _Chosen, composite: CompositeOptions, progress: Progress
+) -> tuple[Layout, CompositeOptions, list[Message]]:
+    """Where the images lie, by the sidecar and the lens of their band, and how they are composed there."""
+    used = chosen.used
+    # Channels of a microscope have their places in common, not their content.
+    tiles = saved.record.stage is not None
+    lens, messages = (None, []) if tiles else _lens_of_band(saved, chosen.frames, used, progress)
+    if lens is not None:
+        used = {index: replace(source, camera=lens.camera(source.camera)) for index, source in used.items()}
+    placed, said = turned_anew(_placed(saved, used, lens), composite, saved.composite)
+    if (grid := _same_grid(saved, used, composite)) is not None:
+        placed, composite = replace(placed, grid=grid), replace(composite, crop="none")
+    return Layout.of(placed, composite), composite, [*messages, *said]
 
 
 _GEOMETRY = (
@@ -360,7 +368,7 @@ def _used(
 ) -> dict[int, Source]:
     """The images of the output, with their masks, by their number in the registration; at least one, or all."""
     if strict and left_out:
-        raise PartialResultError("; ".join(map(str, told_once(left_out.values()))))
+        raise PartialResultError("; ".join(map(str, merge_by_reason(left_out.values()))))
     used = {index: source for index, source in enumerate(sources) if source is not None}
     if not used:
         first = next(iter(left_out.values()))

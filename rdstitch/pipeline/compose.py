@@ -29,7 +29,7 @@ from rdstitch.compositing.projection import PLANE
 from rdstitch.compositing.tiles import Block, BlockRunner, OutputStrip
 from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, has_place, world_file_paths
-from rdstitch.inputs.input_guard import GuardNotes
+from rdstitch.inputs.input_guard import GuardState
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
@@ -256,7 +256,7 @@ def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None
         tasks = ((block, [sources[k] for k in block.images]) for block in blocks)
         with closing(in_order(executor, partial(compose_block, store=store), tasks)) as done:
             for strips, notes in done:
-                sources[0].guard.learn(notes)
+                sources[0].guard.merge(notes)
                 yield strips
 
     return run
@@ -264,12 +264,12 @@ def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None
 
 def compose_block(
     task: tuple[Block, Sequence[Source]], *, store: Cache
-) -> tuple[list[Stored[OutputStrip]], GuardNotes]:
+) -> tuple[list[Stored[OutputStrip]], GuardState]:
     """Compute a block of these images into a store; and what was noticed of their files."""
     block, sources = task
     strips = block.compute(store)
     # All have one guard, which travels with them.
-    return strips, sources[0].guard.notes_on([source.path for source in sources]) if sources else ({}, {})
+    return strips, sources[0].guard.state_of([source.path for source in sources]) if sources else ({}, {})
 
 
 def write_page(result: OutputImage, outputs: Outputs, images: Callable[[], Sequence[ViewedImage]]) -> list[Message]:

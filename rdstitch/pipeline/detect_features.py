@@ -17,7 +17,7 @@ from rdstitch.errors import InputError
 from rdstitch.executors import batches, in_order
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, detect, detect_view
 from rdstitch.features.prepared_image import Stretch, common_stretch, halving, usual_stretch
-from rdstitch.inputs.input_guard import GuardNotes
+from rdstitch.inputs.input_guard import GuardState
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
 from rdstitch.options.feature_options import CLOSER
@@ -59,7 +59,7 @@ def detect_features(
     results: list[StoredFeatures | InputError] = []
     run = partial(detect_batch, options=options, store=store)
     for batch, notes in in_order(executor, run, batches(sources, _IMAGES_AT_ONCE, _MIN_BATCHES)):
-        sources[0].guard.learn(notes)
+        sources[0].guard.merge(notes)
         errors = [result for result in batch if isinstance(result, InputError)]
         if errors and not skip_bad:
             raise errors[0]
@@ -82,7 +82,7 @@ def detect_features(
 
 def detect_batch(
     sources: Sequence[Source], *, options: FeatureOptions, store: Cache
-) -> tuple[list[StoredFeatures | InputError], GuardNotes]:
+) -> tuple[list[StoredFeatures | InputError], GuardState]:
     """The features of each image, or why it cannot be read; and what was noticed of the files."""
     detected: list[StoredFeatures | InputError] = []
     for source in sources:
@@ -90,7 +90,7 @@ def detect_batch(
             detected.append(_detected(source, options, store))
         except InputError as error:
             detected.append(error)
-    return detected, sources[0].guard.notes_on([source.path for source in sources])
+    return detected, sources[0].guard.state_of([source.path for source in sources])
 
 
 def _detected(source: Source, options: FeatureOptions, store: Cache) -> StoredFeatures:
@@ -176,12 +176,12 @@ def _stretch_of(sources: Sequence[Source], options: FeatureOptions, executor: Ex
     for stretch, notes in in_order(
         executor, partial(_stretch_of_one, megapixels=options.limits[1], store=store), sources
     ):
-        sources[0].guard.learn(notes)
+        sources[0].guard.merge(notes)
         stretches.append(stretch)
     return common_stretch(stretches)
 
 
-def _stretch_of_one(source: Source, *, megapixels: float | None, store: Cache) -> tuple[Stretch | None, GuardNotes]:
+def _stretch_of_one(source: Source, *, megapixels: float | None, store: Cache) -> tuple[Stretch | None, GuardState]:
     """The stretch of an image, None for one that cannot be read; and what was noticed of its file."""
 
     def compute() -> Stretch | None:
@@ -191,4 +191,4 @@ def _stretch_of_one(source: Source, *, megapixels: float | None, store: Cache) -
             return None
 
     inputs = (source.content(store), source.mask_content(store), megapixels)
-    return store.recall("stretches", inputs, compute), source.guard.notes_on([source.path])
+    return store.recall("stretches", inputs, compute), source.guard.state_of([source.path])

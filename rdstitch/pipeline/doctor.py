@@ -19,7 +19,7 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.read import DecodedImage
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.results.messages import Message, bytes_in_words, seconds_in_words, shortened, told_once
+from rdstitch.results.messages import Message, bytes_in_words, merge_by_reason, seconds_in_words, shortened
 from rdstitch.results.registration import Registration
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.progress import Progress, silent
@@ -204,7 +204,7 @@ def _dry_run(
         plan, registration = None, refused.registration
     except RegistrationError as error:
         return None, None, (Message(str(error)),)
-    problems = told_once((*registration.failures, *registration.warnings, *registration.left_out))
+    problems = merge_by_reason((*registration.failures, *registration.warnings, *registration.left_out))
     return plan, registration, tuple(problems)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.executors import in_order
-from rdstitch.inputs.input_guard import GuardNotes
+from rdstitch.inputs.input_guard import GuardState
 from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.system.cache import Cache
@@ -46,7 +46,7 @@ def with_image_circle(
     def compute() -> Circle | None:
         seen = []
         for grey, notes in in_order(executor, _grey_of, [(source, megapixels) for source in chosen]):
-            sources[0].guard.learn(notes)
+            sources[0].guard.merge(notes)
             seen += [] if grey is None else [grey]
         circle = find_circle(np.mean(seen, axis=0)) if seen else None
         if circle is None:
@@ -66,10 +66,10 @@ def with_image_circle(
     ]
 
 
-def _grey_of(task: tuple[Source, float | None]) -> tuple[NDArray[np.float32] | None, GuardNotes]:
+def _grey_of(task: tuple[Source, float | None]) -> tuple[NDArray[np.float32] | None, GuardState]:
     """Grey levels of a small version of an image, None where it cannot be read; and what was noticed of its file."""
     source, megapixels = task
-    notes = source.guard.notes_on
+    notes = source.guard.state_of
     try:
         pixels = source.view(megapixels).image
     except InputError:  # left out, or reported, by the detection

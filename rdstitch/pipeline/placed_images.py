@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -223,19 +223,19 @@ def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
 
 def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canvas:
     """The canvas on a plane, or, of images taken by turning on the spot, in a projection."""
-    how: dict[str, Any] = {
-        "scale": scale,
-        "rotate": options.rotate,
-        "reference": placed.reference,
-        "names": [source.name for source in placed.sources],
-        "max_stretch": options.max_stretch,
-    }
-    if placed.turned:
-        canvas = plan_panorama(placed.cameras, placed.homographies, projection=options.projection, **how)
-        return replace(canvas, orientation=placed.orientation)
-    if options.projection not in ("auto", "plane"):
+    if not placed.turned and options.projection not in ("auto", "plane"):
         raise ArgumentError(
             f"the {options.projection} projection is for images taken by turning on the spot; these were not, "
             "leave out --projection"
         )
-    return replace(plan_canvas(placed.cameras, placed.homographies, **how), orientation=placed.orientation)
+    planner = partial(plan_panorama, projection=options.projection) if placed.turned else plan_canvas
+    canvas = planner(
+        placed.cameras,
+        placed.homographies,
+        scale=scale,
+        rotate=options.rotate,
+        reference=placed.reference,
+        names=[source.name for source in placed.sources],
+        max_stretch=options.max_stretch,
+    )
+    return replace(canvas, orientation=placed.orientation)

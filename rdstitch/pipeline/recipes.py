@@ -29,7 +29,7 @@ from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_ca
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_full_size
-from rdstitch.results.messages import Message, told_once
+from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.opencv_state import one_opencv_thread
@@ -302,7 +302,7 @@ def _accepted(sources: Sequence[Source], known: Sequence[Message], run: Run, exe
         return accept(registration.with_messages(known), run.options, run.purpose)
     except RegistrationError as error:
         unread = [message for message in known if message.severity == "left out"]
-        told = [str(replace(message, code="")) for message in told_once([*unread, *sources[0].guard.complaints])]
+        told = [str(replace(message, code="")) for message in merge_by_reason([*unread, *sources[0].guard.warnings])]
         error.args = ("; ".join([str(error), *told]),)
         if isinstance(error, RefusedError):
             report_refused(run, error.registration)

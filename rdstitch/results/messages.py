@@ -59,7 +59,7 @@ def left_out(path: str | Path, reason: str) -> Message:
     return Message(reason.removeprefix(f"{path}: "), (str(path),), "left out", "left-out")
 
 
-def told_once(messages: Iterable[Message]) -> list[Message]:
+def merge_by_reason(messages: Iterable[Message]) -> list[Message]:
     """The same; images left out for the same reason are named in one, each once, which stands where the first did."""
     told: dict[object, Message] = {}
     for number, message in enumerate(messages):

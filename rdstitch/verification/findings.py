@@ -66,28 +66,13 @@ class Kind(Enum):
         "parallax",
         "{what}; most of all between {first} and {second} ({rms:.1f} pixels)",
     )
-    SHAPE_UNKNOWN = (
+    FREE_HOMOGRAPHIES = (
         Scope.WHOLE,
         "shape",
         (
             "global accuracy unknown: the images do not come from one camera with one focal length, or what they "
-            "show is not flat; each has a homography of its own, and their errors add up from image to image"
-        ),
-    )
-    SHAPE_BENT = (
-        Scope.WHOLE,
-        "shape",
-        (
-            "may be bent by about {size:.0f} pixels from end to end, though neighbours fit: the errors have a "
-            "pattern that was not modelled, most likely {cause}"
-        ),
-    )
-    SHAPE_FREE = (
-        Scope.WHOLE,
-        "shape",
-        (
-            "may be bent by about {size:.0f} pixels from end to end, though neighbours fit: the images cannot "
-            "exclude {cause}; give {remedy}"
+            "show is not flat; each has a homography of its own, and their errors add up from image to image, most of "
+            "all between {first} and {second}"
         ),
     )
     UNLIKE = (

@@ -20,6 +20,11 @@ LIMITS = {
     "few matches": Limit(40, "matches", "pairs that share nothing have been seen to have up to 33 of one motion"),
     "error": Limit(1.0, "thresholds, rms of the whole", "the definition of an inlier"),
     "error of rough ground": Limit(3.0, "thresholds, where images look alike", "small_failures, classical"),
+    "bent": Limit(
+        1 / 3,
+        "thresholds that neighbours' errors have in common",
+        "10 of 10 planes beyond it are off by 3 px and more, 5 of 17 below by 1.5: benchmarks.trust",
+    ),
     "error that relief explains": Limit(0.02, "of an image's diagonal", "python -m examples.benchmarks.relief"),
     "length": Limit(0.05, "standard deviation of the focal length's logarithm", "chosen: 5 cm in a metre are seen"),
     # Cells of an overlap.

@@ -5,7 +5,6 @@ A warning is for what puts this result at risk. A picture is judged by its seams
 errors is a detail.
 """
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -102,28 +101,12 @@ def _depth(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(kind, (fit.image1, fit.image2), "warning", {"what": what, "rms": fit.rms})
 
 
-def _shape(evidence: Evidence) -> Iterator[Finding]:
-    """A shape of the whole that the overlaps do not hold, and the image that may be off the most."""
-    alignment, shape = evidence.alignment, evidence.alignment.shape
-    if shape is None or evidence.purpose.lens_only:
-        return
-    if alignment.focal is None:
-        # Chains of free homographies bend with whatever is not modelled, a curved wall for one.
-        yield Finding(
-            Kind.SHAPE_UNKNOWN,
-            (shape.image,),
-            "warning" if shape.doubtful else "detail",
-            {"size": _size_of_shape(evidence)},
-        )
-    elif shape.doubtful:
-        remedy = "more rows of images" if alignment.lens_given else "the lens, or more rows of images"
-        values = {"size": _size_of_shape(evidence), "cause": shape.cause, "remedy": remedy}
-        yield Finding(Kind.SHAPE_BENT if shape.shown else Kind.SHAPE_FREE, (shape.image,), "warning", values)
-
-
-def _size_of_shape(evidence: Evidence) -> float:
-    shape = evidence.alignment.shape
-    return math.inf if shape is None else math.hypot(shape.shift, shape.shift_std)
+def _free_homographies(evidence: Evidence) -> Iterator[Finding]:
+    """A homography for each of three or more images: their chain bends with whatever is not modelled."""
+    alignment = evidence.alignment
+    if evidence.flat and alignment.focal is None:
+        fit = max(evidence.used, key=lambda fit: fit.rms)
+        yield Finding(Kind.FREE_HOMOGRAPHIES, fit.images, "warning" if alignment.relief.found else "detail")
 
 
 def _unlike(evidence: Evidence) -> Iterator[Finding]:
@@ -210,7 +193,7 @@ OF_PAIRS: tuple[Find, ...] = (disagreeing_pairs, _unlike, _ambiguous)
 OF_THE_WHOLE: tuple[Find, ...] = (
     _errors,
     _depth,
-    _shape,
+    _free_homographies,
     _looked_at,
     _pattern,
     _rival_motion,
@@ -220,24 +203,23 @@ OF_THE_WHOLE: tuple[Find, ...] = (
 """Everything else."""
 
 OF_PLACES = {
-    Kind.SHAPE_UNKNOWN, Kind.SHAPE_BENT, Kind.SHAPE_FREE, Kind.PATTERN, Kind.SETTLED_PATTERN, Kind.AMBIGUOUS,
+    Kind.FREE_HOMOGRAPHIES, Kind.PATTERN, Kind.SETTLED_PATTERN, Kind.AMBIGUOUS,
     Kind.OUTVOTED, Kind.OUTVOTED_PATTERN,
 }  # fmt: skip
 """Kinds that make the places of images doubtful and leave the lens as it is: a board shifted by a square is as straight
 as before."""
 
 
-SEEN_AT_SEAMS = {Kind.RELIEF, Kind.DEPTH_OF_A_TURN}
-"""Kinds that the seams of a picture show, or do not."""
-
-
 def _bent(evidence: Evidence) -> bool:
-    return evidence.flat and _size_of_shape(evidence) < min(2.0 * camera.scale for camera in evidence.alignment.cameras)
+    """Whether what neighbours share shows a bent plane, even where seams hold: it adds up from image to image, and
+    tilts take most of it up.
+    """
+    return evidence.flat and evidence.alignment.relief.size > limit("bent") * evidence.threshold
 
 
-def _seen(evidence: Evidence) -> bool:
-    """Whether depth leaves the images unlike."""
-    return evidence.alike < limit("alike")
+def _depth_seen(evidence: Evidence) -> bool:
+    """Whether depth leaves the images unlike; pictures have their seams."""
+    return not evidence.purpose.picture and evidence.alike < limit("alike")
 
 
 class Aloud(NamedTuple):
@@ -248,10 +230,12 @@ class Aloud(NamedTuple):
 
 
 ALOUD = {
-    **dict.fromkeys((Kind.SHAPE_UNKNOWN, Kind.SHAPE_BENT, Kind.SHAPE_FREE), Aloud("flatness", _bent)),
-    # Local alignment makes the seams of a picture hold over any ground, and leaves the whole bent.
-    Kind.ROUGH: Aloud("flatness", lambda evidence: evidence.flat or (_seen(evidence) and not evidence.purpose.picture)),
-    Kind.RELIEF: Aloud("flatness", lambda evidence: evidence.flat or _seen(evidence)),
-    Kind.DEPTH_OF_A_TURN: Aloud("flatness", _seen),
+    Kind.FREE_HOMOGRAPHIES: Aloud("flatness"),
+    Kind.ROUGH: Aloud("flatness", lambda evidence: evidence.flat or _depth_seen(evidence)),
+    Kind.RELIEF: Aloud(
+        "flatness",
+        lambda evidence: _bent(evidence) or (evidence.flat and not evidence.purpose.picture) or _depth_seen(evidence),
+    ),
+    Kind.DEPTH_OF_A_TURN: Aloud("flatness", _depth_seen),
 }
 """The gravest first; other kinds are always said, and before these."""

@@ -96,7 +96,6 @@ def _aloud(findings: Sequence[Finding], evidence: Evidence) -> tuple[Finding, ..
     for k in sorted(range(len(findings)), key=lambda k: rank.get(findings[k].kind, -1)):
         rule = rules.ALOUD.get(findings[k].kind, rules.Aloud(findings[k].kind.name))
         speaks = findings[k].severity == "warning" and rule.topic not in topics and rule.speaks(evidence)
-        speaks = speaks and not (evidence.purpose.picture and findings[k].kind in rules.SEEN_AT_SEAMS)
         if speaks and len(aloud) < rules.MAX_WARNINGS:
             aloud.add(k)
             topics.add(rule.topic)

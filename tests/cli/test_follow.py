@@ -34,11 +34,6 @@ def folder(tmp_path: Path) -> Path:
     return made
 
 
-def _written_as(image: Path, file: Path) -> Path:
-    write_image(file, read_image(image).pixels)
-    return file
-
-
 def _line(process: "subprocess.Popen[bytes]") -> dict[str, Any]:
     line = process.stdout.readline()
     assert line, process.stderr.read().decode() if process.stderr else ""
@@ -152,9 +147,9 @@ def test_the_line_of_what_cannot_be_read(rdstitch: Run, drive: list[Path], folde
 
 def test_files_whose_writers_pause_are_read_when_they_are_whole(drive: list[Path], folder: Path) -> None:
     names = ["a.png", "b.jpg", "c.png", "d.tif", "e.png"]
-    whole = {
-        name: _written_as(image, folder.parent / name).read_bytes() for name, image in zip(names, drive, strict=False)
-    }
+    for name, image in zip(names, drive, strict=False):
+        write_image(folder.parent / name, read_image(image).pixels)
+    whole = {name: (folder.parent / name).read_bytes() for name in names}
     arrivals = Arrivals(folder, frames_folder=Path, idle=2.0)
     frames = follow(arrivals, StitchOptions(workers=1), comes_again=arrivals.comes_again)
     (folder / "a.png").write_bytes(whole["a.png"])

@@ -4,11 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from rdstitch.choices import MatchBy
+from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.option import Option
-from rdstitch.options.shared_options import DryRun, Every, FlatField, Mask, Overwrite, Strict, Topic, Workers
-from rdstitch_cli.flags import ImageFile, command, flags, flags_of, is_given, values_of
+from rdstitch_cli.flags import ImageFile, command, flags_of, is_given, values_of
 from rdstitch_cli.stitching import report_applied, resolve
 from rdstitch_cli.terminal import Reporter
 
@@ -20,16 +19,7 @@ from rdstitch_cli.terminal import Reporter
   rdstitch apply small.jpg.json --images originals/ -o large.tif --match name --strict
 """,
     flags_of(CompositeOptions),
-    flags(
-        flat_field=(FlatField, "off"),
-        every=(Every, 1),
-        topic=(Topic, None),
-        mask=(Mask, None),
-        workers=(Workers, 0),
-        overwrite=(Overwrite, False),
-        strict=(Strict, False),
-        dry_run=(DryRun, False),
-    ),
+    flags_of(ApplyOptions),
 )
 def apply(
     sidecar: Annotated[Path, "SIDECAR"],
@@ -38,12 +28,6 @@ def apply(
         Option("Images to compose: what 'rdstitch mosaic' takes; may be given several times.", "INPUT"),
     ],
     output: ImageFile,
-    match: Annotated[
-        MatchBy,
-        Option(
-            "Assign images by name (suffix and band may differ), by order, or (auto) by name, time or GPS position."
-        ),
-    ] = "auto",
     *,
     reporter: Reporter,
     **given: Any,
@@ -58,7 +42,6 @@ def apply(
     from rdstitch.sidecar.read import read_sidecar
 
     compositing = values_of(CompositeOptions, given)
-    others = {name: value for name, value in given.items() if name not in compositing}
     chosen = {name: value for name, value in compositing.items() if is_given(name)}
     # What is given takes the place of what the sidecar has for the same purpose.
     if "scale" in chosen or "gsd" in chosen:
@@ -66,5 +49,5 @@ def apply(
     if chosen.keys() & {"rectangle", "straighten", "level"}:
         chosen = {"rectangle": None, "straighten": "off", "level": False, **chosen}
     composite = replace(read_sidecar(sidecar).composite, **chosen)
-    result = recipe(sidecar, resolve(images), output, composite, match=match, progress=reporter, **others)
+    result = recipe(sidecar, resolve(images), output, composite, progress=reporter, **values_of(ApplyOptions, given))
     report_applied(result, reporter)

@@ -12,7 +12,6 @@ import rdstitch
 from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
 from rdstitch.alignment.odometry import OdometryFit, bridged, scaled_by_odometry
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.odometry import BodyPose, read_odometry
@@ -100,10 +99,6 @@ def _files(drive: Sequence, folder: Path) -> dict[str, Any]:
 CAMERA = Camera((320, 240), DISTORTION, focal=256.0, focal_source="option")
 
 
-def _within(places: FloatArray, drive: Sequence) -> None:
-    assert np.abs(places - _metres(drive).position).max() < 0.06 * HEIGHT + 0.02
-
-
 def test_offline_and_live_give_metres_and_bridge_what_shows_nothing(drive: Sequence, tmp_path: Path) -> None:
     images = list(drive.frames())
     for k in (9, 10):
@@ -112,7 +107,7 @@ def test_offline_and_live_give_metres_and_bridge_what_shows_nothing(drive: Seque
     path, registration = rdstitch.trajectory(images, options=options)
     assert path.frame.tolist() == list(range(16))
     assert path.height[0] == pytest.approx(HEIGHT, rel=0.03)
-    _within(path.position, drive)
+    assert np.abs(path.position - _metres(drive).position).max() < 0.06 * HEIGHT + 0.02
     assert any("placed by the odometry alone: image_0009" in message.text for message in registration.messages)
 
     tracker, poses = rdstitch.Tracker(options, rdstitch.FollowedPoses(frame="camera")), dict[int, rdstitch.Pose]()

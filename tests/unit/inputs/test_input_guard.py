@@ -12,7 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from rdstitch.errors import ArgumentError, InputError, LimitError
@@ -64,12 +63,12 @@ def test_what_another_process_read_must_have_been_the_same(tmp_path: Path) -> No
     for guard in (here, same):
         with guard.reading(path):
             pass
-    here.learn(same.notes_on([path]))
+    here.merge(same.state_of([path]))
     os.utime(path, ns=(0, 0))
     with later.reading(path):
         pass
     with pytest.raises(InputError, match=r"a\.bmp: has changed during the run"):
-        here.learn(later.notes_on([path]))
+        here.merge(later.state_of([path]))
 
 
 def test_a_file_that_is_being_written_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,10 +134,6 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seen
 
 
-def _image(values: NDArray[np.uint8]) -> DecodedImage:
-    return DecodedImage(values, None, Metadata(values.shape[::-1]))
-
-
 def test_an_image_is_decoded_once_for_all_stages(source: Source, read: list[int]) -> None:
     shelved = replace(source, decoded_images=DecodedImageCache())
     looks = [shelved.read(reduction, keep=True).pixels for reduction in (2, 4, 8)]
@@ -184,7 +179,7 @@ def test_masks_are_kept_apart(source: Source, tmp_path: Path) -> None:
 
 def test_images_for_which_there_is_no_room_are_not_kept() -> None:
     decoded_images = DecodedImageCache(room=250)
-    large, small = (_image(np.zeros((10, n), np.uint8)) for n in (20, 5))
+    large, small = (DecodedImage(np.zeros((10, n), np.uint8), None, Metadata((n, 10))) for n in (20, 5))
     decoded_images.put("large", large)
     decoded_images.put("other", large)
     decoded_images.put("small", small)

@@ -117,44 +117,36 @@ def test_first_image_of_several(tmp_path: Path, colours: Samples) -> None:
         assert np.abs(pixels.astype(int) - colours).mean() < 12
 
 
+_CALIBRATED, _MIDDLE = 'drone-dji:CalibratedFocalLength="268.0"', ' drone-dji:CalibratedOpticalCenterX="{}"'
+
+
 class TestMetadata:
     """What drones and cameras write."""
 
-    def test_focal_length(self, tmp_path: Path) -> None:
-        exif = Image.Exif()
-        exif[0x8769] = {0xA405: 28}
-        Image.new("L", (400, 300)).save(tmp_path / "a.jpg", exif=exif)
-        metadata = read_metadata(tmp_path / "a.jpg")
-        assert metadata.focal_px == pytest.approx(500 * 28 / np.hypot(36, 24))
-
-    def test_focal_plane_resolution_counts_original_pixels(self, tmp_path: Path) -> None:
-        exif = Image.Exif()
-        # 5 mm, 800 pixels per mm at a width of 4000 pixels; the file was made smaller since.
-        exif[0x8769] = {0x920A: 5.0, 0xA20E: 800.0, 0xA210: 4, 0xA002: 4000}
-        Image.new("L", (1000, 750)).save(tmp_path / "a.jpg", exif=exif)
-        assert read_metadata(tmp_path / "a.jpg").focal_px == pytest.approx(1000.0)
-
     @pytest.mark.parametrize(
-        ("tags", "middle", "focal"),
+        ("width", "tags", "xmp", "focal"),
         [
-            # As the drone wrote it, with a middle that is not quite there; reduced, by EXIF's width or by the middle.
-            ({0xA002: 400}, 203.0, 268.0),
-            ({0xA002: 1600}, None, 67.0),
-            ({0xA002: 400}, 800.0, 67.0),
-            ({}, 800.0, 67.0),
+            (400, {0xA405: 28}, "", 500 * 28 / np.hypot(36, 24)),
+            # 5 mm, 800 pixels per mm at a width of 4000 pixels; the file was made smaller since.
+            (1000, {0x920A: 5.0, 0xA20E: 800.0, 0xA210: 4, 0xA002: 4000}, "", 1000.0),
+            # Calibrated, as the drone wrote it, with a middle that is not quite there; reduced, by EXIF's width or by
+            # the middle.
+            (400, {0xA002: 400}, _CALIBRATED + _MIDDLE.format(203.0), 268.0),
+            (400, {0xA002: 1600}, _CALIBRATED, 67.0),
+            (400, {0xA002: 400}, _CALIBRATED + _MIDDLE.format(800.0), 67.0),
+            (400, {}, _CALIBRATED + _MIDDLE.format(800.0), 67.0),
             # Nothing says that it was reduced, but what 35 mm film would have says so; that it was, and by how much.
-            ({0xA405: 6}, None, None),
-            ({0xA405: 6}, 800.0, 67.0),
+            (400, {0xA405: 6}, _CALIBRATED, None),
+            (400, {0xA405: 6}, _CALIBRATED + _MIDDLE.format(800.0), 67.0),
         ],
     )
-    def test_a_calibrated_focal_length_is_that_of_the_original(
-        self, tmp_path: Path, tags: dict[int, Any], middle: float | None, focal: float | None
+    def test_a_focal_length_is_that_of_the_pixels_there_are(
+        self, tmp_path: Path, width: int, tags: dict[int, Any], xmp: str, focal: float | None
     ) -> None:
         exif = Image.Exif()
         exif[0x8769] = tags
-        told = "" if middle is None else f'drone-dji:CalibratedOpticalCenterX="{middle}"'
-        xmp = f'<rdf:Description drone-dji:CalibratedFocalLength="268.0" {told}/>'
-        Image.new("L", (400, 300)).save(tmp_path / "a.jpg", exif=exif, xmp=xmp.encode())
+        told: dict[str, Any] = {"xmp": f"<rdf:Description {xmp}/>".encode()} if xmp else {}
+        Image.new("L", (width, width * 3 // 4)).save(tmp_path / "a.jpg", exif=exif, **told)
         assert read_metadata(tmp_path / "a.jpg").focal_px == pytest.approx(focal)
 
     def test_place_and_attitude(self, tmp_path: Path) -> None:

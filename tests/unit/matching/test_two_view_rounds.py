@@ -28,12 +28,6 @@ def _features(points: FloatArray, descriptors: FloatArray) -> Features:
     return Features(points, descriptors.astype(np.float32), one, one, one, None, "rootsift", LENS.image_size)
 
 
-def _descriptors(count: int, rng: np.random.Generator) -> FloatArray:
-    drawn = rng.normal(size=(count, 64))
-    unit: FloatArray = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
-    return unit
-
-
 def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pairing:
     """Images in which some points rest, while a board with others is carried about, or is not there.
 
@@ -42,7 +36,8 @@ def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pai
     rng = np.random.default_rng(seed)
     background = rng.uniform((0, 0), (639, 479), (resting, 2))
     board = rng.uniform(-0.5, 0.5, (moving, 2)) * 1.2
-    names = _descriptors(resting + moving, rng)
+    names = rng.normal(size=(resting + moving, 64))
+    names /= np.linalg.norm(names, axis=1, keepdims=True)
     names[resting : resting + repeated] = np.repeat(names[resting : resting + repeated : 5], 5, axis=0)
     found = []
     for index in range(IMAGES):

@@ -14,6 +14,7 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.map_grid import read_grid
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
+from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.bands import mosaic_bands
@@ -135,6 +136,11 @@ def test_images_of_other_places_are_refused(rig: Path, tmp_path: Path) -> None:
         copy.write_bytes(file.read_bytes())
     with pytest.raises(InputError, match="--match order takes them in order"):
         apply(rig / "red.tif.json", unlike, workers=1)
+    with pytest.raises(ArgumentError, match="match must be one of auto, name, order, not 'guess'"):
+        apply(rig / "red.tif.json", unlike, match="guess")
+    in_order = apply(rig / "red.tif.json", unlike, options=ApplyOptions(match="order", dry_run=True), workers=1)
+    assert in_order.matched == "order"
+    assert in_order.plan is not None
 
 
 def test_the_grid_of_another_file(rig: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from rdstitch.alignment import LENSES, MODELS
 from rdstitch.choices import LensName, ModelName, ProjectionName
 from rdstitch.compositing.projection import PROJECTIONS
 from rdstitch.errors import ArgumentError
-from rdstitch.results.messages import Message, left_out, told_once
+from rdstitch.results.messages import Message, left_out, merge_by_reason
 from rdstitch.verification.findings import Kind
 from rdstitch.verification.verdict import RefusedError
 
@@ -20,7 +20,7 @@ from rdstitch.verification.verdict import RefusedError
 def test_images_left_out_for_one_reason_are_named_together() -> None:
     blurred, alone = Message("is blurred", ("b/1.jpg",)), "no overlap"
     first, last = left_out("a/1.jpg", alone), left_out("a/3.jpg", alone)
-    told = told_once([blurred, first, left_out("a/2.jpg", "in block 2"), last, blurred, first])
+    told = merge_by_reason([blurred, first, left_out("a/2.jpg", "in block 2"), last, blurred, first])
     assert list(map(str, told)) == [
         "1.jpg: is blurred",
         "left out a/1.jpg, 3.jpg: no overlap [left-out]",
@@ -29,7 +29,7 @@ def test_images_left_out_for_one_reason_are_named_together() -> None:
     ]
 
     # The folder is named where it changes, and the temporary one of a video is not.
-    (message,) = told_once([left_out(path, "no overlap") for path in ("a/1.jpg", "a/2.jpg", "b/1.jpg")])
+    (message,) = merge_by_reason([left_out(path, "no overlap") for path in ("a/1.jpg", "a/2.jpg", "b/1.jpg")])
     assert str(message) == "left out a/1.jpg, 2.jpg, b/1.jpg: no overlap [left-out]"
     assert str(left_out("/tmp/rdstitch-x1.part/drive_0003.jpg", "is blurred")).startswith("left out drive_0003.jpg: ")
 

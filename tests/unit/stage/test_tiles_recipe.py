@@ -63,12 +63,8 @@ def test_one_array_of_all_tiles_is_read_tile_by_tile() -> None:
     assert _errors(result, STAGE.places).max() < 0.5
 
 
-def _write(folder: Path) -> list[Path]:
-    return STAGE.write(folder)
-
-
 def test_a_truncated_tile_and_a_coloured_one_are_left_out_by_name(tmp_path: Path) -> None:
-    files = _write(tmp_path)
+    files = STAGE.write(tmp_path)
     tifffile.imwrite(files[2], np.repeat(TILES[2][..., None], 3, axis=2), photometric="rgb")
     files[5].write_bytes(files[5].read_bytes()[:60_000])
     result = rdstitch.tiles(tmp_path, grid="r{row}c{col}", overlap=20.0)
@@ -82,7 +78,7 @@ def test_a_truncated_tile_and_a_coloured_one_are_left_out_by_name(tmp_path: Path
 
 
 def test_tiles_of_several_sizes_lie_where_they_are(tmp_path: Path) -> None:
-    files = _write(tmp_path)
+    files = STAGE.write(tmp_path)
     tifffile.imwrite(files[4], TILES[4][:230, :250])
     result = rdstitch.tiles(tmp_path, positions=tmp_path / "positions.csv")
     assert _errors(result, STAGE.places).max() < 0.5
@@ -96,7 +92,7 @@ def test_tiles_of_several_sizes_lie_where_they_are(tmp_path: Path) -> None:
 
 
 def test_another_channel_keeps_the_frame_whatever_tiles_it_lacks(tmp_path: Path) -> None:
-    files = _write(tmp_path / "a")
+    files = STAGE.write(tmp_path / "a")
     rdstitch.tiles(tmp_path / "a", tmp_path / "a.ome.tif", grid="r{row}c{col}", overlap=20.0, pixel_size=0.65)
     (tmp_path / "b").mkdir()
     for file in files[1:]:

@@ -155,9 +155,8 @@ def test_a_frame_of_something_else_has_no_place_and_the_next_one_has() -> None:
     for frame in frames[:14]:
         tracker.add(frame, Camera(SIZE))
     lost = tracker.add(strangers[3], Camera(SIZE))[-1]
-    assert lost.placement is None
-    assert lost.inliers == 0
-    assert lost.map_number == 0
+    assert (lost.placement, lost.inliers, lost.map_number) == (None, 0, 0)
+    assert lost.reason == "no keyframe shows what it shows"
     assert tracker.add(frames[14], Camera(SIZE))[-1].placement is not None
 
 

@@ -1,7 +1,6 @@
 """Of two motions in the same images, which is that of the plane?"""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pytest
@@ -43,10 +42,6 @@ def _shift(pixels: float) -> FloatArray:
     return matrix
 
 
-def _moving(pixels: float, inliers: Any = ()) -> RadialHomography:
-    return RadialHomography(_shift(pixels), LENS, LENS, np.asarray(inliers, dtype=np.bool_))
-
-
 def _registered(
     monkeypatch: pytest.MonkeyPatch, images: list[Grey], places: list[float], pairs: Sequence[PairRegistration] = ()
 ) -> Registration:
@@ -67,7 +62,8 @@ def _pair(first: int, second: int, on_plane: int, ahead: int) -> PairRegistratio
     other = rng.uniform((290, 5), (395, 295), (ahead, 2))
     matched = stored(np.concatenate([plane, other]), np.concatenate([plane - (STEP, 0.0), other - (SWAY, 0.0)]))
     by_plane = on_plane > ahead
-    relation = _moving(STEP if by_plane else SWAY, (np.arange(on_plane + ahead) < on_plane) == by_plane)
+    inliers = (np.arange(on_plane + ahead) < on_plane) == by_plane
+    relation = RadialHomography(_shift(STEP if by_plane else SWAY), LENS, LENS, inliers)
     return PairRegistration(first, second, matched, relation)
 
 

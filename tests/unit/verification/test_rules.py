@@ -23,18 +23,21 @@ from rdstitch.verification.self_similarity import Ambiguity
 from rdstitch.verification.verdict import _aloud
 from tests.registrations import CAMERA, evidence, registration, source
 
-SHAPE = replace(registration().alignment.shape, doubtful=True, shift=6.0, shift_std=8.0)
-SHAPED = evidence(registration(shape=SHAPE), alike=0.8)
+FLAT = evidence(registration(), alike=0.8)
 
 
-def _said(*kinds: Kind, found: Evidence = SHAPED) -> list[Kind]:
+def _said(*kinds: Kind, found: Evidence = FLAT) -> list[Kind]:
     findings = [Finding(kind, (0,), "warning") for kind in kinds]
     return [finding.kind for finding in _aloud(findings, found) if finding.severity == "warning"]
 
 
+def _mosaic(shared: float) -> Evidence:
+    relief = replace(FLAT.alignment.relief, found=True, size=shared)
+    return evidence(registration(relief=relief), Purpose.MOSAIC, alike=0.8)
+
+
 TURNED = evidence(registration(model="rotation"), alike=0.8)
 UNLIKE = evidence(TURNED.registration, alike=0.1)
-SMALL = evidence(registration(shape=replace(SHAPE, shift=1e4)), alike=0.8)
 
 
 @pytest.mark.parametrize(
@@ -43,12 +46,13 @@ SMALL = evidence(registration(shape=replace(SHAPE, shift=1e4)), alike=0.8)
         (TURNED, [Kind.RELIEF], []),  # of a turn and of pairs only what is seen
         (UNLIKE, [Kind.RELIEF], [Kind.RELIEF]),
         (UNLIKE, [Kind.DEPTH_OF_A_TURN], [Kind.DEPTH_OF_A_TURN]),
-        (SHAPED, [Kind.RELIEF], [Kind.RELIEF]),
-        (SHAPED, [Kind.RELIEF, Kind.SHAPE_BENT], [Kind.SHAPE_BENT]),  # one line says that the plane may be none
-        (SMALL, [Kind.SHAPE_BENT], []),  # by more than an image
+        (FLAT, [Kind.RELIEF], [Kind.RELIEF]),
+        (FLAT, [Kind.RELIEF, Kind.FREE_HOMOGRAPHIES], [Kind.FREE_HOMOGRAPHIES]),  # one line: the plane may be none
         (evidence(TURNED.registration, Purpose.MOSAIC, alike=0.1), [Kind.RELIEF, Kind.ROUGH], []),
         # What local alignment hides along the seams of a plane leaves the whole bent.
-        (evidence(SHAPED.registration, Purpose.MOSAIC, alike=0.8), [Kind.RELIEF, Kind.ROUGH], [Kind.ROUGH]),
+        (evidence(FLAT.registration, Purpose.MOSAIC, alike=0.8), [Kind.RELIEF, Kind.ROUGH], [Kind.ROUGH]),
+        (_mosaic(1.01), [Kind.RELIEF], [Kind.RELIEF]),  # a third of the threshold
+        (_mosaic(0.99), [Kind.RELIEF], []),
     ],
 )
 def test_what_is_said_aloud(found: Evidence, kinds: list[Kind], said: list[Kind]) -> None:
@@ -58,13 +62,13 @@ def test_what_is_said_aloud(found: Evidence, kinds: list[Kind], said: list[Kind]
 def test_failures_stay_and_what_is_not_said_is_a_detail() -> None:
     given = (Finding(Kind.ERRORS), Finding(Kind.IMAGE_MISFITS, (1,)))
     assert _aloud(given, TURNED) == given
-    (note,) = _aloud([Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "warning", {"size": 3.0})], SHAPED)
+    (note,) = _aloud([Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "warning", {"size": 3.0})], FLAT)
     assert note == Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "detail", {"size": 3.0})
 
 
 def test_there_are_a_few_lines_of_a_run_the_gravest_first_and_one_of_a_kind() -> None:
     others = [Kind.UNMASKED, Kind.ZOOMED, Kind.TWO_OF_ONE_LENS, Kind.SETTLED_PATTERN][: rules.MAX_WARNINGS]
-    assert _said(Kind.SHAPE_BENT, *others) == others
+    assert _said(Kind.FREE_HOMOGRAPHIES, *others) == others
     assert _said(others[0], others[0]) == others[:1]
 
 
@@ -159,17 +163,15 @@ def test_images_without_a_mask_among_others_are_named() -> None:
     assert _texts(masked[0], source("x.png"), source("y.png")) == ["2 of 3 images have no mask: x.png, y.png"]
 
 
-@pytest.mark.parametrize(("doubtful", "severity"), [(True, "warning"), (False, "detail")])
-def test_free_homographies_are_doubted_where_their_errors_have_a_pattern(doubtful: bool, severity: str) -> None:
-    found = evidence(registration(parameters=(), shape=replace(SHAPE, image=1, doubtful=doubtful)))
-    assert [(own.kind, own.severity) for own in rules._shape(found)] == [(Kind.SHAPE_UNKNOWN, severity)]
+@pytest.mark.parametrize(("relief", "severity"), [(True, "warning"), (False, "detail")])
+def test_free_homographies_are_doubted_where_neighbours_errors_agree(relief: bool, severity: str) -> None:
+    ground = replace(FLAT.alignment.relief, found=relief)
+    found = evidence(registration(parameters=(), relief=ground))
+    assert [(own.kind, own.severity) for own in rules._free_homographies(found)] == [(Kind.FREE_HOMOGRAPHIES, severity)]
+    assert not list(rules._free_homographies(evidence(registration(2, parameters=(), relief=ground))))
 
 
 LARGEST = 0.02 * 500.0  # pixels that relief explains, of images with a diagonal of 500
-
-
-def _kinds(findings: Any) -> list[Kind]:
-    return [finding.kind for finding in findings]
 
 
 @pytest.mark.parametrize(
@@ -195,7 +197,7 @@ def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kin
     cameras = (CAMERA, Camera((40, 30)), CAMERA)
     found = evidence(registration(rms=rms, relief=ground, cameras=cameras), alike=alike)
     findings = list(rules._errors(found))
-    assert _kinds(findings) == ([] if kind is None else [kind])
+    assert [finding.kind for finding in findings] == ([] if kind is None else [kind])
     for finding in findings:
         assert finding.severity == ("warning" if kind == Kind.ROUGH else "failure")
         assert finding.values == pytest.approx({"rms": rms, "threshold": 3.0}, nan_ok=True)

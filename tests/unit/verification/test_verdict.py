@@ -201,17 +201,13 @@ def test_of_doubtful_pairs_on_which_nothing_depends_the_images_are_named() -> No
     assert said() == []
 
 
-def test_a_doubtful_shape_names_the_image_and_the_size(good: Registration) -> None:
-    alignment = good.alignment
-    doubtful = replace(alignment.shape, doubtful=True, shown=True, image=2, shift=6.0, shift_std=8.0)
-    bent = replace(good, alignment=replace(alignment, shape=doubtful))
-    (message,) = judge(bent, THRESHOLD)
-    assert message.images == (str(good.sources[2].path),)
-    assert "about 10 pixels" in message.text
-    assert judge(bent, THRESHOLD, Purpose.CALIBRATE) == ()
-    free = replace(good, alignment=replace(alignment, parameters=()))
-    (message,) = judge(free, THRESHOLD)
+def test_homographies_over_a_scene_with_depth_are_doubted_in_what_they_add_up_to(good: Registration) -> None:
+    relief = replace(good.alignment.relief, found=True)
+    free = replace(good, alignment=replace(good.alignment, parameters=(), relief=relief))
+    (message,) = (own for own in judge(free, THRESHOLD) if own.severity == "warning")
     assert "homography of its own" in message.text
+    assert len(message.images) == 2
+    assert "homography" not in "".join(own.text for own in judge(free, THRESHOLD, Purpose.CALIBRATE))
 
 
 def test_two_images_that_are_left_of_one_lens_may_be_of_a_curved_wall(good: Registration) -> None:

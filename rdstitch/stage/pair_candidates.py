@@ -1,0 +1,194 @@
+"""Where the second tile of a pair may lie in the first, by correlation of coarse tiles."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.geometry.camera import Camera
+from rdstitch.robust.loss import normal_std
+from rdstitch.stage.correlation import (
+    CoarseTile,
+    Overlap,
+    coarse_tile,
+    correlate,
+    log_evidence,
+    peak_threshold,
+    peaks,
+    wide_peaks,
+)
+from rdstitch.stage.grid import TileGrid
+from rdstitch.system.progress import Progress
+
+Reader = Callable[[int], NDArray[Any]]
+"""Gives a tile as it is registered, (h, w)."""
+
+_Tile = TypeVar("_Tile")
+
+# What is searched; sides are longer sides of tiles.
+_COARSE_SIDE = 512  # pixels that are enough to find a displacement to a pixel of theirs
+_SEARCH = 0.05  # of a side: displacement from the nominal place where the user does not say
+_MIN_OVERLAP = 0.02  # of a side: overlap that is compared at least
+_NARROW = 2  # coarse pixels about where others say that a pair is: peaks are kept above the noise of so few
+_CANDIDATES = 8  # highest peaks of a pair that are compared by normalized cross-correlation
+_LENSES = np.linspace(-0.04, 0.04, 21)  # values of λ that are tried before it is estimated
+_LENS_REACH = 0.02  # of a side: largest displacement of an overlap's blocks against each other by the lens
+
+# Evidence for a place of a pair is in nats: logarithms of odds.
+_LOW_EVIDENCE = 6.0  # nats below which a pair is looked for elsewhere: a correlation of about 0.6
+_MIN_CONTENT = 0.5  # share of the variance of a tile that must be content to look for it elsewhere
+MIN_EVIDENCE = 4.6  # nats from which on a place is possible that the whitened correlation does not show: 100 to 1
+
+
+@dataclass(frozen=True)
+class SearchPlan:
+    """How neighbours are looked for."""
+
+    grid: TileGrid
+    search: float  # how far they may be off, pixels
+    factor: int  # by which tiles are made smaller
+
+    @classmethod
+    def of(cls, grid: TileGrid, search: float | None = None) -> "SearchPlan":
+        """By what the user says of the search, or as usual."""
+        side = max(grid.size)
+        return cls(grid, _SEARCH * side if search is None else search, max(1, round(side / _COARSE_SIDE)))
+
+    @property
+    def stage_std(self) -> float:
+        """Standard deviation of where the stage goes, pixels, of which the search is three."""
+        return self.search / 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Where the second tile of a pair may be in the first."""
+
+    offsets: FloatArray  # (K, 2), pixels
+    nats: FloatArray  # (K,): evidence for each, see :func:`log_evidence`
+    grain: float  # pixels within which two of them are one
+
+    def apart(self, index: int) -> BoolArray:
+        """Which others (K,) are another place than one of them."""
+        return np.asarray(np.abs(self.offsets - self.offsets[index]).max(axis=1) > self.grain)
+
+    def best_besides(self, index: int) -> float:
+        """The most evidence, nats, for any other place than one of them; 0 for none."""
+        return float(self.nats[self.apart(index)].max(initial=0.0))
+
+
+class PairFinder:
+    """Looks for the second tile of each pair in the first, on coarse tiles."""
+
+    def __init__(self, plan: SearchPlan, pairs: IntArray) -> None:
+        self.grid, self.pairs, self.factor = plan.grid, pairs, plan.factor
+        grid, factor = plan.grid, plan.factor
+        side = max(grid.size)
+        self.radius = max(2, math.ceil(plan.search / factor))
+        self.spare = math.ceil(_LENS_REACH * side / factor)
+        self.least = math.ceil(_MIN_OVERLAP * side)
+        self.sizes = grid.sizes
+        self.coarse = Camera((-(-grid.size[0] // factor), -(-grid.size[1] // factor)))
+
+    def overlap(self, number: int, offset: FloatArray | None = None, scale: int | None = None) -> Overlap:
+        """What the tiles of a pair have in common with the second at an offset, by default where the grid has it."""
+        scale = scale or self.factor
+        first, second = self.pairs[number].tolist()
+        if offset is None:
+            offset = self.grid.places[second] - self.grid.places[first]
+        sizes = -(-self.sizes[[first, second]] // scale)
+        return Overlap.expected(first, second, offset / scale, sizes, self.least // scale)
+
+    def candidates(self, read: Reader, known: float | None, progress: Progress) -> tuple[list[Candidates], float]:
+        """Candidates of all pairs, and the λ by which they were found; where that is unknown, twice if need be."""
+        heights = np.zeros((2, len(_LENSES)))
+        lens = known or 0.0
+        found = self._each(read, lens, progress, heights if known is None and self.grid.own_sizes is None else None)
+        middle = len(_LENSES) // 2
+        best = int(heights.sum(axis=0).argmax())
+        if best != middle and (heights[:, best] > heights[:, middle]).all():
+            lens = float(_LENSES[best])
+            found = self._each(read, lens, progress, None)
+        return found, lens
+
+    def _each(self, read: Reader, lens: float, progress: Progress, heights: FloatArray | None) -> list[Candidates]:
+        found = []
+        pairs = in_pairs(lambda index: coarse_tile(read(index), self.factor), self.pairs)
+        for number, tiles in enumerate(pairs):
+            found.append(self._of_pair(number, tiles, self.coarse.with_coefficients(lens), heights))
+            progress("correlating", number + 1, len(self.pairs))
+        return found
+
+    def _of_pair(
+        self, number: int, tiles: tuple[CoarseTile, CoarseTile], lens: Camera, heights: FloatArray | None
+    ) -> Candidates:
+        overlap = self.overlap(number)
+        surface = correlate(tiles[0].pixels, tiles[1].pixels, overlap, self.radius + self.spare)
+        total = surface.total(_shifts(overlap, lens), self.radius)
+        if heights is not None:
+            tops = [
+                surface.total(_shifts(overlap, self.coarse.with_coefficients(v)), self.radius).max() for v in _LENSES
+            ]
+            if max(tops) > _threshold(total, self.radius):
+                heights[int(np.abs(overlap.offset).argmax())] += tops
+        inner = slice(self.spare, self.spare + 2 * self.radius + 1)
+        plain = surface.plain[inner, inner].astype(np.float64)
+        likely = [_vertex(total, *at) for at in peaks(total, _threshold(total, _NARROW), _CANDIDATES)]
+        # Of a repeated pattern all places are alike, whichever of them a whitened correlation makes higher.
+        others = [_vertex(plain, *at) for at in peaks(plain, 0.0, _CANDIDATES)]
+        grain = min(tile.grain for tile in tiles)
+        others = [at for at in others if all(np.abs(at - other).max() > grain for other in likely)]
+        offsets: list[FloatArray] = []
+        nats: list[float] = []
+        for at in (*likely, *others):
+            offset = overlap.offset + at - self.radius
+            there = self.overlap(number, offset * self.factor)
+            value = log_evidence(tiles, there, offset, _shifts(there, lens))
+            if len(offsets) < len(likely) or value > MIN_EVIDENCE:
+                offsets.append(offset)
+                nats.append(value)
+        if max(nats, default=0.0) < _LOW_EVIDENCE and min(tile.content_share for tile in tiles) > _MIN_CONTENT:
+            places, values = wide_peaks(tiles)
+            offsets, nats = [*offsets, *places], [*nats, *values.tolist()]
+        return Candidates(self.factor * np.array(offsets).reshape(-1, 2), np.array(nats), self.factor * grain)
+
+
+def _vertex(surface: FloatArray, x: int, y: int) -> FloatArray:
+    """Place of a peak to a fraction of a pixel, by a parabola through its neighbours along each axis."""
+    place = np.array([x, y], dtype=np.float64)
+    for axis, (line, k) in enumerate(((surface[y], x), (surface[:, x], y))):
+        if 0 < k < len(line) - 1:
+            before, at, after = line[k - 1 : k + 2]
+            place[axis] += 0.5 * (before - after) / min(before + after - 2.0 * at, -1e-9)
+    return place
+
+
+def in_pairs(read: Callable[[int], _Tile], pairs: IntArray) -> Iterator[tuple[_Tile, _Tile]]:
+    """The tiles of each pair; each is read when it is first needed, and kept until its last pair has been."""
+    last = {int(tile): number for number, pair in enumerate(pairs) for tile in pair}
+    held: dict[int, _Tile] = {}
+    for number, pair in enumerate(pairs.tolist()):
+        for tile in pair:
+            if tile not in held:
+                held[tile] = read(tile)
+        yield held[pair[0]], held[pair[1]]
+        for tile in pair:
+            if last[tile] == number:
+                del held[tile]
+
+
+def _shifts(overlap: Overlap, camera: Camera) -> FloatArray:
+    """Displacement of each block of an overlap (K, 2) by the lens, mean 0."""
+    first = overlap.centers
+    bent = [camera.undistort(points) - points for points in (first, first - overlap.offset)]
+    shifts = bent[1] - bent[0]
+    return np.asarray(shifts - shifts.mean(axis=0))
+
+
+def _threshold(total: FloatArray, radius: int) -> float:
+    """Height that a peak of noise hardly reaches within a window."""
+    return peak_threshold(normal_std(total), (2 * radius + 1) ** 2)
