@@ -48,7 +48,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     watch(detect_features, "detect_view")
     watch(two_view, "estimate_radial_homographies")
     # The package has a function of the module's name.
-    watch(import_module("rdstitch.alignment.align"), "_chosen")
+    watch(import_module("rdstitch.alignment.align"), "_lens_and_model")
     watch(overlap_check, "overlap_agreement")
     return called
 
@@ -58,15 +58,15 @@ def test_only_what_depends_on_a_changed_option_is_done_again(
 ) -> None:
     output = tmp_path / "out.png"
     arguments = ("mosaic", *frames, "-o", output, "--overwrite", "--cache", tmp_path / "new" / "cache", *FAST)
-    for expected in ({"detect_view", "estimate_radial_homographies", "_chosen", "overlap_agreement"}, set()):
+    for expected in ({"detect_view", "estimate_radial_homographies", "_lens_and_model", "overlap_agreement"}, set()):
         work.clear()
         first = rdstitch(*arguments)
         assert (first.status, set(work)) == (0, expected)
         assert _result(output) == plain
     for options, expected in (
         (("--blend", "feather", "--scale", "0.5"), set()),
-        (("--seed", "1"), {"estimate_radial_homographies", "_chosen", "overlap_agreement"}),
-        (("--features", "orb"), {"detect_view", "estimate_radial_homographies", "_chosen", "overlap_agreement"}),
+        (("--seed", "1"), {"estimate_radial_homographies", "_lens_and_model", "overlap_agreement"}),
+        (("--features", "orb"), {"detect_view", "estimate_radial_homographies", "_lens_and_model", "overlap_agreement"}),
     ):
         work.clear()
         rdstitch(*arguments, *options)
@@ -75,7 +75,7 @@ def test_only_what_depends_on_a_changed_option_is_done_again(
     moved = [Path(shutil.copy(frame, tmp_path / f"moved_{frame.name}")) for frame in frames]
     work.clear()
     rdstitch("calibrate", *moved, "-o", tmp_path / "camera.json", *arguments[-2 - len(FAST) :])
-    assert work == ["_chosen"]  # whose layout does not matter to a lens
+    assert work == ["_lens_and_model"]  # whose layout does not matter to a lens
 
 
 def test_an_image_more_needs_only_its_own(
