@@ -25,7 +25,7 @@ MIN_TILES = 20  # fewer show one flat field as well as another
 LARGEST_ERROR = 0.01  # root mean square, by which two halves of the tiles may differ from their mean
 _PARTS = 4  # of the tiles, by which the error of the dark level is known
 _KNOWN = 3.0  # standard deviations from 0 from which on it is taken out
-_CELLS = 24  # cells along each side of a tile
+_CELLS = 24  # cells along each side of a tile, or one a pixel where it has fewer
 _SIDE = 512  # pixels of the longer side that are enough
 _DEGREE = 4  # degree of the polynomial that the logarithm of the illumination is
 _TRUNCATED = 0.9113  # variance of a standard normal number within 2.5 of its mean
@@ -52,21 +52,22 @@ class _Statistics:
         for tile in tiles:
             factor = max(1, round(max(tile.shape[:2]) / _SIDE))
             small = block_mean(tile, factor).reshape(-(-tile.shape[0] // factor), -(-tile.shape[1] // factor), -1)
-            rows, columns = (max(1, side // _CELLS) for side in small.shape[:2])
             ground.append(np.median(_cells(small.astype(np.float32)), axis=-1))
             mean, noise = _noise(tile.reshape(*tile.shape[:2], -1))
             light.append(mean)
             variance.append(noise)
         self.size = small.shape[:2]
-        self.used = rows * _CELLS, columns * _CELLS
+        self.used = tuple(side - side % min(_CELLS, side) for side in self.size)
         self.ground, self.light, self.variance = (np.array(v, dtype=np.float64) for v in (ground, light, variance))
 
 
 def _cells(plane: NDArray[Any]) -> NDArray[Any]:
-    """The samples of each cell of a plane (h, w, C), (cells, cells, C, n)."""
-    rows, columns = (max(1, side // _CELLS) for side in plane.shape[:2])
-    cut = plane[: rows * _CELLS, : columns * _CELLS].reshape(_CELLS, rows, _CELLS, columns, -1)
-    return cut.transpose(0, 2, 4, 1, 3).reshape(_CELLS, _CELLS, plane.shape[2], -1)
+    """The samples of each cell of a plane (h, w, C), (cells down, cells across, C, n)."""
+    height, width, channels = plane.shape
+    down, across = min(_CELLS, height), min(_CELLS, width)
+    cut = plane[: height - height % down, : width - width % across]
+    parts = cut.reshape(down, height // down, across, width // across, channels)
+    return parts.transpose(0, 2, 4, 1, 3).reshape(down, across, channels, -1)
 
 
 def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
@@ -91,9 +92,10 @@ def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
 
 def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
     """Estimate the flat field and the dark level of tiles."""
-    if count < MIN_TILES:
-        return Illumination(None, math.inf, 0.0, np.zeros(1), np.zeros(1))
     first = read(0)
+    # Second differences in every other row take two rows of three samples.
+    if count < MIN_TILES or first.shape[0] < 2 or first.shape[1] < 3:
+        return Illumination(None, math.inf, 0.0, np.zeros(1), np.zeros(1))
     shown = _Statistics(read(index) for index in range(count))
     channels = shown.ground.shape[3]
     height, width = first.shape[:2]
@@ -116,7 +118,8 @@ def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Il
         halves = [_fitted(ground[k::2] - dark[channel]) for k in (0, 1)]
         gain[..., channel] = np.exp(_surface(whole, x, y))
         gain[..., channel] /= gain[..., channel].mean()
-        cells = [np.exp(_on_cells(coefficients)) for coefficients in (whole, *halves)]
+        down, across = (_middles(cells) for cells in ground.shape[1:])
+        cells = [np.exp(_surface(coefficients, across, down)) for coefficients in (whole, *halves)]
         errors.append(float(np.sqrt(((cells[1] / cells[1].mean() - cells[2] / cells[2].mean()) ** 2).mean())) / 2.0)
         noise.append(float((cells[0] / cells[0].mean()).std()))
     field = FlatField(gain, dark.astype(np.float32)[None, None])
@@ -175,19 +178,16 @@ def _surface(coefficients: FloatArray, x: FloatArray, y: FloatArray) -> FloatArr
     return np.asarray(np.polynomial.polynomial.polygrid2d(y, x, table))
 
 
-def _middles() -> FloatArray:
-    return np.asarray((2.0 * np.arange(_CELLS) + 1.0) / _CELLS - 1.0)
-
-
-def _on_cells(coefficients: FloatArray) -> FloatArray:
-    return _surface(coefficients, _middles(), _middles())
+def _middles(cells: int) -> FloatArray:
+    """Of the cells along a side, from -1 to 1."""
+    return np.asarray((2.0 * np.arange(cells) + 1.0) / cells - 1.0)
 
 
 def _fitted(light: FloatArray) -> FloatArray:
-    """Coefficients of the logarithm of the illumination, from light (N, cells, cells)."""
+    """Coefficients of the logarithm of the illumination, from light (N, cells down, cells across)."""
     logarithm = np.log(np.maximum(light, max(1e-3 * float(np.median(light)), 1e-9)))
     values = [np.median(np.diff(logarithm, axis=axis), axis=0).ravel() for axis in (1, 2)]
-    x, y = np.meshgrid(_middles(), _middles())
+    x, y = np.meshgrid(_middles(light.shape[2]), _middles(light.shape[1]))
     columns = [x**i * y**k for i, k in _powers()]
     matrix = np.stack(
         [np.concatenate([np.diff(c, axis=0).ravel(), np.diff(c, axis=1).ravel()]) for c in columns], axis=1
@@ -205,10 +205,10 @@ def _fitted(light: FloatArray) -> FloatArray:
 def _dark_level(ground: FloatArray, variance: FloatArray) -> float:
     """D of a channel by its photon noise, whose variance is in proportion to the light; 0 where that is not so."""
     mean, noise = ground.ravel(), variance.ravel()
-    order = np.argsort(mean)
-    bins = [part for part in np.array_split(order, min(_BINS, len(order) // _LEAST_IN_BIN)) if len(part)]
-    if len(bins) < _LEAST_BINS:
+    count = min(_BINS, len(mean) // _LEAST_IN_BIN)
+    if count < _LEAST_BINS:
         return 0.0
+    bins = np.array_split(np.argsort(mean), count)
     x = np.array([np.median(mean[part]) for part in bins])
     # Of each bin the lower part: texture, too, is taken for noise.
     y = np.array([np.quantile(noise[part], 0.25) for part in bins])

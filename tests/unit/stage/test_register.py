@@ -40,6 +40,16 @@ def test_shading_of_a_third_is_found_to_a_percent(specimen: Specimen, rows: int,
     assert estimate_illumination(few.render, 2).field is None
 
 
+@pytest.mark.parametrize("part", [np.s_[:40], np.s_[:9], np.s_[:, 200:220]])
+def test_narrow_tiles_show_their_flat_field_too(part: slice | tuple[slice, slice]) -> None:
+    stage = StageGrid(rows=7, columns=7, tile=256, specimen="brightfield", content=0.5, seed=1)
+    shown = estimate_illumination(lambda index: stage.render(index)[part], len(stage))
+    expected = stage.flat_field[part] / stage.flat_field[part].mean(axis=(0, 1))
+    assert shown.field is not None
+    off = shown.field.gain / expected - 1.0
+    assert np.sqrt((off**2).mean()) < 0.01
+
+
 def test_what_is_read_before_the_flat_field_is_known_is_corrected_too(tmp_path: Path) -> None:
     stage = StageGrid(rows=6, columns=6, tile=192, content=0.5, seed=1)
     sources, _ = read_sources(stage.write(tmp_path), skip_bad=False)
@@ -132,7 +142,9 @@ def test_micro_manager_says_it_beside_the_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("matrix", [((0, 1), (1, 0)), ((1, 0), (0, -1)), ((-1, 0), (0, -1))])
-def test_axes_and_overlap_are_those_that_the_tiles_show(matrix: tuple[tuple[int, int], tuple[int, int]]) -> None:
+def test_axes_and_overlap_are_those_that_the_tiles_show(
+    matrix: tuple[tuple[float, float], tuple[float, float]],
+) -> None:
     stage = StageGrid(rows=3, columns=3, tile=256, overlap=0.13, content=0.9, seed=5)
     told = stage.nominal @ np.array(matrix, float) * 0.9
     grid = TileGrid(told - told.min(axis=0), (256, 256))
