@@ -57,20 +57,18 @@ def with_axes_shown(
     """
     axes = [_axis(grid, axis, read, factor) for axis in (0, 1)]
     told = [None if axis is None else axis.step for axis in axes]
-    most, best = 0.0, told
     choices = [[None] if axis is None else [axis.step, *axis.steps(search)] for axis in axes]
-    scores = {}
+
+    def evidence(steps: Sequence[FloatArray | None]) -> float:
+        pairs = zip(axes, steps, strict=True)
+        return sum(axis.evidence(step, search) for axis, step in pairs if axis is not None and step is not None)
+
+    nominal = evidence(told)
+    most, best = nominal, told
     for x in choices[0]:
         for y in choices[1]:
-            if x is not None and y is not None and not _perpendicular(x, y):
-                continue
-            score = sum(
-                a.evidence(s, search) for a, s in zip(axes, (x, y), strict=True) if a is not None and s is not None
-            )
-            scores[id(x), id(y)] = score
-            if score > most:
+            if (x is None or y is None or _perpendicular(x, y)) and (score := evidence((x, y))) > most:
                 most, best = score, [x, y]
-    nominal = scores[id(told[0]), id(told[1])]
     if (
         most < max(_MIN_EVIDENCE, _MIN_RATIO * nominal)
         or best is told
@@ -78,8 +76,10 @@ def with_axes_shown(
     ):
         return grid, ""
     steps = _completed(best, told, axes, search)
-    matrix = np.array([_map(step, known, k) for k, (step, known) in enumerate(zip(steps, told, strict=True))])
-    places = grid.places @ matrix
+    before, after = (
+        np.array([np.eye(2)[k] if step is None else step for k, step in enumerate(pair)]) for pair in (told, steps)
+    )
+    places = grid.places @ np.linalg.solve(before, after)
     turned = replace(grid, places=places - places.min(axis=0))
     return turned, _in_words(steps, told, grid.size)
 
@@ -129,14 +129,6 @@ def _completed(
             across = np.array([-other[1], other[0]]) * float(np.linalg.norm(own) / np.linalg.norm(others))
             completed[k] = across if float(across @ own) >= 0.0 else -across
     return completed
-
-
-def _map(step: FloatArray | None, told: FloatArray | None, axis: int) -> FloatArray:
-    """Where a unit of the nominal places along an axis goes."""
-    if step is None or told is None:
-        unchanged: FloatArray = np.eye(2)[axis]
-        return unchanged
-    return np.asarray(step / float(told[axis]), dtype=np.float64)
 
 
 def _in_words(steps: Sequence[FloatArray | None], told: Sequence[FloatArray | None], size: tuple[int, int]) -> str:

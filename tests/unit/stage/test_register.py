@@ -141,7 +141,7 @@ def test_micro_manager_says_it_beside_the_files(tmp_path: Path) -> None:
         grid_from_tiles(stored_tiles(files), SIZE, None)
 
 
-@pytest.mark.parametrize("matrix", [((0, 1), (1, 0)), ((1, 0), (0, -1)), ((-1, 0), (0, -1))])
+@pytest.mark.parametrize("matrix", [((0, 1), (1, 0)), ((1, 0), (0, -1)), ((-1, 0), (0, -1)), ((1, 0), (0.15, 1))])
 def test_axes_and_overlap_are_those_that_the_tiles_show(
     matrix: tuple[tuple[float, float], tuple[float, float]],
 ) -> None:
