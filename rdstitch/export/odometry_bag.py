@@ -15,7 +15,7 @@ from rdstitch.export.trajectory_files import (
     positions_in_frame,
     ros_covariance,
 )
-from rdstitch.system.outputs import naming
+from rdstitch.system.outputs import naming, replace_folder
 from rdstitch.system.temporary_folder import TemporaryFolder
 
 
@@ -34,11 +34,9 @@ def check_bag(file: Path, *, overwrite: bool) -> None:
 def write_bag_folder(path: Trajectory, folder: Path, frame: TrajectoryFrame) -> None:
     """Write the bag of ROS 2, whole or not at all, in the place of an older one."""
     with naming(folder), TemporaryFolder(folder.parent, ".rdstitch-") as aside:
-        (aside / "new").mkdir()
-        write_bag(path, aside / "new" / folder.name, frame)
-        if folder.exists():
-            folder.rename(aside / "old")
-        (aside / "new" / folder.name).rename(folder)
+        # The files of a bag are named for their folder.
+        write_bag(path, aside / folder.name, frame)
+        replace_folder(aside / folder.name, folder)
 
 
 def write_bag(path: Trajectory, file: Path, frame: TrajectoryFrame) -> None:

@@ -325,18 +325,31 @@ class Outputs:
                 item.staged.replace(item.place)
 
     def _place_folder(self, item: _Item) -> None:
-        """No system call replaces a folder that is not empty: the old one goes aside, and back if this fails."""
-        old = item.staged.with_name(f"old{item.staged.name}")
-        if self._overwrite and item.place.exists():
-            item.place.rename(old)
+        if self._overwrite:
+            replace_folder(item.staged, item.place)
+            return
         try:
             item.staged.rename(item.place)
         except OSError:
-            if old.exists():
-                old.rename(item.place)
-            elif item.place.exists():
+            if item.place.exists():
                 raise _appeared(item.name) from None
             raise
+
+
+def replace_folder(new: Path, place: Path) -> None:
+    """Put a folder in the place of another one, which goes aside, and back if this fails or is interrupted.
+
+    No system call replaces a folder that is not empty.
+    """
+    old = new.with_name(f"old{new.name}")
+    try:
+        if place.exists():
+            place.rename(old)
+        new.rename(place)
+    except BaseException:
+        if old.exists() and not place.exists():
+            old.rename(place)
+        raise
 
 
 def _appeared(name: Path) -> OutputError:

@@ -20,7 +20,7 @@ from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
 from rdstitch.system.file_access import is_url, url_of
-from rdstitch.system.outputs import Outputs, check_output, write_bytes_atomic
+from rdstitch.system.outputs import Outputs, check_output, replace_folder, write_bytes_atomic
 from rdstitch.system.temporary_folder import TemporaryFolder
 from tests.faults import OPERATIONS, Operation, failing_disk
 
@@ -233,6 +233,28 @@ def test_nothing_is_renamed_in_which_a_file_is_open(tmp_path: Path, monkeypatch:
                 (folder / "0" / "0_0.jpg").write_bytes(b"tile")
             outputs.write(tmp_path / "x.dzi", b"description")
     assert {path.name for path in tmp_path.rglob("*")} == {"x_files", "0", "0_0.jpg", "x.dzi"}
+
+
+@pytest.mark.parametrize("interrupted", [0, 1])
+def test_an_interrupt_leaves_the_old_folder_or_the_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interrupted: int
+) -> None:
+    place, new = tmp_path / "a", tmp_path / "new"
+    for folder in (place, new):
+        folder.mkdir()
+        (folder / "content").write_text(folder.name)
+    rename, done = os.rename, []
+
+    def interrupting(source: Path, target: Path) -> None:
+        rename(source, target)
+        done.append(target)
+        if len(done) == interrupted + 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "rename", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        replace_folder(new, place)
+    assert (place / "content").read_text() == ("a", "new")[interrupted]
 
 
 def test_of_two_outputs_in_one_place_neither_is_published(tmp_path: Path) -> None:
