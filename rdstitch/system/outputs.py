@@ -243,7 +243,7 @@ class Outputs:
         Yields where to write the file, or the empty folder.
         """
         name = Path(path)
-        with naming(name):
+        with naming(name), self.together():
             staged = self._stage(name, is_folder=is_folder)
             if is_folder:
                 staged.mkdir()

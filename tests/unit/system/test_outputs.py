@@ -257,6 +257,19 @@ def test_an_interrupt_leaves_the_old_folder_or_the_new_one(
     assert (place / "content").read_text() == ("a", "new")[interrupted]
 
 
+def test_what_a_caught_error_cut_short_is_not_published(tmp_path: Path) -> None:
+    def write_half() -> None:
+        with outputs.writing(tmp_path / "a.txt") as staged:
+            staged.write_text("half")
+            raise ValueError
+
+    with Outputs(overwrite=True) as outputs:
+        with pytest.raises(ValueError):  # noqa: PT011
+            write_half()
+        outputs.write(tmp_path / "b.txt", b"whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["b.txt"]
+
+
 def test_of_two_outputs_in_one_place_neither_is_published(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path)
 
