@@ -309,6 +309,8 @@ def _placed(
     used[usable] = fit.used
     off = np.full(len(names), complex(np.inf))
     off[usable] = fit.left_out
+    if not used.any():
+        return None, f"no scale and direction of the map fit the {source} and the places of the images"
     rms = math.sqrt(float(np.mean(np.abs(off[used]) ** 2)))
     spread = math.sqrt(float(np.mean(np.abs(places[used] - places[used].mean()) ** 2)))
     reason = ""

@@ -205,6 +205,10 @@ def test_positions_that_do_not_fit_are_refused() -> None:
     assert reason == "2 of 8 images have a GPS position, and 3 are needed"
     place, reason = georeference(replace(row, positions=[row.positions[0]] * 8))
     assert (place, reason) == (None, "all images have the same GPS position")
+    in_one_place = replace(row, to_output=np.tile(row.to_output[:1], (8, 1, 1)))
+    place, reason = georeference(in_one_place, force=True)
+    assert place is None
+    assert "no scale and direction of the map fit the GPS positions" in reason
 
 
 @pytest.mark.parametrize(("wrong", "off"), [(GpsPosition(0.0, 1e-9), 5e6), (GpsPosition(50.0027, 8.0004), 300.0)])
