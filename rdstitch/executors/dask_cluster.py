@@ -34,8 +34,10 @@ class DaskExecutor(Executor):
             raise ArgumentError("--scheduler needs Dask: pip install distributed") from error
         self._killed: type[BaseException] = distributed.KilledWorker
         # What matters ends as an exception; a scheduler that goes away would be logged at length.
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        logger = logging.getLogger("distributed")
         self._open = contextlib.ExitStack()
+        self._open.callback(logger.setLevel, logger.level)
+        logger.setLevel(logging.CRITICAL)
         try:
             if address == LOCAL:
                 address = self._open.enter_context(

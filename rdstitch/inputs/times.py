@@ -36,7 +36,7 @@ def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
     the TUM benchmark; or one time a line, the n-th for the n-th image or frame of the video, as KITTI's ``times.txt``.
     Lines that begin with ``#`` are ignored.
     """
-    if file is None:
+    if file is None or not frames:
         return list(frames)
     named = _read_times(file, file_state(file))
     if not isinstance(named, list):

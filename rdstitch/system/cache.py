@@ -38,7 +38,8 @@ _MAX_ENTRY = 2**31  # bytes
 _CAPACITY = 16 * 2**20  # bytes of files whose content is kept in memory
 _PACKAGE = Path(__file__).parents[1]
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
-_PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
+_READERS = ("imagecodecs", "pillow", "pillow-heif", "rawpy", "simplejpeg", "tifffile")
+_PACKAGES = ("numpy", "scipy", *_OPENCV, *_READERS)
 _NUMPY = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
 # What reading damaged bytes raises.
 _DAMAGED = (pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, ImportError, EOFError)

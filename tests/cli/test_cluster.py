@@ -1,6 +1,7 @@
 """``--scheduler``: a Dask cluster gives the same bytes, also when a worker dies; what cannot work is said in a line."""
 
 import json
+import logging
 import subprocess
 import sys
 import time
@@ -118,7 +119,9 @@ def test_a_cluster_is_started_here_and_ended(rdstitch: Run, frames: list[Path], 
 
 def test_what_a_cluster_lacks_is_said(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     arguments = ("mosaic", *frames, "-o", tmp_path / "out.png", *FAST, "--scheduler", "tcp://127.0.0.1:9")
+    level = logging.getLogger("distributed").level
     rdstitch(*arguments, status=2, told="--cache")
     nobody = rdstitch(*arguments, "--cache", tmp_path / "cache", status=2, told="no Dask scheduler")
     assert "tcp://127.0.0.1:9" in nobody.line
+    assert logging.getLogger("distributed").level == level
     assert not (tmp_path / "out.png").exists()

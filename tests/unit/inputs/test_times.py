@@ -21,6 +21,7 @@ def test_one_time_a_line_is_for_each_file_in_order(tmp_path: Path) -> None:
     for count in (4, 6, 80):
         with pytest.raises(InputError, match=f"has {count} times for 5 images"):
             with_times(frames, times(tmp_path, count))
+    assert with_times([], times(tmp_path, 5)) == []
 
 
 @pytest.mark.parametrize(("numbers", "counts"), [((0, 2, 4), (5, 6)), ((0, 1, 2), (3,)), ((0, 3, 4), (5, 9))])
