@@ -126,5 +126,5 @@ def _pair_matches(
     putative = matches.load()
     first = replace(camera.without_lens(), focal=camera.focal, focal_source=camera.focal_source).with_focal()
     known = None if tilt1 is None or tilt2 is None else np.array([tilt1, tilt2])
-    second = first.resized(camera2.image_size)
+    second = replace(first.resized(camera2.image_size), center=camera2.center)
     return PairMatches(putative.points1, putative.points2, first, second, -putative.ratio, known)

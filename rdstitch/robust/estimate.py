@@ -243,11 +243,14 @@ def _result(
     reason = fit.reason
     if not confident:
         reason += "; the search stopped at its limit of samples before it was confident"
-    camera1 = replace(pair.camera1, distortion=fit.distortion, distortion_std=fit.distortion_std)
+    camera1, camera2 = (
+        replace(camera, distortion=fit.distortion, distortion_std=fit.distortion_std)
+        for camera in (pair.camera1, pair.camera2)
+    )
     return RadialHomography(
         homography=fit.homography / np.cbrt(np.linalg.det(fit.homography)),
         camera=camera1,
-        camera2=camera1.resized(pair.camera2.image_size),
+        camera2=camera2,
         inliers=inliers,
         covariance=fit.covariance,
         parameters=("distortion", *fit.model.parameters),

@@ -30,6 +30,11 @@ def _take(values: "FloatArray | SampleArrays", samples: IndexArray) -> "FloatArr
     return values.take(samples) if isinstance(values, SampleArrays) else np.take(values, samples, axis=-1)
 
 
+def sample_count(x1: ArrayLike) -> int:
+    """Number of samples of a batch (B, k, 2), or 1 of one sample (k, 2)."""
+    return int(np.shape(x1)[0]) if np.ndim(x1) == 3 else 1
+
+
 def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int, block_size: int = 4096) -> Solutions:
     """Check a batch of samples, and solve it block by block; ArgumentError when a shape is wrong.
 

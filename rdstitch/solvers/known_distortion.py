@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.solvers.batch import IndexArray, solve_in_blocks
+from rdstitch.solvers.batch import IndexArray, sample_count, solve_in_blocks
 from rdstitch.solvers.homography import Quadrangles
 from rdstitch.solvers.plane import TiltRotations, depths, lens_range, motion_homography, visible_range
 from rdstitch.solvers.solutions import Solutions
@@ -78,7 +78,7 @@ def four_point_dlt(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike) -> Solut
 
 def _motion(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike, tilt: ArrayLike, *, height_free: bool) -> Solutions:
     """Motion in the plane from two points."""
-    rotations = TiltRotations.from_tilt(tilt, np.shape(x1)[0] if np.ndim(x1) else 0)
+    rotations = TiltRotations.from_tilt(tilt, sample_count(x1))
     lam = distortions(distortion, x1)
 
     def solve(points: FloatArray, samples: IndexArray) -> Solutions:
@@ -94,7 +94,7 @@ def _motion(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike, tilt: ArrayLike
 def distortions(distortion: ArrayLike, x1: ArrayLike) -> FloatArray:
     """λ of every sample of a batch, from one for all or one for each."""
     lam = np.asarray(distortion, dtype=np.float64)
-    count = np.shape(x1)[0] if np.ndim(x1) == 3 else 1
+    count = sample_count(x1)
     if lam.shape not in ((), (count,)) or not np.isfinite(lam).all():
         raise ArgumentError(f"distortion must be a finite number or one a sample, not {distortion!r}")
     return np.broadcast_to(lam, (count,))

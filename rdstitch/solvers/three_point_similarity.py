@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.division_model import SOLVED_DISTORTION
-from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
+from rdstitch.solvers.batch import IndexArray, SampleArrays, sample_count, solve_in_blocks
 from rdstitch.solvers.lines import Lines, triangle_determinants
 from rdstitch.solvers.plane import TiltRotations, depths, differences, motion_homography, visible_range
 from rdstitch.solvers.roots import real_roots
@@ -53,7 +53,7 @@ def three_point_similarity(
     ArgumentError
         When a shape is wrong or the range is empty.
     """
-    rotations = TiltRotations.from_tilt(tilt, np.shape(x1)[0] if np.ndim(x1) else 0)
+    rotations = TiltRotations.from_tilt(tilt, sample_count(x1))
 
     def solve(points: FloatArray, samples: IndexArray) -> Solutions:
         tilts = rotations.take(samples)

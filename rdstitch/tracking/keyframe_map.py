@@ -144,10 +144,13 @@ class KeyframeMap:
         first.covariance = np.zeros((4, 4)) if first.covariance is None else first.covariance
         first.aligned, self.state = True, self.state.with_plane()
         for keyframe in self.older:
-            if keyframe.place is not None:
-                keyframe.place = PlaneSimilarity(longer, 0.0).applied(keyframe.place)
+            assert keyframe.place is not None
+            keyframe.place = PlaneSimilarity(longer, 0.0).applied(keyframe.place)
         for keyframe in others:
+            assert keyframe.place is not None
+            about = PlaneSimilarity(longer, 0.0).applied(keyframe.place)
             self.settle(keyframe)
+            keyframe.place = keyframe.place or about  # a keyframe always has one
 
     def revise(self, waiting: set[int] | None = None) -> list[TrackedFrame]:
         """Place the frames between keyframes anew; of all that have a place those that were waiting, None: all."""

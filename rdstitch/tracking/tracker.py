@@ -106,12 +106,13 @@ class Tracker:
         inliers, links = self._follow(frame), list[Link]()
         if not inliers or self._is_new(frame):
             links = links_with_map(frame, self._map, self._match)
-        if not links and not inliers:
+        if links:
+            self._map.settle(frame, links)
+        if frame.place is None:
             return self._predicted(frame) or [self._without_place(frame)]
         self._map.state = self._map.state.placed()
         keyframe = bool(links)
         if links:
-            self._map.settle(frame, links)
             inliers, last = max(map(len, links)), self._map.keyframes[-1].number
             shown = next((link for link in links if link.image1 == last), None)
             if shown is not None and not self._is_new(frame):

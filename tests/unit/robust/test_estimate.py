@@ -77,6 +77,16 @@ def test_a_known_lens_is_kept() -> None:
     assert found.solver in ("two_point_similarity", "four_point_dlt")
 
 
+def test_each_image_keeps_its_distortion_centre() -> None:
+    camera = Camera((640, 480), center=(400.0, 239.5), focal=500.0)
+    points = np.random.default_rng(3).uniform((40.0, 40.0), (600.0, 440.0), (200, 2))
+    turned = np.stack([479.0 - points[:, 1], points[:, 0]], axis=-1)
+    (found,) = estimate_radial_homographies(
+        [PairMatches(points, turned, camera, camera.turned(6))], EstimationOptions()
+    )
+    np.testing.assert_allclose(found.transfer(points), turned, atol=1e-3)
+
+
 def test_too_few_matches_are_no_result_but_a_reason() -> None:
     found = estimate_radial_homography(MATCHES.points1[:5], MATCHES.points2[:5], LENS.image_size)
     assert not found

@@ -203,6 +203,14 @@ def test_wrong_arguments_raise(solver: Case, name: str, values: list[Any]) -> No
             solver.solve(x1, x2, **{name: value})
 
 
+def test_one_sample_has_one_tilt_an_image() -> None:
+    (x1,), (x2,) = samples(CASES[0], batch=1)
+    with pytest.raises(ArgumentError):
+        CASES[0].solve(x1, x2, tilt=np.zeros((len(x1), 2, 2)))
+    same = CASES[0].solve(x1, x2, tilt=np.zeros((1, 2, 2))), CASES[0].solve(x1, x2, tilt=(0.0, 0.0))
+    np.testing.assert_array_equal(*(found.homography for found in same))
+
+
 @pytest.mark.parametrize("case", CASES[:2], ids=lambda case: case.name)
 def test_rigid_solutions_are_planar_motions(case: Case) -> None:
     found = case.solve(*samples(case, batch=20, noise=2e-3))

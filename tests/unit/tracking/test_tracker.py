@@ -244,6 +244,23 @@ def test_a_frame_that_corners_place_is_not_lost_where_they_make_no_link(
     assert len(set(numbers)) == len(numbers)
 
 
+def test_where_no_homography_fits_frames_are_lost_and_keyframes_stay(
+    drive: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracker, images = _tracker(), _frames(drive)
+    for image in images[:12]:
+        tracker.add(image, Camera(SIZE, focal=256.0))
+    assert tracker._known.plane is not None
+    monkeypatch.setattr(
+        "rdstitch.tracking.keyframe_map.fitted_homography",
+        lambda *given: (None, np.zeros(len(given[2]), dtype=np.bool_)),
+    )
+    later = [tracker.add(image, Camera(SIZE, focal=256.0))[-1] for image in images[12:14]]
+    assert [result.placement for result in later] == [None, None]
+    tracker._map.place_anew(1.1)
+    assert all(keyframe.place is not None for keyframe in tracker._map.keyframes)
+
+
 def test_a_cut_is_no_motion(video: tuple[Sequence, list[NDArray[np.uint8]]]) -> None:
     _, images = video
     flow, first = CornerFlow(), prepare(View(images[0]), None)
