@@ -207,8 +207,8 @@ def test_one_sample_has_one_tilt_an_image() -> None:
     (x1,), (x2,) = samples(CASES[0], batch=1)
     with pytest.raises(ArgumentError):
         CASES[0].solve(x1, x2, tilt=np.zeros((len(x1), 2, 2)))
-    same = CASES[0].solve(x1, x2, tilt=np.zeros((1, 2, 2))), CASES[0].solve(x1, x2, tilt=(0.0, 0.0))
-    np.testing.assert_array_equal(*(found.homography for found in same))
+    one, same = (CASES[0].solve(x1, x2, tilt=tilt) for tilt in (np.zeros((1, 2, 2)), (0.0, 0.0)))
+    np.testing.assert_array_equal(one.homography, same.homography)
 
 
 @pytest.mark.parametrize("case", CASES[:2], ids=lambda case: case.name)
