@@ -97,7 +97,9 @@ def stitch_options(reporter: Reporter, given: Mapping[str, Any], **more: Any) ->
     """The library's options from a command's flags."""
     _check_written([given["camera"]])
     if given.get("preview"):
-        quick = {"max_size": 1200, "seam": "voronoi", "max_features": 1500, "work_megapixels": 0.5}
+        quick = {"seam": "voronoi", "max_features": 1500, "work_megapixels": 0.5}
+        if not (is_given("like") or is_given("extent")):
+            quick["max_size"] = 1200  # they say the size too
         given = {**given, **{name: value for name, value in quick.items() if not is_given(name)}}
     more |= {
         "camera": read_lens(given["camera"], reporter),

@@ -78,7 +78,7 @@ class CompositeTables:
         In the order of those that the tables were made for, (H, W) or (H, W, C), each of the size of its camera. Of
         other bands than these, exposure is left as it is.
         """
-        self._check(images)
+        self.check(images)
         first = images[0]
         channels = 1 if first.ndim == 2 else first.shape[2]
         corrected = channels == self._shares[0].factors.shape[2]
@@ -100,7 +100,7 @@ class CompositeTables:
         done = cv2.subtract(total, 0.0, dtype=DEPTHS[first.dtype.name])  # type: ignore[call-overload]
         return np.asarray(done).reshape(height, width, *first.shape[2:])
 
-    def _check(self, images: Sequence[NDArray[Any]]) -> None:
+    def check(self, images: Sequence[NDArray[Any]]) -> None:
         """Refuse images that the tables are not for."""
         if len(images) != len(self._sizes):
             raise ArgumentError(f"expected {len(self._sizes)} images, not {len(images)}")

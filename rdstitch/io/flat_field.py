@@ -48,11 +48,12 @@ def read_flat_field(file: str | Path, size: tuple[int, int], channels: int) -> F
     check_readable(path)
     read: Callable[[Any], NDArray[np.float32]] = lambda page: np.asarray(page.asarray(), dtype=np.float32)  # noqa: E731
     with decoding(path), tifffile.TiffFile(path) as tiff:
-        pages = [read(page) for page in tiff.pages[:2]]
-    if any(page.shape[:2] != size[::-1] for page in pages):
-        raise InputError(
-            f"{file}: has {pages[0].shape[1]} x {pages[0].shape[0]} pixels, but the tiles {size[0]} x {size[1]}"
-        )
+        every = [page.aspage() for page in tiff.pages]
+        pages = [read(page) for page in [page for page in every if not (page.is_reduced or page.is_mask)][:2]]
+    for number, page in enumerate(pages, 1):
+        if page.shape[:2] != size[::-1]:
+            has = f"page {number} has {page.shape[1]} x {page.shape[0]} pixels"
+            raise InputError(f"{file}: {has}, but the tiles {size[0]} x {size[1]}")
     planes = [page.reshape(*page.shape[:2], -1) for page in pages]
     if any(plane.shape[2] not in (1, channels) for plane in planes):
         raise InputError(f"{file}: has {planes[0].shape[2]} channels, but the tiles {channels}")

@@ -24,8 +24,10 @@ def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[
     if size[0] * size[1] > _OVERVIEW_FROM and suffix in (".tif", ".tiff"):
         with tifffile.TiffFile(path) as file:
             levels = file.series[0].levels
-            enough = [level for level in levels if max(level.shape[:2]) >= side]
-            return np.asarray((enough or levels)[-1 if enough else 0].asarray()), None
+            enough = [level for level in levels if max(level.sizes["height"], level.sizes["width"]) >= side]
+            level = (enough or levels)[-1 if enough else 0]
+            pixels = level.asarray()
+            return (np.moveaxis(pixels, 0, -1) if level.axes == "CYX" else pixels), None
     if suffix in (".jpg", ".jpeg"):
         # Of any size: none of it is decoded larger than needed.
         with JpegImagePlugin.JpegImageFile(path) as jpeg:

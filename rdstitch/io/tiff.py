@@ -7,6 +7,7 @@ describes the pages comes first, then the pixels, smallest overview first, so th
 that part. While an image is being made nobody knows where its parts will lie: compressed tiles are copied afterwards.
 """
 
+import hashlib
 import struct
 import tempfile
 import uuid
@@ -332,16 +333,17 @@ def write_ome_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_t
                     predictor=_has_predictor(spec.dtype),
                     subifds=None if number else len(levels) - 1,
                     subfiletype=1 if number else 0,
-                    metadata=None if number else _ome_metadata(spec, apart=apart),
+                    metadata=None if number else _ome_metadata(spec, pixels, apart=apart),
                     software="rdstitch",
                     iccprofile=None if number else spec.metadata.icc_profile or None,
                     extratags=[] if number else [*_copied_tags(spec.metadata), *extra_tags],
                 )
 
 
-def _ome_metadata(spec: ImageSpec, *, apart: bool) -> dict[str, Any]:
+def _ome_metadata(spec: ImageSpec, pixels: NDArray[Any], *, apart: bool) -> dict[str, Any]:
     """What OME-XML says of the image, whose channels are pages where they are ``apart``."""
-    identity = uuid.uuid5(uuid.NAMESPACE_OID, f"rdstitch {spec.size} {spec.channels} {spec.dtype}")
+    samples = hashlib.sha256(pixels.data).hexdigest()
+    identity = uuid.uuid5(uuid.NAMESPACE_OID, f"rdstitch {spec.size} {spec.channels} {spec.dtype} {samples}")
     content: dict[str, Any] = {"axes": "CYX" if apart else "YXS", "UUID": f"urn:uuid:{identity}"}
     if spec.metadata.pixel_size is not None:
         for axis in "XY":

@@ -36,7 +36,7 @@ from rdstitch.results.messages import left_out as left_out_message
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
 from rdstitch.sidecar.records import VERSION, Applied, ImageRecord
-from rdstitch.sidecar.write import output_record, seams_record, to_output, versions
+from rdstitch.sidecar.write import displacement_record, output_record, seams_record, taken_fields, to_output, versions
 from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 from rdstitch.system.opencv_state import one_opencv_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
@@ -126,14 +126,17 @@ def _image(result: Recomposition, index: int) -> ImageRecord:
         gone = {"used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
         return replace_fields(image, **lens, **gone, lambda2=UNSET)
     to_plane = result.placed.homographies[sum(earlier is not None for earlier in result.sources[:index])]
+    field, size = image.displacement_field(), source.camera.image_size
     return replace_fields(
         image,
         name=source.name,
         path=str(source.path),
-        size=source.camera.image_size,
+        size=size,
         to_plane=to_plane.tolist(),
         to_output=to_output(result.canvas, to_plane),
+        displacement=displacement_record(None if field is None else field.resized(size)),
         lambda2=UNSET,
+        **taken_fields(source),
         **lens_fields(source.camera),
     )
 

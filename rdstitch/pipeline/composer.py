@@ -76,8 +76,10 @@ class Composer:
         ArgumentError
             When number, size or kind of the images is another.
         """
+        given = [np.asarray(image) for image in images]
+        self._tables.check(given)
         return to_channel_order(
-            self._tables.compose([to_channel_order(np.asarray(image), self._order) for image in images]), self._order
+            self._tables.compose([to_channel_order(image, self._order) for image in given]), self._order
         )
 
 

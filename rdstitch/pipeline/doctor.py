@@ -10,7 +10,7 @@ import numpy as np
 
 from rdstitch.choices import ChannelOrder
 from rdstitch.compositing import CompositePlan
-from rdstitch.errors import InputError, RegistrationError
+from rdstitch.errors import InputError, LimitError, RegistrationError
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import points_over
 from rdstitch.inputs.find import found_images
@@ -202,7 +202,7 @@ def _dry_run(
         plan, registration = result.plan, result.registration
     except RefusedError as refused:
         plan, registration = None, refused.registration
-    except RegistrationError as error:
+    except (RegistrationError, LimitError) as error:
         return None, None, (Message(str(error)),)
     problems = merge_by_reason((*registration.failures, *registration.warnings, *registration.left_out))
     return plan, registration, tuple(problems)

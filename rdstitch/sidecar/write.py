@@ -114,7 +114,7 @@ def _images(result: StitchResult) -> list[ImageRecord]:
                 registration.keypoints[index],
                 to_plane=_plain(homography) if used else None,
                 to_output=to_output(result.canvas, homography) if used else None,
-                displacement=_displacement(next(fields, None) if used else None),
+                displacement=displacement_record(next(fields, None) if used else None),
                 pose=_pose(registration, index) if used else None,
                 **taken_fields(source),
                 **lens_fields(alignment.cameras[index]),
@@ -226,7 +226,7 @@ def _stage(registration: Registration) -> StageRecord | None:
     )
 
 
-def _displacement(field: DisplacementField | None) -> Displacement | None:
+def displacement_record(field: DisplacementField | None) -> Displacement | None:
     if field is None:
         return None
     rows, columns, _ = field.values.shape

@@ -60,6 +60,22 @@ def test_local_alignment_is_applied_again(rdstitch: Run, frames: list[Path], tmp
     assert "images[0].displacement: expected" in refused.err
 
 
+def test_an_image_of_another_size_brings_its_own_displacement_time_and_place(
+    rdstitch: Run, frames: list[Path], tmp_path: Path
+) -> None:
+    small, twice = tmp_path / "small.png", tmp_path / "twice.png"
+    rdstitch("mosaic", *frames, "-o", small, "--local-alignment", "5", *CACHED)
+    content = sidecar_of(small)
+    for image in content["images"]:
+        image |= {"timestamp": 1.0, "gps": [47.0, 8.0, None]}  # of the images that were registered, not of these
+    _sidecar(small).write_text(json.dumps(content), encoding="utf-8")
+    large = _written(frames, tmp_path / "large", [frame.name for frame in frames], factor=2.0)
+    _apply(rdstitch, _sidecar(small), large, twice)
+    for then, now in zip(content["images"], sidecar_of(twice)["images"], strict=True):
+        np.testing.assert_allclose(now["displacement"]["px"], 2.0 * np.array(then["displacement"]["px"]))
+        assert (now["timestamp"], now["gps"]) == (None, None)
+
+
 def test_given_options_win_over_the_sidecar(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     changed, direct = tmp_path / "changed.png", tmp_path / "direct.png"
     options = ("--scale", "0.4", "--rotate", "0", "--blend", "feather")

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
+from rdstitch.errors import LimitError
+from rdstitch.pipeline import doctor
 from rdstitch.pipeline.doctor import examine
 from tests.cli.running import Run
 
@@ -77,3 +79,12 @@ def test_arrays(frames: list[Path], single: bool) -> None:
     found = examine(images[0] if single else images, channel_order="rgb")
     assert found.images == (1 if single else 3)
     assert ("needs two images" in " ".join(found.advice)) == single
+
+
+def test_what_cannot_be_laid_out_is_an_advice(frames: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    def too_large(*_arguments: object, **_options: object) -> None:
+        raise LimitError("the horizon is in the image")
+
+    monkeypatch.setattr(doctor, "mosaic", too_large)
+    found = doctor.examine(frames)
+    assert (found.plan, found.advice) == (None, ("the horizon is in the image",))

@@ -17,7 +17,7 @@ from PIL import Image
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.seam_quality import SeamQuality
-from rdstitch.io import preview
+from rdstitch.io import Metadata, preview, write_image
 from rdstitch.io.opening import MAX_IMAGE_GB
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline import accept
@@ -190,6 +190,13 @@ def test_overviews_are_read(rdstitch: Run, frames: list[Path], tmp_path: Path, m
     height = min(len(whole), len(overview))
     assert abs(len(whole) - len(overview)) <= 1
     assert np.abs(overview[:height].astype(float) - whole[:height]).mean() < 12.0
+
+
+def test_the_overview_of_channels_on_pages_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(preview, "_OVERVIEW_FROM", 0)
+    file, size = tmp_path / "channels.ome.tif", (1600, 400)
+    write_image(file, np.zeros((400, 1600, 2), np.uint8), metadata=Metadata(size, channels=2, planes=True))
+    assert preview.read_preview(file, size, 700)[0].shape == (200, 800, 2)
 
 
 def _decoded(address: str | None) -> NDArray[np.uint8]:

@@ -62,6 +62,23 @@ def test_preview_is_small_and_leaves_what_is_given(rdstitch: Run, frames: list[P
     assert 190 <= max(read_image(tmp_path / "small.png").pixels.shape[:2]) <= 200
 
 
+def test_a_preview_may_have_its_size_from_elsewhere(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    area = ("--extent", "0,0,100,100")
+    # As without --preview: what is wrong is that these images have no place on the map.
+    rdstitch(
+        "pano",
+        *frames,
+        "-o",
+        tmp_path / "a.png",
+        "--preview",
+        *area,
+        "-j",
+        "1",
+        status=2,
+        told="extent needs GPS positions",
+    )
+
+
 def test_quality_makes_files_smaller(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     sizes = []
     for quality in ("95", "40"):

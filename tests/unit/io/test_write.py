@@ -1,6 +1,7 @@
 """Writing images: whole or not at all, the same bytes for the same image, nothing lost."""
 
 import itertools
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -87,12 +88,21 @@ def test_strips_do_not_matter(tmp_path_factory: pytest.TempPathFactory, suffix: 
         np.testing.assert_array_equal(a.pixels, b.pixels)
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "ome.tif", "webp"])
 def test_same_bytes_twice(tmp_path: Path, suffix: str) -> None:
     pixels = _image(700, 400, 3, np.uint8)
     for name in ("a", "b"):
         write_image(tmp_path / f"{name}.{suffix}", pixels)
     assert (tmp_path / f"a.{suffix}").read_bytes() == (tmp_path / f"b.{suffix}").read_bytes()
+
+
+def test_other_images_have_another_identity(tmp_path: Path) -> None:
+    identities = set()
+    for grey in (0, 1):
+        write_image(tmp_path / "a.ome.tif", np.full((30, 40), grey, np.uint8))
+        with tifffile.TiffFile(tmp_path / "a.ome.tif") as tiff:
+            identities |= set(re.findall('UUID="([^"]+)"', str(tiff.ome_metadata)))
+    assert len(identities) == 2
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "ome.tif", "webp"])

@@ -13,6 +13,7 @@ from examples.worlds.stage_grid import Specimen, StageGrid
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.source import read_sources
+from rdstitch.io import write_image
 from rdstitch.io.flat_field import FlatField, read_flat_field
 from rdstitch.io.stored_tiles import stored_tiles
 from rdstitch.pipeline.read_inputs import with_flat_field
@@ -72,6 +73,15 @@ def test_the_dark_level_stays_and_files_hold_both(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.corrected(measured), field.corrected(measured))
     with pytest.raises(InputError, match="4 x 3"):
         read_flat_field(file, (5, 3), 1)
+
+
+def test_overviews_and_masks_of_a_flat_field_are_no_dark_fields(tmp_path: Path) -> None:
+    pixels, holed = np.full((600, 800), 100, np.uint8), np.full((600, 800), 255, np.uint8)
+    holed[0, 0] = 0
+    for alpha in (None, holed):
+        write_image(tmp_path / "flat.tif", pixels, alpha)
+        field = read_flat_field(tmp_path / "flat.tif", (800, 600), 1)
+        assert (field.gain.shape, field.dark.tolist()) == ((600, 800, 1), [[[0.0]]])
 
 
 SIZE = (100, 80)
