@@ -168,14 +168,17 @@ class BundleAdjuster:
         first errors decides.
         """
         squared = self.squared(start)
-        sigma, damping, parameters, used = self._sigma(squared), _FIRST_DAMPING, start, 0
+        half_diagonal = float(np.median(self.observations.scale2))  # of errors from which a descent may find back
+        sigma = min(self.observations.sigma(squared), half_diagonal)
+        damping, parameters, used = _FIRST_DAMPING, start, 0
         wide = max(self._rough_width(squared) if rough else 0.0, ALIGNMENT_WIDTH * sigma)
         while True:
             last = wide <= ALIGNMENT_WIDTH * sigma * 1.05
             descent = self._descend(parameters, sigma, wide, damping, 12 if last else 4)
             parameters, damping, used = descent.parameters, descent.damping, used + descent.iterations
             squared, previous = squared_lengths(descent.errors), sigma
-            scatter, sigma = self.observations.sigma(squared), self._sigma(squared)
+            scatter = self.observations.sigma(squared)
+            sigma = min(scatter, half_diagonal)
             wide = max(wide / 3.0, ALIGNMENT_WIDTH * sigma)
             settled = abs(sigma - previous) <= 0.02 * previous and np.isfinite(scatter)
             converged = bool(last and descent.converged and settled)
@@ -259,10 +262,6 @@ class BundleAdjuster:
         medians = self.observations.medians(np.sqrt(squared))
         most = 1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95))
         return min(most, WIDEST_START * float(np.median(self.observations.scale2)))
-
-    def _sigma(self, squared: FloatArray) -> float:
-        """Standard deviation of an error's coordinate, or half a diagonal, from which a descent may find back."""
-        return min(self.observations.sigma(squared), float(np.median(self.observations.scale2)))
 
     def weight(self, sigma: float) -> float:
         """Of squared errors of this scatter: one over their variance, as far as they are independent."""
