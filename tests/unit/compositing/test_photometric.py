@@ -47,11 +47,11 @@ def test_of_images_in_two_places_each_keeps_few_neighbours_and_the_places_stay_c
     assert ((pairs[:, 0] >= 60) & (pairs[:, 1] < 60)).any()
 
 
-def _row(count: int) -> tuple[Survey, list[PlacedImage]]:
-    """Tiny images side by side, each half over the next, and by turns darker and brighter."""
-    lens = Camera((32, 24), distortion=0.0, focal=32.0)
-    frames = [np.full((24, 32, 3), 100 + 20 * (k % 2), dtype=np.uint8) for k in range(count)]
-    step = 16 / lens.scale
+def _row(count: int, width: int = 32) -> tuple[Survey, list[PlacedImage]]:
+    """Images side by side, tiny or so wide, each half over the next, and by turns darker and brighter."""
+    lens = Camera((width, 3 * width // 4), distortion=0.0, focal=float(width))
+    frames = [np.full((3 * width // 4, width, 3), 100 + 20 * (k % 2), dtype=np.uint8) for k in range(count)]
+    step = width / 2 / lens.scale
     places = np.array([[[1, 0, k * step], [0, 1, 0], [0, 0, 1]] for k in range(count)], dtype=np.float64)
     cameras = [lens] * count
     images = place_images([partial(as_image, frame) for frame in frames], cameras, places)
@@ -67,6 +67,14 @@ def test_what_is_compared_is_linear_in_the_number_of_images() -> None:
     exposure = gain_compensation.estimate_exposure(survey, images)
     means = exposure.log_gain.mean(axis=1)
     assert (means[1::2] > means[::2]).all()
+
+
+@pytest.mark.parametrize("width", [64, 640])
+def test_cells_are_spread_over_the_overlap_of_images_of_any_size(width: int) -> None:
+    cells = compare_overlaps(_row(2, width)[0])
+    first, second = cells.points
+    np.testing.assert_allclose(np.abs(first - second), np.tile([width / 2, 0.0], (len(first), 1)), atol=1e-6)
+    np.testing.assert_array_less(0.75 * np.array([width / 2, 3 * width / 4]), np.ptp(first, axis=0))
 
 
 def test_gains_of_thousands_of_overlaps_take_a_few_cells_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
