@@ -84,9 +84,14 @@ def compare_overlaps(survey: Survey) -> Cells | None:
         shares[index] = np.count_nonzero(seen) / min(areas[i], areas[j])
         side = max(2, round(max(*a.inside.shape, *b.inside.shape) / _CELLS))
         step = max(1, side // _SAMPLES)
+        compared: list[tuple[NDArray[Any], NDArray[Any]]] = [
+            (light[i], light[j]),
+            (grey[i], grey[j]),
+            (a.pixels, b.pixels),
+        ]
         lit, (p, q), colours = (
             [cut(values, tile.box, box)[::step, ::step] for values, tile in zip(both, (a, b), strict=True)]
-            for both in ((light[i], light[j]), (grey[i], grey[j]), (a.pixels, b.pixels))
+            for both in compared
         )
         burnt = np.stack([each > 1 for each in lit] + [each > 2 for each in lit], axis=-1)
         moments = np.stack([p, q, p * p, q * q, p * q], axis=-1)
