@@ -81,7 +81,7 @@ class _Shown(NamedTuple):
 
     @classmethod
     def of(cls, tile: SurveyTile) -> Self:
-        return cls(tile, _light(tile), _grey(tile.pixels), np.count_nonzero(tile.inside))
+        return cls(tile, _light(tile), _grey(tile.pixels), int(np.count_nonzero(tile.inside)))
 
 
 def compare_overlaps(survey: Survey) -> Cells | None:
