@@ -71,14 +71,11 @@ def write_report(
     OutputError
         When the file cannot be written.
     """
-    if outputs is None:
-        with Outputs(overwrite=True) as alone:
-            write_report(path, result, stages, command, outputs=alone)
-        return
     output = result.output if isinstance(result, StitchResult) else None
-    page = report_page(result, stages, command, None if output is None else outputs.staged(output))
-    # Names of files need not be UTF-8.
-    outputs.write(path, page.encode("utf-8", "backslashreplace"))
+    with Outputs.or_own(outputs) as staging:
+        page = report_page(result, stages, command, None if output is None else staging.staged(output))
+        # Names of files need not be UTF-8.
+        staging.write(path, page.encode("utf-8", "backslashreplace"))
 
 
 def report_page(
