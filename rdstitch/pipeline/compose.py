@@ -28,7 +28,8 @@ from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.projection import PLANE
 from rdstitch.compositing.tiles import Block, BlockRunner, OutputStrip
 from rdstitch.executors import in_order
-from rdstitch.export.georeference import Georeference, has_place, world_file_paths
+from rdstitch.export.georeference import Georeference, world_file_paths
+from rdstitch.export.place_on_map import has_place
 from rdstitch.inputs.input_guard import GuardState
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space

@@ -196,7 +196,9 @@ def place(result: StitchResult) -> str:
         return ""
     residuals = sorted(placed.residuals, key=lambda residual: -residual.off)[:_MAX_ROWS]
     rows = [(r.name, f"{r.east:+.3f}", f"{r.north:+.3f}", "" if r.used else "not used") for r in residuals]
-    explanation = f"{placed.summary}. Where the output has them less where they were measured to be, the largest first:"
+    explanation = (
+        f"{map_summary(placed)}. Where the output has them less where they were measured to be, the largest first:"
+    )
     return section("Place on the Earth", explanation, table([("", "east, m", "north, m", ""), *rows]))
 
 
