@@ -6,8 +6,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.inputs.find import READABLE_SUFFIXES
 from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.image_folders import READABLE_SUFFIXES
 from rdstitch.inputs.source import Source
 from rdstitch.io.mask import mask_frame
 from rdstitch.system.file_access import canonical_name
