@@ -11,7 +11,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import tilt_from_normal, turned_tilt
-from rdstitch.inputs.delays import DELAYS
+from rdstitch.inputs.delays import DELAYS, MeasuredTilt
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, by_image, csv_rows
 from rdstitch.inputs.times import timestamps_of
@@ -54,7 +54,7 @@ def _of_images(sources: Sequence[Source]) -> list[Source]:
                 "give a CSV file if that is wrong"
             )
         psi, theta = tilt_from_normal(nadir).tolist()
-        measured.append(replace(source, attitude=(psi, theta)))
+        measured.append(replace(source, attitude=MeasuredTilt((psi, theta))))
     if lacking:
         raise InputError(
             f"{shortened(lacking)}: no attitude of the camera can be read from the XMP; give a CSV file instead"
@@ -66,9 +66,9 @@ def _of_table(source: Source, file: str | Path) -> Source:
     """A source with (ψ, θ), radians, of its line, or of its time, and then at delays too."""
     table, turn = _read_attitudes(file), turning_matrix(source.metadata.orientation)
     if not len(table.times):
-        return replace(source, attitude=turned_tilt(table.of(source, file), turn))
+        return replace(source, attitude=MeasuredTilt(turned_tilt(table.of(source, file), turn)))
     tilts = [turned_tilt((psi, theta), turn) for psi, theta in table.at(table.time_of(source, file) + DELAYS).tolist()]
-    return replace(source, attitude=tilts[len(DELAYS) // 2], attitude_by_delay=np.array(tilts))
+    return replace(source, attitude=MeasuredTilt(tilts[len(DELAYS) // 2], np.array(tilts)))
 
 
 @dataclass(frozen=True, eq=False)

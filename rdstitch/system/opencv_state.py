@@ -4,7 +4,7 @@ import selectors
 import sys
 import threading
 from collections.abc import Iterator
-from concurrent.futures.thread import _worker  # type: ignore[attr-defined]
+from concurrent.futures.thread import _worker
 from contextlib import contextmanager
 from typing import Any
 

@@ -24,6 +24,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import Metadata, write_image
 from rdstitch.io import read as reading
+from rdstitch.io.mask import Mask
 from rdstitch.io.read import DecodedImage, read_image
 from tests.videos import write_video
 
@@ -170,7 +171,7 @@ def test_masks_are_kept_apart(source: Source, tmp_path: Path) -> None:
     mask[:600] = 0
     write_image(tmp_path / "mask.png", mask)
     shelved = replace(source, decoded_images=DecodedImageCache())
-    masked = replace(shelved, mask=tmp_path / "mask.png")
+    masked = replace(shelved, mask=Mask(tmp_path / "mask.png"))
     assert shelved.read(2, keep=True).alpha is None
     alpha = masked.read(4, keep=True).alpha
     np.testing.assert_array_equal(alpha, np.repeat([0, 255], [150, 100])[:, None].repeat(375, axis=1))
