@@ -1,9 +1,9 @@
 """The part of an oblique image that is drawn: that which is not much coarser than the reference image.
 
 A plane seen obliquely gets coarser towards the horizon, along the line of sight with the square of the distance. The
-distance is one over the third coordinate of ``G p``, undistorted points p of the image mapped to the plane; so a limit on the stretch is, in
-undistorted coordinates, a straight line parallel to the horizon. What the lens itself stretches, towards the corners
-of a wide-angle image, does not count.
+distance is one over the third coordinate of ``G p``, undistorted points p of the image mapped to the plane; so a limit
+on the stretch is, in undistorted coordinates, a straight line parallel to the horizon. What the lens itself stretches,
+towards the corners of a wide-angle image, does not count.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,7 @@
-"""What is transparent in an image: filled before it is resampled, and weighted less towards it when blended; some rows at a time."""
+"""What is transparent in an image: filled before it is resampled, and weighted less towards it when blended.
+
+All is computed some rows at a time.
+"""
 
 from collections.abc import Iterator
 from typing import Any
