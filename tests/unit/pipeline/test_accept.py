@@ -19,8 +19,9 @@ from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.accept import _without, accept
+from rdstitch.pipeline.accept import accept
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, reselect_inliers, select_by_whole_lens
+from rdstitch.pipeline.realign import without
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.pipeline.register import register
 from rdstitch.results.messages import Message, left_out
@@ -49,7 +50,7 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
         alignment=replace(found.alignment, links=links, used=found.alignment.used & [False, True, True]),
         messages=(left_out(frames[0], "contradicts"),),
     )
-    rest = _without(spoiled, {(2,): Message("shows something else")}, Aligner.of(sources, OPTIONS, NO_CACHE))
+    rest = without(spoiled, {(2,): Message("shows something else")}, Aligner.of(sources, OPTIONS, NO_CACHE))
     assert rest.alignment.used.tolist() == [True, True, False]
     assert [str(message) for message in rest.left_out] == [f"left out {frames[2]}: shows something else [left-out]"]
 
