@@ -28,9 +28,9 @@ def aligner_of(registration: Registration, options: StitchOptions, purpose: Purp
 
 
 def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Alignment], bool]) -> Registration | None:
-    """The pairs of a registration aligned by another aligner; None where a draft does not fit, or is not wanted."""
+    """The images that are used aligned by another aligner; None where a draft does not fit, or is not wanted."""
     try:
-        draft = aligner.draft(registration.pairs)
+        draft = aligner.draft(_between_used(registration))
         if draft.alignment.rms > limit("error of rough ground") * aligner.threshold or not wanted(draft.alignment):
             return None
         return _aligned_anew(registration, aligner.completed(draft), aligner, {})
@@ -50,7 +50,7 @@ def plane_of_most(registration: Registration, aligner: Aligner) -> Registration 
 
 
 def by_second_motions(registration: Registration, chosen: Iterable[Pair], aligner: Aligner) -> Registration | None:
-    """Some pairs of images, and their copies, by what most of the matches agree on that their motion does not explain.
+    """The images that are used; some pairs, and their copies, by a motion of the matches that their own leaves over.
 
     Where a scene has two surfaces, matches may say as much for one as for the other. None without a second motion.
     """
@@ -60,12 +60,19 @@ def by_second_motions(registration: Registration, chosen: Iterable[Pair], aligne
         return frozenset(copies.get(k, k) for k in pair)
 
     wanted = {originals(pair) for pair in chosen}
-    pairs = [pair for pair in registration.pairs if pair.relation and originals(pair.images) in wanted]
+    used = _between_used(registration)
+    pairs = [pair for pair in used if pair.relation and originals(pair.images) in wanted]
     motions = second_motions(registration.alignment.cameras, pairs, aligner.threshold)
     if not motions:
         return None
-    changed = [replace(pair, relation=motions.get(pair.images, pair.relation)) for pair in registration.pairs]
+    changed = [replace(pair, relation=motions.get(pair.images, pair.relation)) for pair in used]
     return _with_pairs(registration, changed, aligner)
+
+
+def _between_used(registration: Registration) -> list[PairRegistration]:
+    """The pairs of images that are used: what was left out stays out."""
+    used = registration.alignment.used
+    return [pair for pair in registration.pairs if used[pair.image1] and used[pair.image2]]
 
 
 def _with_pairs(registration: Registration, pairs: Sequence[PairRegistration], aligner: Aligner) -> Registration | None:
