@@ -15,14 +15,14 @@ from rdstitch.alignment.adjustment_problem import (
 )
 from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.build_result import AdjustedImages, GivenImages, build_alignment
-from rdstitch.alignment.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
-from rdstitch.alignment.lens_selection import LensChoice, choose_lens, left_coherence, with_third_coefficient
+from rdstitch.alignment.least_squares.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjustmentResult
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.priors import CameraPriors
+from rdstitch.alignment.lens.lens_selection import LensChoice, choose_lens, left_coherence, with_third_coefficient
 from rdstitch.alignment.map_priors import adjust_to_map
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, independent_errors
-from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import CameraPriors
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
@@ -34,6 +34,7 @@ from rdstitch.geometry.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTIO
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link, in_alternate_directions
+from rdstitch.results.messages import Message
 from rdstitch.robust.posterior import LENS
 
 # Side of an image, beside that of the largest, below which it was reduced, and must not set the scale of the output.
@@ -215,21 +216,23 @@ def _checked_focal(adjusted: AdjustedImages, given: AlignmentOptions) -> Adjuste
     if adjusted.covariance is None or not is_strained(adjusted.whole.camera_priors, adjusted.choice.fit):
         return adjusted
     task = adjusted.given
-    cameras = [replace(camera, focal=None, focal_std=None, focal_source=None).with_focal() for camera in task.cameras]
+    cameras = [camera.without_focal().with_focal() for camera in task.cameras]
     # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
     only_tilt = task.options.attitudes is None and task.options.tilt is not None
     options = replace(task.options, tilt=None) if only_tilt else task.options
-    without = GivenImages(cameras, task.links, options)
+
+    def by_themselves(options: AlignmentOptions) -> tuple[AdjustedImages, Message | None]:
+        free = _adjusted(_lens_and_model(GivenImages(cameras, task.links, options)))
+        return free, check_focal(task.cameras[free.images[0]], free.choice.fit, free.covariance)
+
     try:
-        free = _adjusted(_lens_and_model(without))
-        doubt = check_focal(task.cameras[free.images[0]], free.choice.fit, free.covariance)
-        if doubt is None:
-            return adjusted
-        if options is not given:  # what seemed to be wrong may have been so with the wrong focal length only
-            free = _adjusted(_lens_and_model(replace(without, options=given)))
+        free, contradiction = by_themselves(options)
+        # What seemed to be wrong may have been so with the wrong focal length only.
+        if contradiction is not None and options is not given:
+            free, contradiction = by_themselves(given)
     except (RegistrationError, ImpossibleCameraError, np.linalg.LinAlgError):
         return adjusted  # by themselves the images determine nothing
-    return replace(free, messages=(*free.messages, doubt))
+    return adjusted if contradiction is None else replace(free, messages=(*free.messages, contradiction))
 
 
 def most_matches_read(links: int, options: AlignmentOptions) -> int | None:
