@@ -19,20 +19,22 @@ from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import timestamps_of, with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty
+from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.along_odometry import along_odometry, with_odometry_of_bag
-from rdstitch.pipeline.choose_layout import LaidOut, choose_layout
+from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import blocks_on, check_world_files, compose_images, viewed_images, write_page
+from rdstitch.pipeline.lay_out import LaidOut
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.output_plan import check_run, report_refused, stage_beside
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag
+from rdstitch.pipeline.realign import aligner_of
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_not_read, check_outputs, json_bytes, text_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent
 from rdstitch.verification.verdict import RefusedError
@@ -42,7 +44,7 @@ _NO_TIMES = Message(
 )
 
 
-@one_opencv_thread()
+@one_native_thread()
 def pano(
     inputs: Images,
     output: str | Path | None = None,
@@ -89,7 +91,7 @@ def pano(
     return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, StageTimer(progress), Purpose.PANO))
 
 
-@one_opencv_thread()
+@one_native_thread()
 def mosaic(
     inputs: Images,
     output: str | Path | None = None,
@@ -168,7 +170,7 @@ def stitch_found(listed: FoundImages, run: Run, outputs: Outputs, further: Seque
         return compose_registration(chosen, run, outputs, executor)
 
 
-@one_opencv_thread()
+@one_native_thread()
 def calibrate(
     inputs: Images,
     options: StitchOptions | None = None,
@@ -208,7 +210,7 @@ def calibrate(
         return result.with_messages(stage_beside(run, outputs, result))
 
 
-@one_opencv_thread()
+@one_native_thread()
 def trajectory(
     inputs: Images,
     output: str | Path | None = None,

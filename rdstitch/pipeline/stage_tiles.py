@@ -24,8 +24,8 @@ from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
-from rdstitch.pipeline.choose_layout import lay_out
 from rdstitch.pipeline.compose import check_world_files
+from rdstitch.pipeline.lay_out import lay_out
 from rdstitch.pipeline.output_plan import check_run
 from rdstitch.pipeline.read_inputs import NO_FLAT_FIELD, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
@@ -43,14 +43,14 @@ from rdstitch.stage.positions import Scan, grid_from_arrays, grid_from_names, gr
 from rdstitch.stage.register_tiles import TileRegistration, register_tiles
 from rdstitch.stage.tile_frames import tile_frames
 from rdstitch.stage.tile_inputs import as_tiles
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent
 
 _COMPARED = 32  # overlaps by which a flat field is judged
 
 
-@one_opencv_thread()
+@one_native_thread()
 def tiles(
     inputs: Images | Iterable[Any],
     output: str | Path | None = None,
@@ -105,7 +105,7 @@ def _stitch_options(options: TileOptions) -> StitchOptions:
     )
 
 
-@one_opencv_thread()
+@one_native_thread()
 def place_tiles(
     inputs: Images | Iterable[Any],
     positions_file: str | Path | None = None,
