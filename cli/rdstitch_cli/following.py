@@ -18,7 +18,7 @@ from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
-    from rdstitch.pipeline.follow import FollowedPoses
+    from rdstitch.pipeline.pose import FollowedPoses
     from rdstitch.results.registration import Registration
 
 FOLLOWING = flags(

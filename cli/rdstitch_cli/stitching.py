@@ -23,7 +23,7 @@ from rdstitch_cli.terminal import Reporter
 if TYPE_CHECKING:
     from rdstitch.compositing import CompositePlan
     from rdstitch.geometry.camera import Camera
-    from rdstitch.pipeline.apply_sidecar import Recomposition
+    from rdstitch.pipeline.recomposition import Recomposition
     from rdstitch.results.registration import Registration
     from rdstitch.results.stitch_result import StitchResult
 

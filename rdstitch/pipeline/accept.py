@@ -10,8 +10,10 @@ from rdstitch.alignment.result import Alignment, LinkFit, links_by_image
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.choices import Purpose
 from rdstitch.errors import PartialResultError, RegistrationError
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
+from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason, names_of
 from rdstitch.results.registration import Registration
@@ -30,13 +32,14 @@ Offenders = Mapping[tuple[int, ...], Message]
 
 
 @impossible_estimates_fail()
-def accept(registration: Registration, options: StitchOptions, purpose: Purpose = Purpose.MOSAIC) -> Registration:
+def accept(registration: Registration, run: Run) -> Registration:
     """The registration of what passes all checks, with everything that the user should know of it.
 
     The registration comes and goes in pixels of the working size.
     """
+    options, purpose = run.options, run.purpose
     aligner = aligner_of(registration, options, purpose)
-    undamaged = None if options.force else _without_damage(registration, aligner)
+    undamaged = None if options.force else _without_damage(registration, aligner, run.guard)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None
 
@@ -81,6 +84,12 @@ def aligner_of(registration: Registration, options: StitchOptions, purpose: Purp
     return replace(aligner, needs_poses=purpose.poses)
 
 
+def with_reference_of(registration: Registration, run: Run) -> Registration:
+    """The pairs of a registration aligned anew, in the frame of the reference image that the options name."""
+    aligner = aligner_of(registration, run.options, run.purpose)
+    return _aligned_anew(registration, aligner.align(registration.pairs), aligner.paths, {})
+
+
 def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Alignment], bool]) -> Registration | None:
     """The pairs of a registration aligned by another aligner; None where a draft does not fit, or is not wanted."""
     try:
@@ -92,15 +101,14 @@ def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Al
         return None
 
 
-def _without_damage(registration: Registration, aligner: Aligner) -> Registration | None:
+def _without_damage(registration: Registration, aligner: Aligner, guard: InputGuard) -> Registration | None:
     """Without images of damaged files; None where none is used, or too few others are left.
 
     Flipped bits shift a part of an image: by a few pixels, that looks as if the camera had tilted, and all tilt then;
     by more, as if something moved.
     """
     used = registration.alignment.used
-    known = registration.sources[0].guard.damaged  # all have one guard
-    damaged = [k for k, source in enumerate(registration.sources) if source.path in known and used[k]]
+    damaged = [k for k, source in enumerate(registration.sources) if source.path in guard.damaged and used[k]]
     if not damaged:
         return None
     reason = Message("is damaged, and all others fit better without it; copy it again from its source")

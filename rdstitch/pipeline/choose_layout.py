@@ -112,7 +112,7 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         if local is None:
             local = align_registration_locally(whole, options.local_alignment, edges, options.threads)
         one = lay_out(whole, local, options.composite)
-        return one if options.dry_run else replace(one, layout=one.layout.decided(options.composite, options.threads))
+        return one if options.dry_run else replace(one, layout=one.layout.decided(options.compositing))
 
     failed: RdstitchError | None = None
     tried: list[LaidOut] = []

@@ -84,7 +84,8 @@ def tiles(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = replace(options or TileOptions(), **fields)
-    run = Run(_stitch_options(options), output, beside, StageTimer(progress))
+    guard = InputGuard(options.strict)
+    run = Run(_stitch_options(options), output, beside, StageTimer(progress), guard=guard)
     with found_images(as_tiles(inputs), output=output, topic=options.topic) as listed:
         registration, tiled = _registered(listed, run, options, positions_file)
         with Outputs(options.overwrite) as outputs, run.executor(len(registration.sources)) as executor:
@@ -125,7 +126,7 @@ def place_tiles(
     """
     options = replace(options or TileOptions(), **fields)
     with found_images(as_tiles(inputs), topic=options.topic) as listed:
-        run = Run(_stitch_options(options), progress=StageTimer(progress))
+        run = Run(_stitch_options(options), progress=StageTimer(progress), guard=InputGuard(options.strict))
         registration, tiled = _registered(listed, run, options, positions_file)
     with Outputs(options.overwrite) as outputs:
         _write_beside(outputs, positions_file, options, registration, tiled)
@@ -144,10 +145,9 @@ def _registered(
         [frame.name for frame in listed.frames],
         others=[Path(file) for file in (positions_file, options.save_flat_field) if file is not None],
     )
-    guard = InputGuard(options.strict)
     frames, stored, notes = tile_frames(listed.frames, options.z, options.time)
     limit = options.composite.max_memory
-    sources, unread = read_sources(frames, skip_bad=not options.strict, guard=guard, max_memory=limit)
+    sources, unread = read_sources(frames, skip_bad=not options.strict, guard=run.guard, max_memory=limit)
     check_world_files([] if run.output is None else [run.output], sources, options.overwrite)
     sources, odd = _of_one_kind(sources, options.strict)
     unread += odd

@@ -19,7 +19,7 @@ from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
-    from rdstitch.pipeline.apply_sidecar import Recomposition
+    from rdstitch.pipeline.recomposition import Recomposition
     from rdstitch.results.stitch_result import StitchResult
 
 

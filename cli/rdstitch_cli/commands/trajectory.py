@@ -67,7 +67,7 @@ def trajectory(
     """
     from rdstitch.export.trajectory_files import frame_of
     from rdstitch.pipeline.along_odometry import with_odometry_of_bag
-    from rdstitch.pipeline.follow import FollowedPoses
+    from rdstitch.pipeline.pose import FollowedPoses
     from rdstitch.pipeline.recipes import trajectory as recipe
 
     with ExitStack() as stack:

@@ -11,7 +11,8 @@ from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.io import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.choose_layout import _is_stretched
-from rdstitch.pipeline.compose import Layout, seam_messages
+from rdstitch.pipeline.compose import Layout
+from rdstitch.pipeline.compose_messages import seam_messages
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recipes import mosaic, pano
 from rdstitch.synthetic.textures import ground
