@@ -34,6 +34,7 @@ class Option:
     none: str = ""  # the word for None on the command line
     default: str = ""  # what help pages say of the default, where its value says too little
     entered: Any = None  # the type on the command line, where that of the field is another one
+    writes: bool = False  # whether it names a file or folder that is written
     command_line: bool = True
 
     def allows(self, number: float) -> bool:

@@ -130,7 +130,7 @@ class StitchOptions(RansacOptions):
     overwrite: Overwrite = False
     strict: Strict = False
     force: bool = option(False, "Write the result even when it fails its own checks.")
-    save_camera: Path | None = option(None, "Write the estimated camera.", "FILE")
+    save_camera: Path | None = option(None, "Write the estimated camera.", "FILE", writes=True)
     camera_format: CameraFormat = option(
         "auto",
         "Format of the camera file written. auto: by its name, .json (rdstitch), .yml (OpenCV), .fisheye.yml, "

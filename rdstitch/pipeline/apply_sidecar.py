@@ -54,7 +54,7 @@ _GEOMETRY = (
 
 @one_opencv_thread()
 def apply(
-    sidecar: str | Path,
+    sidecar: str | Path | SavedRegistration,
     images: Images,
     output: str | Path | None = None,
     composite: CompositeOptions | None = None,
@@ -67,7 +67,7 @@ def apply(
 
     Parameters
     ----------
-    sidecar : path
+    sidecar : path or SavedRegistration
         What :func:`rdstitch.pano` or :func:`rdstitch.mosaic` wrote beside its image.
     images : path, ndarray, or iterable of them
         The same images, or others that were taken by the same lens from the same places: other bands, other sizes of
@@ -94,7 +94,7 @@ def apply(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = replace(options or ApplyOptions(), **fields)
-    saved = read_sidecar(sidecar)
+    saved = sidecar if isinstance(sidecar, SavedRegistration) else read_sidecar(sidecar)
     mismatch = mismatch_with_image(saved)
     if options.strict and mismatch:
         raise InputError(mismatch)
@@ -106,7 +106,7 @@ def apply(
         Outputs(options.overwrite) as outputs,
     ):
         if output is not None:
-            check_outputs(image_files(check_suffix(output)), options.overwrite, [*listed.files, sidecar])
+            check_outputs(image_files(check_suffix(output)), options.overwrite, [*listed.files, saved.path])
         result = apply_found(saved, listed, output, composite or saved.composite, options, outputs, progress)
     return replace(result, messages=(*([Message(mismatch)] if mismatch else []), *result.messages))
 

@@ -34,6 +34,16 @@ from rdstitch.system.outputs import Outputs, check_outputs
 from rdstitch.system.progress import Progress, StageTimer, silent
 
 
+def parse_bands(text: str) -> dict[str, str]:
+    """Patterns of images by the names of bands, of ``NIR=*_NIR.TIF,RED=*_RED.TIF``."""
+    pairs = [part.partition("=") for part in text.split(",")]
+    bands = {name.strip(): pattern.strip() for name, _, pattern in pairs}
+    complete = len(bands) == len(pairs) > 1 and all(bands) and all(bands.values())
+    if not complete or {"/", "\\"} & set("".join(bands)):
+        raise ArgumentError(f"--bands: {text!r} is not a list like NIR=*_NIR.TIF,RED=*_RED.TIF")
+    return bands
+
+
 @one_opencv_thread()
 def mosaic_bands(
     inputs: Images,

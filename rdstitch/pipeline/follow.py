@@ -3,7 +3,7 @@
 import math
 import sys
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -47,7 +47,7 @@ def follow(
     comes_again: Callable[[Frame], bool] = lambda frame: False,
     preview: Path | None = None,
     refresh: float = 5.0,
-) -> Iterator[Pose]:
+) -> Generator[Pose]:
     """Register frames as they arrive, against the last keyframes.
 
     Poses are for watching: loops are closed, and every pair is used, only when all frames are registered together
