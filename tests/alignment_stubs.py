@@ -4,10 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, FreeParameters, Parameters
+from rdstitch.alignment.least_squares.bundle_adjustment import (
+    BundleAdjuster,
+    BundleAdjustmentResult,
+    FreeParameters,
+    Parameters,
+)
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import HOMOGRAPHY
-from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import FloatArray
 
 SCALE = 500.0

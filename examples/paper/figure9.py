@@ -14,10 +14,15 @@ from examples.paper.common.drives import PATHS, Drive, drive, estimated_links
 from examples.paper.common.plain_ransac import all_solvers, best_of
 from examples.paper.common.report import Report, Settings, Table
 from rdstitch.alignment import align
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, FreeParameters, Parameters
+from rdstitch.alignment.least_squares.bundle_adjustment import (
+    BundleAdjuster,
+    BundleAdjustmentResult,
+    FreeParameters,
+    Parameters,
+)
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import RIGID, YAW, X, Y
-from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Priors
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray

@@ -7,8 +7,8 @@ from scipy.spatial import KDTree
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, SIMILARITY, THETA, TILTING, YAW, X, Y
-from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography

@@ -2,7 +2,7 @@
 
 from rdstitch.alignment.align import AlignmentTask, align, most_matches_read
 from rdstitch.alignment.alignment_options import AlignmentOptions
-from rdstitch.alignment.lens_selection import LENSES
+from rdstitch.alignment.lens.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment
 from rdstitch.matching.links import Link

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rdstitch.alignment.bundle_adjustment import (
+from rdstitch.alignment.least_squares.bundle_adjustment import (
     MIN_GAIN,
     ROUGH_GAIN,
     WIDEST_START,
@@ -17,12 +17,12 @@ from rdstitch.alignment.bundle_adjustment import (
     FreeParameters,
     Parameters,
 )
-from rdstitch.alignment.link_equations import split_lens, squared_lengths, whitened_errors
+from rdstitch.alignment.least_squares.link_equations import split_lens, squared_lengths, whitened_errors
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, SIMILARITY, THETA, MotionModel, PlanarModel
 from rdstitch.alignment.noise import shared_variance
-from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import RadialHomography, inverses, transfer

@@ -15,14 +15,14 @@ from rdstitch.alignment.adjustment_problem import (
 )
 from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.build_result import AdjustedImages, GivenImages, build_alignment
-from rdstitch.alignment.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
-from rdstitch.alignment.lens_selection import LensChoice, choose_lens, left_coherence, with_third_coefficient
+from rdstitch.alignment.least_squares.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjustmentResult
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.priors import CameraPriors
+from rdstitch.alignment.lens.lens_selection import LensChoice, choose_lens, left_coherence, with_third_coefficient
 from rdstitch.alignment.map_priors import adjust_to_map
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, independent_errors
-from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import CameraPriors
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model

@@ -7,10 +7,10 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.alignment.lens_selection import LENSES
+from rdstitch.alignment.least_squares.plane_marks import ControlPoints, Sighting
+from rdstitch.alignment.least_squares.priors import CameraPriors, known_focal
+from rdstitch.alignment.lens.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
-from rdstitch.alignment.plane_marks import ControlPoints, Sighting
-from rdstitch.alignment.priors import CameraPriors, known_focal
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError

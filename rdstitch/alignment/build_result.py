@@ -8,10 +8,10 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
-from rdstitch.alignment.lens_description import radius_std
-from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
-from rdstitch.alignment.level_frame import levelled
-from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
+from rdstitch.alignment.frames.level_frame import levelled
+from rdstitch.alignment.least_squares.link_equations import squared_lengths, whitened_errors
+from rdstitch.alignment.lens.lens_description import radius_std
+from rdstitch.alignment.lens.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise import coherence, judge_relief
 from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, Unused

@@ -7,9 +7,9 @@ be the identity, within what the links' covariances allow. After it, by the erro
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
-from rdstitch.alignment.link_equations import split_lens
-from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
+from rdstitch.alignment.least_squares.link_equations import split_lens
+from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import are_homographies, inverses, transfer_jacobian
 from rdstitch.matching.links import spread_choice

@@ -14,8 +14,8 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
+from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA, PlanarModel
-from rdstitch.alignment.priors import CameraPriors
 from rdstitch.alignment.select import select_model
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.camera import Camera

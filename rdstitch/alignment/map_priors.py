@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster
+from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster
+from rdstitch.alignment.least_squares.plane_marks import PlaneMarks
+from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.motion_models import PlanarModel, X, Y
-from rdstitch.alignment.plane_marks import PlaneMarks
-from rdstitch.alignment.priors import CameraPriors
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.posterior import MODEL_ERROR

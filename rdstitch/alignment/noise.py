@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.alignment.cycle_consistency import misfitting_links
-from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
-from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.least_squares.link_equations import squared_lengths, whitened_errors
+from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.nearest_points import nearest_points

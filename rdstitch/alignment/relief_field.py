@@ -15,9 +15,9 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
-from rdstitch.alignment.linear_response import Fields, LinearResponse
-from rdstitch.alignment.link_equations import LinearizedErrors, split_lens
+from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
+from rdstitch.alignment.least_squares.linear_response import Fields, LinearResponse
+from rdstitch.alignment.least_squares.link_equations import LinearizedErrors, split_lens
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y
 from rdstitch.alignment.noise import apart, neighbours
 from rdstitch.arrays import FloatArray, IntArray

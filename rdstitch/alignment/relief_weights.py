@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.lens_selection import left_coherence
-from rdstitch.alignment.link_equations import linearized_errors
+from rdstitch.alignment.least_squares.link_equations import linearized_errors
+from rdstitch.alignment.lens.lens_selection import left_coherence
 from rdstitch.alignment.motion_models import SIMILARITY, TILTING, PlanarModel
 from rdstitch.alignment.noise import independent_errors, judge_relief
 from rdstitch.alignment.relief_field import Parallax

@@ -110,7 +110,7 @@ class Alignment:
     tilt_spread : float
         Standard deviation of the single images' tilts, radians; 0 where the model has none.
     lens : str
-        The lens that was found, a key of :data:`rdstitch.alignment.lens_selection.LENSES`.
+        The lens that was found, a key of :data:`rdstitch.alignment.lens.lens_selection.LENSES`.
     lens_reason : str
         Why that one.
     parameters : tuple of str

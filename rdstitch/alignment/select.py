@@ -15,9 +15,9 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
-from rdstitch.alignment.lens_selection import NO_COHERENCE, left_coherence
-from rdstitch.alignment.link_equations import split_lens, whitened_errors
+from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
+from rdstitch.alignment.least_squares.link_equations import split_lens, whitened_errors
+from rdstitch.alignment.lens.lens_selection import NO_COHERENCE, left_coherence
 from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.alignment.noise import evidence_of
 from rdstitch.arrays import BoolArray, FloatArray

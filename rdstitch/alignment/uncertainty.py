@@ -16,11 +16,15 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, inverse_information
-from rdstitch.alignment.linear_response import LinearResponse
+from rdstitch.alignment.least_squares.bundle_adjustment import (
+    BundleAdjuster,
+    BundleAdjustmentResult,
+    inverse_information,
+)
+from rdstitch.alignment.least_squares.linear_response import LinearResponse
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.plane_marks import PlaneMarks
 from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, YAW, PlanarModel, X, Y
-from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.plane_marks import PlaneMarks
 from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.select import Posterior
 from rdstitch.arrays import FloatArray, IntArray

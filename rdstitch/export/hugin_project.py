@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from rdstitch.alignment.quarter_turns import QuarterTurns
+from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.camera_files.polynomials import HEAD, hugin_lens, image_line

@@ -9,9 +9,9 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
-from rdstitch.alignment.cut_outs import common_size, cut_alignment, framed_camera, framed_link
-from rdstitch.alignment.plane_marks import Sighting
-from rdstitch.alignment.quarter_turns import QuarterTurns
+from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
+from rdstitch.alignment.frames.quarter_turns import QuarterTurns
+from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError

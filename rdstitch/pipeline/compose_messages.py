@@ -35,8 +35,11 @@ def cut_away_messages(placed: PlacedImages, canvas: Canvas, options: CompositeOp
 
 
 def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
-    """Where seams are broken, a warning where a person sees it, else a detail; and whether overlaps are unlike."""
-    if seams.contradicted and seams.least_alike is not None:
+    """Where seams are broken, a warning where a person sees it, else a detail; of overlaps that are unlike, one warning
+    where no seams hold that say otherwise.
+    """
+    hold = len(seams.places) and not seams.seen
+    if seams.contradicted and not hold and seams.least_alike is not None:
         images = tuple(paths[k] for k in seams.least_alike)
         text = (
             f"only {seams.alike:.0%} of what the images share looks alike, the least between "

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 
 from rdstitch.alignment import Alignment
-from rdstitch.alignment.reference_frame import frontal_reference, in_frame_of
+from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.choices import Purpose
 from rdstitch.features import LightGlue, Matcher, match

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rdstitch.alignment.lens_description import describe_lens, radius_std
+from rdstitch.alignment.lens.lens_description import describe_lens, radius_std
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.distortion_consensus import Consensus, vote

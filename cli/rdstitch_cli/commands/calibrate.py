@@ -49,7 +49,7 @@ def calibrate(
     --camera: the lens as given, the focal length within its standard deviation; for the tilt, which belongs to how the
     camera was mounted, use --tilt.
     """
-    from rdstitch.alignment.lens_description import describe_camera
+    from rdstitch.alignment.lens.lens_description import describe_camera
     from rdstitch.camera_files import export_note
     from rdstitch.geometry.camera_record import camera_json
     from rdstitch.pipeline.recipes import calibrate as recipe

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rdstitch.alignment.block_cholesky import Elimination
+from rdstitch.alignment.least_squares.block_cholesky import Elimination
 from rdstitch.arrays import IntArray
 
 _SIZE = 3

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from examples.worlds.alignment_scenes import Scene, grid, jittered, scene
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
-from rdstitch.alignment.link_equations import link_equations, squared_lengths, trial_errors
+from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
+from rdstitch.alignment.least_squares.link_equations import link_equations, squared_lengths, trial_errors
+from rdstitch.alignment.least_squares.normal_equations import SparseNormalEquations, chain
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, MotionModel
-from rdstitch.alignment.normal_equations import SparseNormalEquations, chain
-from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Priors
 from rdstitch.geometry.radial_homography import transfer_jacobian
 from rdstitch.robust.loss import robust_cost, robust_weight, sigma_of
 

@@ -7,7 +7,7 @@ import pytest
 
 from examples.worlds.alignment_scenes import Scene, grid, scene
 from rdstitch.alignment import AlignmentOptions, align
-from rdstitch.alignment.cut_outs import common_size, cut_alignment, framed_camera, framed_link
+from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import Link
 

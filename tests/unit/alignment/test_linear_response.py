@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 
 from examples.worlds.alignment_scenes import grid, scene
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult, FreeParameters, Parameters
-from rdstitch.alignment.linear_response import LinearResponse
-from rdstitch.alignment.link_equations import LinearizedErrors, whitened_errors
+from rdstitch.alignment.least_squares.bundle_adjustment import (
+    BundleAdjuster,
+    BundleAdjustmentResult,
+    FreeParameters,
+    Parameters,
+)
+from rdstitch.alignment.least_squares.linear_response import LinearResponse
+from rdstitch.alignment.least_squares.link_equations import LinearizedErrors, whitened_errors
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import MODELS, MotionModel
-from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.radial_homography import inverses, project
 from rdstitch.robust.posterior import Prior

@@ -6,8 +6,8 @@ import numpy as np
 
 from examples.worlds.alignment_scenes import Scene, grid, jittered, scene
 from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.alignment.least_squares.plane_marks import PlaneMarks, Sighting
 from rdstitch.alignment.motion_models import TILTING, X, Y
-from rdstitch.alignment.plane_marks import PlaneMarks, Sighting
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rdstitch.alignment.link_equations import squared_lengths
+from rdstitch.alignment.least_squares.link_equations import squared_lengths
+from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of, judge_relief, shared_variance
 from rdstitch.alignment.noise import independent_errors as independent
-from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import FloatArray
 from rdstitch.robust.posterior import MODEL_ERROR
 from tests.alignment_stubs import SHIFT, independent_errors, observations

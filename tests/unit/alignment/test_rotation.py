@@ -8,10 +8,10 @@ import pytest
 from examples.worlds.alignment_scenes import aligned, scene
 from examples.worlds.turns import camera_rotations, panorama_rotations
 from rdstitch.alignment import Alignment, align
-from rdstitch.alignment.level_frame import level_frame
+from rdstitch.alignment.frames.level_frame import level_frame
+from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.motion_models import POSE, PSI, X
 from rdstitch.alignment.motion_models.rotation import ROTATION, rotation_from_vector
-from rdstitch.alignment.reference_frame import frontal_reference, in_frame_of
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import nearest_rotation

@@ -7,11 +7,11 @@ import pytest
 
 from examples.worlds.alignment_scenes import aligned, grid, scene
 from examples.worlds.lens_scenes import SIZE, lens_scene
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
+from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.noise import shared_variance
-from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Priors
 from rdstitch.alignment.uncertainty import sandwich_covariances
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import LENS_STD, Camera

@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.link_equations import (
+from rdstitch.alignment.least_squares.link_equations import (
     LinkEquations,
     folds,
     link_equations,
@@ -18,10 +18,10 @@ from rdstitch.alignment.link_equations import (
     trial_errors,
     whitened_errors,
 )
+from rdstitch.alignment.least_squares.normal_equations import ImageEquations, SparseNormalEquations, chain
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel
-from rdstitch.alignment.normal_equations import ImageEquations, SparseNormalEquations, chain
-from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.priors import Priors
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain

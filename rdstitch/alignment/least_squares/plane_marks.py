@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.link_equations import split_lens
+from rdstitch.alignment.least_squares.link_equations import split_lens
 from rdstitch.alignment.motion_models import ModelMatrices
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from rdstitch.alignment.lens_selection import CENTER
+from rdstitch.alignment.lens.lens_selection import CENTER
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera

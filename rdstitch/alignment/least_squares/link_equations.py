@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.division_model import is_one_to_one
 from rdstitch.geometry.radial_homography import (

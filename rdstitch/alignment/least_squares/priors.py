@@ -9,8 +9,8 @@ from typing import Self
 
 import numpy as np
 
+from rdstitch.alignment.least_squares.plane_marks import ControlPoints, PlaneMarks
 from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, PlanarModel, X, Y
-from rdstitch.alignment.plane_marks import ControlPoints, PlaneMarks
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.robust.posterior import LENS, TILT, Prior, exact, focal_prior

@@ -11,10 +11,10 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.block_cholesky import BlockCholesky, Elimination
-from rdstitch.alignment.link_equations import LinkEquations
+from rdstitch.alignment.least_squares.block_cholesky import BlockCholesky, Elimination
+from rdstitch.alignment.least_squares.link_equations import LinkEquations
+from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.motion_models import ModelMatrices
-from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.system.late_imports import sparse

@@ -11,9 +11,9 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
-from rdstitch.alignment.link_equations import LinearizedErrors, linearized_errors
-from rdstitch.alignment.normal_equations import SparseNormalEquations, link_derivatives
+from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
+from rdstitch.alignment.least_squares.link_equations import LinearizedErrors, linearized_errors
+from rdstitch.alignment.least_squares.normal_equations import SparseNormalEquations, link_derivatives
 from rdstitch.arrays import FloatArray
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_slope, robust_weight
 

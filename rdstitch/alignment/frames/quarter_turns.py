@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.alignment.level_frame import levelled
+from rdstitch.alignment.frames.level_frame import levelled
 from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera

@@ -1,0 +1,1 @@
+"""Which lens the images show, and what is said of it."""
