@@ -11,6 +11,12 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
+def read_only(array: FloatArray) -> FloatArray:
+    """The array itself, which from now on cannot be written to: one that a cache gives to everybody."""
+    array.setflags(write=False)
+    return array
+
+
 def evenly_spaced(count: int, most: int) -> IntArray:
     """So many of ``count`` indices at most, evenly from the first to the last."""
     return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.intp))

@@ -35,7 +35,7 @@ _DISTORTION_STD = 0.01
 
 @dataclass(frozen=True)
 class DrawnMatches:
-    """Matches of the images of a sequence; it stands for :class:`rdstitch.matching.two_view_rounds.Pairing`."""
+    """Matches of the images of a sequence; it stands for :class:`rdstitch.matching.pair_estimator.PairEstimator`."""
 
     sequence: Sequence
     store: Cache = field(default_factory=Cache.for_this_run)

@@ -30,8 +30,8 @@ from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import DecodedImage, Metadata
 from rdstitch.io.write import write_image
+from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline.aligner import Aligner, draft_with_loops
 from rdstitch.pipeline.placed_images import align_registration_locally
 from rdstitch.pipeline.working_size import at_full_size
@@ -126,7 +126,7 @@ def aligned_by_drawn(
     sources = read_sources(frames, skip_bad=False)[0]
     options = options.for_images(count)
     aligner = Aligner.of(sources, options, Cache())
-    aligned = draft_with_loops(aligner, cast(Pairing, matches), pairs, matches.pairs)
+    aligned = draft_with_loops(aligner, cast(PairEstimator, matches), pairs, matches.pairs)
     note("closing loops", 1, 1)
     aligned = aligner.completed(aligned)
     note("aligning", 1, 1)

@@ -34,6 +34,7 @@ from rdstitch.geometry.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTIO
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link, in_alternate_directions
+from rdstitch.results.messages import Message
 from rdstitch.robust.posterior import LENS
 
 # Side of an image, beside that of the largest, below which it was reduced, and must not set the scale of the output.
@@ -215,21 +216,23 @@ def _checked_focal(adjusted: AdjustedImages, given: AlignmentOptions) -> Adjuste
     if adjusted.covariance is None or not is_strained(adjusted.whole.camera_priors, adjusted.choice.fit):
         return adjusted
     task = adjusted.given
-    cameras = [replace(camera, focal=None, focal_std=None, focal_source=None).with_focal() for camera in task.cameras]
+    cameras = [camera.without_focal().with_focal() for camera in task.cameras]
     # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
     only_tilt = task.options.attitudes is None and task.options.tilt is not None
     options = replace(task.options, tilt=None) if only_tilt else task.options
-    without = GivenImages(cameras, task.links, options)
+
+    def by_themselves(options: AlignmentOptions) -> tuple[AdjustedImages, Message | None]:
+        free = _adjusted(_lens_and_model(GivenImages(cameras, task.links, options)))
+        return free, check_focal(task.cameras[free.images[0]], free.choice.fit, free.covariance)
+
     try:
-        free = _adjusted(_lens_and_model(without))
-        doubt = check_focal(task.cameras[free.images[0]], free.choice.fit, free.covariance)
-        if doubt is None:
-            return adjusted
-        if options is not given:  # what seemed to be wrong may have been so with the wrong focal length only
-            free = _adjusted(_lens_and_model(replace(without, options=given)))
+        free, contradiction = by_themselves(options)
+        # What seemed to be wrong may have been so with the wrong focal length only.
+        if contradiction is not None and options is not given:
+            free, contradiction = by_themselves(given)
     except (RegistrationError, ImpossibleCameraError, np.linalg.LinAlgError):
         return adjusted  # by themselves the images determine nothing
-    return replace(free, messages=(*free.messages, doubt))
+    return adjusted if contradiction is None else replace(free, messages=(*free.messages, contradiction))
 
 
 def most_matches_read(links: int, options: AlignmentOptions) -> int | None:

@@ -21,6 +21,7 @@ from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, DELAYS, at_delay, smooth
 from rdstitch.results.messages import Message
+from rdstitch.robust.posterior import WRONG_GIVEN_FOCAL
 
 _MAX_IMAGES = 60
 """That are compared: evenly chosen ones of more say as well which signs are right."""
@@ -115,10 +116,26 @@ def check_focal(given: Camera, fit: Fit, covariance: FloatArray | None) -> Messa
         return None
     place = fit.model.shared_names.index("log_focal")
     focal, std = fit.model.focal(fit.adjusted.parameters.shared) * given.scale, math.sqrt(covariance[place, place])
-    odds = math.log(focal / given.focal) ** 2 / (2.0 * (std**2 + given.focal_log_std**2))
-    if odds < _LOG_ODDS:
-        return None
-    return focal_contradicted(given.focal, focal, std)
+    _, contradicted = judged_focal(given.focal_log_std, math.log(focal / given.focal), std)
+    return focal_contradicted(given.focal, focal, std) if contradicted else None
+
+
+def judged_focal(stated_std: float, shown: float, shown_std: float) -> tuple[float, bool]:
+    """Root mean square error of the logarithm of a given focal length, and whether the images contradict it.
+
+    It is right within ``stated_std``, or wrong by anything (:data:`WRONG_GIVEN_FOCAL`); the images show one that is
+    ``shown`` longer, as a logarithm, with a standard deviation that is inf where they show none.
+    """
+    share, far = WRONG_GIVEN_FOCAL
+    logs, squares = [], []
+    for weight, std in ((1.0 - share, stated_std), (share, far)):
+        spread = std**2 + shown_std**2
+        gain = std**2 / spread if math.isfinite(spread) else 0.0
+        logs.append(math.log(weight) - (0.5 * (math.log(spread) + shown**2 / spread) if gain else 0.0))
+        squares.append((gain * shown) ** 2 + (1.0 - gain) * std**2)
+    log_odds = logs[1] - logs[0]
+    wrong = 1.0 / (1.0 + math.exp(min(-log_odds, 700.0)))
+    return math.sqrt((1.0 - wrong) * squares[0] + wrong * squares[1]), log_odds > _LOG_ODDS
 
 
 def focal_contradicted(given: float, shown: float, log_std: float) -> Message:

@@ -42,11 +42,15 @@ def match(
     ``block_bytes``; the result is the same for any, and for any number of threads.
     """
     limit = check_ratio(ratio)
-    if features1.kind != features2.kind:
-        raise ArgumentError(f"features of different kinds do not match: {features1.kind} and {features2.kind}")
+    _check_kinds(features1, features2)
     pairs, ratios = mutual_nearest(features1, features2, block_bytes, limit)
     order = np.lexsort((pairs[:, 1], pairs[:, 0], ratios))
     return Correspondences.of(features1, features2, pairs[order], ratios[order])
+
+
+def _check_kinds(features1: Features, features2: Features) -> None:
+    if features1.kind != features2.kind:
+        raise ArgumentError(f"features of different kinds do not match: {features1.kind} and {features2.kind}")
 
 
 def check_ratio(ratio: float | None) -> float:
@@ -72,9 +76,12 @@ def match_near(
     at least.
     """
     limit = check_ratio(ratio)
+    _check_kinds(features1, features2)
     candidates = _within(expected, features2.points, radius)
     if not len(candidates):
         return Correspondences.of(features1, features2, candidates, np.zeros(0))
+    if not len(known):
+        raise ArgumentError("to match near expected places takes one match at least that is known to be right")
     similarity = Similarity(features1.descriptors, features2.descriptors)
     sign1, sign2 = features1.laplacian_sign, features2.laplacian_sign
     if sign1 is not None and sign2 is not None:

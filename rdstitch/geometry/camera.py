@@ -53,6 +53,9 @@ _NEAREST_HORIZON = 0.2  # half diagonals: a circle of 180 degrees that is smalle
 _MAX_STRETCH = 20.0
 """How much the lens may stretch what is drawn where it sees beyond the horizon: to 77 degrees off the axis."""
 
+_IMAGE_CENTER = (math.nan, math.nan)
+"""Stands for the image centre until :class:`Camera` puts that in its place: this object only, other NaN are refused."""
+
 _GUESSED_FOCAL = 1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middle of what phones and drones carry
 
 
@@ -114,8 +117,9 @@ class Camera:
     Raises
     ------
     ArgumentError
-        When a value is not finite; when the lens folds the image: its model must be one-to-one out to the corners, or
-        to the horizon, the rays at 90 degrees to its axis; or when that is so near that next to nothing is seen.
+        When a value is not finite, or a standard deviation negative; when the lens folds the image: its model must be
+        one-to-one out to the corners, or to the horizon, the rays at 90 degrees to its axis; or when that is so near
+        that next to nothing is seen.
 
     Notes
     -----
@@ -126,7 +130,7 @@ class Camera:
     image_size: tuple[int, int]
     distortion: float = 0.0
     distortion2: float = 0.0
-    center: tuple[float, float] = (math.nan, math.nan)
+    center: tuple[float, float] = _IMAGE_CENTER
     focal: float | None = None
     focal_source: str | None = None
     distortion_std: float | None = None
@@ -143,17 +147,31 @@ class Camera:
         width, height = self.image_size
         if width < 1 or height < 1:
             raise ArgumentError(f"image size must be at least 1 x 1 pixel, not {width} x {height}")
-        if all(math.isnan(value) for value in self.center):
+        if self.center is _IMAGE_CENTER:
             object.__setattr__(self, "center", ((width - 1) / 2, (height - 1) / 2))
-        numbers = (*self.coefficients, *self.center)
-        if not all(math.isfinite(value) for value in numbers):
-            raise ImpossibleCameraError(f"camera has a value that is not finite: {numbers}")
+        self._check_numbers()
+        self._check_focal()
+        self._check_lens()
+
+    def _check_numbers(self) -> None:
+        for name, values in (("value", (*self.coefficients, *self.center)), ("tilt", self.tilt or ())):
+            if not all(map(math.isfinite, values)):
+                raise ImpossibleCameraError(f"camera has a {name} that is not finite: {values}")
+        stds = (self.distortion_std, self.focal_std, *(self.tilt_std or ()))
+        # Infinite is that of what is not observable.
+        if not all(std >= 0.0 for std in stds if std is not None):
+            raise ImpossibleCameraError(f"camera has a standard deviation that is not 0 or above: {stds}")
+
+    def _check_focal(self) -> None:
+        width, height = self.image_size
         if self.focal is not None and not is_focal_length(self.focal, self.image_size):
             raise ImpossibleCameraError(
                 f"no lens of {width} x {height} pixels has a focal length of {self.focal:g} pixels"
             )
         if self.focal_source is not None and self.focal_source not in FOCAL_LOG_STD:
             raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
+
+    def _check_lens(self) -> None:
         named = ", ".join(f"{value:g}" for value in self.coefficients if value)
         with np.errstate(all="ignore"):  # absurd values, from a damaged file, overflow
             if self.image_circle is not None and not self.image_circle > 0.0:
@@ -265,12 +283,22 @@ class Camera:
         guessed = _GUESSED_FOCAL * self.scale if focal is None else focal
         return replace(self, focal=guessed, focal_source=source, focal_std=std)
 
+    def without_focal(self) -> Self:
+        """The camera without its focal length."""
+        return replace(self, focal=None, focal_source=None, focal_std=None)
+
     def with_coefficients(self, distortion: float, distortion2: float = 0.0, distortion3: float = 0.0) -> Self:
         """The camera with another, given lens; the distortion centre stays."""
-        if (distortion, distortion2, distortion3) == self.coefficients:
-            return replace(self, distortion_std=None, lens_covariance=None)
-        lens = replace(self, distortion=distortion, distortion2=distortion2, distortion3=distortion3)
-        return replace(lens, distortion_std=None, lens_covariance=None, lens_model=None)
+        model = self.lens_model if (distortion, distortion2, distortion3) == self.coefficients else None
+        return replace(
+            self,
+            distortion=distortion,
+            distortion2=distortion2,
+            distortion3=distortion3,
+            distortion_std=None,
+            lens_covariance=None,
+            lens_model=model,
+        )
 
     def without_lens(self) -> "Camera":
         """A camera of which only the images' size and centre, and its image circle, are known."""

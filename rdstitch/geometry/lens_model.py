@@ -61,28 +61,31 @@ class LensModel:
         return self._bend((points - self.center) / self.mean_focal) * self.focal + self.center
 
     def undistort(self, points: FloatArray) -> FloatArray:
-        """Invert :meth:`distort` of Brown's model by Newton's method; NaN where the polynomial folds on the way."""
+        """Invert :meth:`distort` by Newton's method; NaN where that does not converge, or where the lens folds."""
         target = (points - self.center) / self.focal
         x, step = target.copy(), 1e-30
-        for _ in range(_NEWTON_STEPS):
-            # Derivatives are the imaginary parts: the model is analytic.
-            a, c = np.moveaxis(self._bend(x + np.array([1j * step, 0.0])).imag / step, -1, 0)
-            b, d = np.moveaxis(self._bend(x + np.array([0.0, 1j * step])).imag / step, -1, 0)
-            determinant = a * d - b * c
-            ex, ey = np.moveaxis(target - self._bend(x), -1, 0) / np.where(determinant > 0.0, determinant, np.nan)
-            move = np.stack([d * ex - b * ey, a * ey - c * ex], axis=-1)
-            x = x + move
-            if not np.nanmax(np.abs(move), initial=0.0) > _NEWTON_TOLERANCE:
-                break
-        return x * self.mean_focal + self.center
+        with np.errstate(all="ignore"):  # of points that diverge
+            for _ in range(_NEWTON_STEPS):
+                # Derivatives are the imaginary parts: the model is analytic.
+                a, c = np.moveaxis(self._bend(x + np.array([1j * step, 0.0])).imag / step, -1, 0)
+                b, d = np.moveaxis(self._bend(x + np.array([0.0, 1j * step])).imag / step, -1, 0)
+                determinant = a * d - b * c
+                ex, ey = np.moveaxis(target - self._bend(x), -1, 0) / np.where(determinant > 0.0, determinant, np.nan)
+                move = np.stack([d * ex - b * ey, a * ey - c * ex], axis=-1)
+                x = x + move
+                converged = np.abs(move).max(axis=-1, keepdims=True) <= _NEWTON_TOLERANCE
+                if (converged | np.isnan(move[..., :1])).all():
+                    break
+        return np.where(converged, x, np.nan) * self.mean_focal + self.center
 
     def _bend(self, points: FloatArray) -> FloatArray:
-        """Undistorted points (..., 2) to measured ones, both in focal lengths; Brown's also for complex numbers."""
+        """Undistorted points (..., 2) to measured ones, both in focal lengths; analytic, so also of complex numbers."""
         if self.kind != "brown":
-            radius = np.linalg.norm(points, axis=-1, keepdims=True)
+            radius = np.sqrt((points * points).sum(axis=-1, keepdims=True))
             ideal = radius if self.kind == "polynomial" else np.arctan(radius)
             bent = ideal * _series(self.coefficients, ideal**2 if self.fisheye else ideal)
-            return np.asarray(points * np.where(radius > 0.0, bent / np.maximum(radius, 1e-300), 1.0))
+            inside = radius == 0.0
+            return np.asarray(points * np.where(inside, 1.0, bent / np.where(inside, 1.0, radius)))
         k1, k2, p1, p2, k3, *below = (*self.coefficients, *[0.0] * (8 - len(self.coefficients)))
         x, y = np.moveaxis(points, -1, 0)
         r2 = x * x + y * y

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rdstitch.errors import InputError
-from rdstitch.geometry.crs import WGS84, Crs, NamedSystem
+from rdstitch.geometry.crs import WGS84, Crs
 from rdstitch.geometry.places import GpsPosition, GroundControl
+from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.positions import COLUMNS, UNITS, accuracy_of, geographic_places
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import Row, csv_rows

@@ -21,8 +21,9 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.geometry.crs import WGS84, NamedSystem
+from rdstitch.geometry.crs import WGS84
 from rdstitch.geometry.places import GpsPosition
+from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import Row, by_image, csv_rows, json_rows, listed_rows
 from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points

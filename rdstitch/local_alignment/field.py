@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, read_only
 from rdstitch.errors import ArgumentError
 
 _DECIMALS = 3  # pixels; what a sidecar stores is what was used
@@ -117,7 +117,7 @@ def _prefilter(count: int) -> FloatArray:
     one, beside = np.eye(len(padded)), np.eye(len(padded), k=1)
     values = (4.0 * one + beside + beside.T) / 6.0
     values[0, 1] = values[-1, -2] = 2.0 / 6.0
-    return np.asarray(np.linalg.solve(values, padded), dtype=np.float64)
+    return read_only(np.asarray(np.linalg.solve(values, padded), dtype=np.float64))
 
 
 @lru_cache(maxsize=64)
@@ -128,7 +128,7 @@ def _evaluation(count: int) -> FloatArray:
     basis = np.zeros((len(place), count + 2 * _APRON))
     columns = cell[:, None] + np.arange(-1, 3)
     np.put_along_axis(basis, columns, _cubic_weights(place - cell), axis=1)
-    return basis @ _prefilter(count)
+    return read_only(basis @ _prefilter(count))
 
 
 def bilinear(

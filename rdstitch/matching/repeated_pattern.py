@@ -6,13 +6,18 @@ that most keypoints have a partner for is right, or off by whole periods of the 
 a board that is shifted by a square is as flat as before. It is not for the places of the images.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
-from rdstitch.features import Correspondences, Features
+from rdstitch.features import Correspondences, Features, match_near
+from rdstitch.matching.feature_store import StoredMatches
+from rdstitch.matching.pair_estimator import PairEstimator
+from rdstitch.matching.two_view import PairRegistration, Transfer
 
-MIN_REPETITION = 0.1
+_MIN_REPETITION = 0.1
 """Of :func:`repetition`: images with more may show a repeated pattern. Boards have 0.15 to 0.8, flights up to
 0.01, but up to 0.6 over a car park or mown grass."""
 
@@ -28,6 +33,54 @@ _NEAR, _FAR, _SPREAD = 0.01, 0.06, 0.12  # half diagonals: error beside the keyp
 _TOLERANCES = (0.05, 0.035, 0.025, 0.02, 0.015, 0.015)  # half diagonals, of the rounds of refinement
 _AFFINE_ROUNDS = 2  # the first ones; then the quadratic one, which perspective and lens ask for
 _MIN_MATCHES = 20
+_SAMPLED = 5  # images that are looked at for a repeated pattern
+_FEW_INLIERS = 50  # of a pair of a repeated pattern, which shows hundreds of keypoints
+_MIN_INLIER_RATIO = 0.7  # of such matches that agree: right pairs have 0.8 to 1, lattices that hardly match half
+_SEARCH_RADIUS = 3.0  # thresholds around the place where a match is expected
+
+
+def shows_repeated_pattern(estimator: PairEstimator) -> bool:
+    """Whether keypoints of most of the images look like others elsewhere in the same image."""
+    if estimator.matching.network is not None:
+        return False
+    sampled = evenly_spaced(len(estimator.features), _SAMPLED).tolist()
+    return bool(np.median([repetition(estimator.features[k]) for k in sampled]) >= _MIN_REPETITION)
+
+
+def match_repeated_patterns(estimator: PairEstimator, pairs: list[PairRegistration]) -> list[PairRegistration]:
+    """Where the images show a repeated pattern, match again the pairs that failed or hold by little.
+
+    They may be off by whole periods of the pattern then.
+    """
+    if not shows_repeated_pattern(estimator):
+        return pairs
+    weak = [k for k, pair in enumerate(pairs) if not pair.relation or pair.relation.inliers.sum() < _FEW_INLIERS]
+    chosen, features = [pairs[k].images for k in weak], estimator.features
+    matched = [StoredMatches.of(match_pattern(features[i], features[j])) for i, j in chosen]
+    distortion = estimator.estimation.distortion
+    rematched = estimator.estimate_matched(chosen, matched, distortion, "matching a repeated pattern")
+    result = list(pairs)
+    for k, pair in zip(weak, rematched, strict=True):
+        inliers = pair.relation.inliers.sum()
+        if pair.relation and inliers > max(_MIN_INLIER_RATIO * len(pair.matches), pairs[k].relation.inliers.sum()):
+            result[k] = pair
+    return result
+
+
+def rematch_elsewhere(
+    estimator: PairEstimator, pairs: Sequence[PairRegistration], transfer: Transfer
+) -> list[PairRegistration]:
+    """Match registered pairs again, only near where ``transfer`` puts them."""
+    matched, options = [], estimator.estimation
+    for pair in pairs:
+        features1, features2 = estimator.features[pair.image1], estimator.features[pair.image2]
+        expected = transfer(pair.image1, pair.image2, features1.points)
+        known = pair.correspondences.indices[pair.relation.inliers]
+        near = match_near(
+            features1, features2, expected, _SEARCH_RADIUS * options.threshold, known, estimator.matching.ratio
+        )
+        matched.append(StoredMatches.of(near))
+    return estimator.estimate_matched([pair.images for pair in pairs], matched, options.distortion)
 
 
 def repetition(features: Features) -> float:

@@ -6,7 +6,7 @@ plane moved.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -15,7 +15,8 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Correspondences
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.match_graph import connected_components
-from rdstitch.matching.two_view import PairRegistration
+from rdstitch.matching.pair_estimator import PairEstimator
+from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.system.late_imports import spatial
 
 _MIN_IMAGES, _MIN_SHARE = 3, 0.5
@@ -52,6 +53,26 @@ class _Motion:
         overlay = (moved < radius) & ~inliers
         overlaid = bool(pair.relation) and not static and int(overlay.sum()) >= _MIN_STATIC_MATCHES
         return cls(matches, moved, static, overlay & overlaid)
+
+
+def without_static_background(
+    estimator: PairEstimator, pairs: list[PairRegistration], candidates: Sequence[Pair] = ()
+) -> tuple[PairEstimator, list[PairRegistration]] | None:
+    """Where a part of the images is static, the estimator and pairs of what moves; None where none is.
+
+    What the images have in common was static then, so that it says nothing of which of the candidate pairs matter: all
+    of them are compared.
+    """
+    threshold = estimator.estimation.threshold
+    if not has_static_background(pairs, threshold):
+        return None
+    compared = [pair.images for pair in pairs]
+    others = sorted(set(candidates).difference(compared))
+    all_pairs = [*pairs, *estimator.estimate(others)]
+    moving = replace(estimator, features=moving_features(estimator.features, all_pairs, threshold))
+    pairs_of_moving = moving.estimate(sorted([*compared, *others]))
+    shown = show_motion(pairs_of_moving, len(estimator.features), threshold)
+    return (moving, pairs_of_moving) if shown else None
 
 
 def is_static_pair(pair: PairRegistration, threshold: float) -> bool:

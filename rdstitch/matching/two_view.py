@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,20 +69,25 @@ class PairRegistration:
         return Link(self.image1, self.image2, matched.points1[inliers], matched.points2[inliers], self.relation)
 
 
-MatchingTask = tuple[StoredFeatures, StoredFeatures, StoredMatches | None]
-"""Features of both images of a pair; and some matches of it, where they are known: these show where the images
-overlap, and only there the rest is looked for."""
+class MatchingTask(NamedTuple):
+    """A pair to be matched."""
+
+    features1: StoredFeatures
+    features2: StoredFeatures
+    known: (
+        StoredMatches | None
+    )  # some matches: they show where the images overlap, and only there others are looked for
 
 
 def match_pairs(
-    tasks: Sequence[MatchingTask], *, matcher: Matcher, how: tuple[float | str | None, ...], cache: Cache
+    tasks: Sequence[MatchingTask], *, matcher: Matcher, matcher_key: tuple[float | str | None, ...], cache: Cache
 ) -> list[StoredMatches]:
-    """Match the features of pairs; ``how`` stands for the matcher in the inputs of results."""
+    """Match the features of pairs; the key stands for the matcher in the inputs of results."""
     # Pairs that follow one another have an image in common, and the next ones its neighbours: a megabyte each.
     load = lru_cache(maxsize=8)(StoredFeatures.load)
     result = []
     for one, two, known in tasks:
-        inputs = (one.key(cache), two.key(cache), how, None if known is None else known.key(cache))
+        inputs = (one.key(cache), two.key(cache), matcher_key, None if known is None else known.key(cache))
         stored = cache.stored("matches", inputs, partial(_matched, matcher, load, one, two, known))
         result.append(StoredMatches(stored, len(stored.load())))
     return result
@@ -100,31 +106,36 @@ def _matched(
 
 
 Tilt = tuple[float, float]
-EstimationTask = tuple[Camera, Camera, StoredMatches, Tilt | None, Tilt | None]
-"""Cameras, matches and known tilts (ψ, θ), radians, of both images of a pair; of their lens only the centre and the
-focal length are used."""
+"""(ψ, θ), radians."""
+
+
+class EstimationTask(NamedTuple):
+    """A pair to be estimated; of the lens of its cameras only the centre and the focal length are used."""
+
+    camera1: Camera
+    camera2: Camera
+    matches: StoredMatches
+    tilt1: Tilt | None  # where it is known exactly
+    tilt2: Tilt | None
+
+    def pair_matches(self) -> PairMatches:
+        """As estimation takes them."""
+        putative, camera = self.matches.load(), self.camera1
+        first = replace(camera.without_lens(), focal=camera.focal, focal_source=camera.focal_source).with_focal()
+        known = None if self.tilt1 is None or self.tilt2 is None else np.array([self.tilt1, self.tilt2])
+        second = replace(first.resized(self.camera2.image_size), center=self.camera2.center)
+        return PairMatches(putative.points1, putative.points2, first, second, -putative.ratio, known)
 
 
 def estimate_pairs(
     tasks: Sequence[EstimationTask], *, options: EstimationOptions, cache: Cache
 ) -> list[RadialHomography]:
     """Estimate the two-view geometry of pairs, in lockstep."""
-    inputs = [(one, two, matches.key(cache), options, *tilts) for one, two, matches, *tilts in tasks]
+    inputs = [(k.camera1, k.camera2, k.matches.key(cache), options, k.tilt1, k.tilt2) for k in tasks]
 
     def estimate(places: list[int]) -> list[RadialHomography]:
-        pairs = [_pair_matches(*tasks[k]) for k in places]
+        pairs = [tasks[k].pair_matches() for k in places]
         with _one_estimation:
             return estimate_radial_homographies(pairs, options)
 
     return cache.recall_many("pairs", inputs, estimate)
-
-
-def _pair_matches(
-    camera: Camera, camera2: Camera, matches: StoredMatches, tilt1: Tilt | None, tilt2: Tilt | None
-) -> PairMatches:
-    """Matches of a pair as estimation takes them."""
-    putative = matches.load()
-    first = replace(camera.without_lens(), focal=camera.focal, focal_source=camera.focal_source).with_focal()
-    known = None if tilt1 is None or tilt2 is None else np.array([tilt1, tilt2])
-    second = replace(first.resized(camera2.image_size), center=camera2.center)
-    return PairMatches(putative.points1, putative.points2, first, second, -putative.ratio, known)

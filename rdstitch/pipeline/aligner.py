@@ -20,9 +20,9 @@ from rdstitch.inputs.measurements import metres_around_median, positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import loop_closures
 from rdstitch.matching.copies import copies_of, distinct
+from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
-from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
@@ -205,7 +205,7 @@ class Aligner:
 
 
 def draft_with_loops(
-    aligner: Aligner, pairing: Pairing, pairs: Sequence[PairRegistration], candidates: Sequence[Pair]
+    aligner: Aligner, estimator: PairEstimator, pairs: Sequence[PairRegistration], candidates: Sequence[Pair]
 ) -> AlignedPairs:
     """Draft the alignment, and anew with what a draft shows to be missing: pairs, and inliers.
 
@@ -218,12 +218,12 @@ def draft_with_loops(
         tried = {pair.images for pair in pairs}
         beside = loop_closures(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
         unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
-        more = pairing.estimate(sorted(unaligned.union(beside)), distortion=alignment.distortion)
+        more = estimator.estimate(sorted(unaligned.union(beside)), distortion=alignment.distortion)
         selected = select_by_whole_lens(aligned, aligner.threshold)
         pairs = tuple(sorted([*(selected or pairs), *more], key=lambda pair: pair.images))
         if selected is None and not any(pair.relation for pair in more):
             return replace(aligned, pairs=pairs)
-        pairing.progress("aligning", 0, 1)
+        estimator.progress("aligning", 0, 1)
         del aligned, alignment, selected  # what a draft was made from takes as much memory as the next one
         aligned = aligner.draft(pairs)
     return aligned

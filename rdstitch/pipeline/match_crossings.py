@@ -15,8 +15,9 @@ from rdstitch.features.prepared_image import Stretch, prepare
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import StoredMatches
+from rdstitch.matching.pair_estimator import PairEstimator
+from rdstitch.matching.repeated_pattern import shows_repeated_pattern
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.options.feature_options import CLOSER, WORK_MEGAPIXELS
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.robust.chance import places
@@ -31,7 +32,7 @@ _MAX_ERROR = 0.5  # of the error of keypoints that crossings must leave; saddles
 
 def match_crossings(
     aligner: Aligner,
-    pairing: Pairing,
+    estimator: PairEstimator,
     aligned: AlignedPairs,
     sources: Sequence[Source],
     stretch: Stretch | None,
@@ -45,7 +46,7 @@ def match_crossings(
     ``aligned``, by keypoints, is right to less than a period of the pattern. Given is the same as by
     :func:`rdstitch.pipeline.settle_repeated_pattern.settle_repeated_pattern`, whose place this takes.
     """
-    if not pairing.shows_repeated_pattern:
+    if not shows_repeated_pattern(estimator):
         return aligned, {}
     former = aligned.alignment
 

@@ -9,12 +9,15 @@ from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.choices import Purpose
-from rdstitch.features import LightGlue, Matcher, match
+from rdstitch.features import LightGlue, match
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
-from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
+from rdstitch.matching.prescreen import estimate_candidates
+from rdstitch.matching.repeated_pattern import match_repeated_patterns
+from rdstitch.matching.static_background import without_static_background
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, draft_with_loops, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
@@ -61,35 +64,33 @@ def register(
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))
     return_freed_memory()
-    pairing = Pairing(
+    estimator = PairEstimator(
         features,
         cameras,
-        _matcher(options),
+        _matching(options),
         options.estimation,
         progress,
         executor,
         cache,
         store,
-        options.ratio,
-        options.lightglue_model,
         aligner.exact_tilts,
     )
-    pairs = pairing.estimate_candidates(candidates)
-    moving = pairing.without_static_background(pairs, candidates)
-    pairing, pairs = moving or (pairing, pairs)
-    pairs = pairing.match_repeated_patterns(pairs) if purpose.lens_only else pairs
+    pairs = estimate_candidates(estimator, candidates)
+    moving = without_static_background(estimator, pairs, candidates)
+    estimator, pairs = moving or (estimator, pairs)
+    pairs = match_repeated_patterns(estimator, pairs) if purpose.lens_only else pairs
     mixed, other_lens = separate_lenses(aligner.cameras, pairs, options.threshold, options.known_distortion)
     progress("aligning", 0, 1)
     pairs = [pair for pair in pairs if not {*pair.images} & other_lens.keys()]
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
-    aligned = draft_with_loops(aligner, pairing, pairs, candidates)
+    aligned = draft_with_loops(aligner, estimator, pairs, candidates)
     if purpose.poses:
         aligner = replace(aligner, needs_poses=True)
         aligned = aligner.metric(aligned)
     progress("aligning", 0, 1)
     aligned = aligner.completed(aligned)
     settle = match_crossings if purpose.lens_only else settle_repeated_pattern
-    aligned, undecided = settle(aligner, pairing, aligned, sources, detected.stretch, options.threads)
+    aligned, undecided = settle(aligner, estimator, aligned, sources, detected.stretch, options.threads)
     unplaced = {**other_lens, **detected.damaged, **undecided}
     return Registration(
         tuple(sources),
@@ -123,11 +124,11 @@ def with_frontal_reference(registration: Registration, options: StitchOptions, *
     return replace(registration, alignment=in_frame_of(alignment, reference))
 
 
-def _matcher(options: StitchOptions) -> Matcher:
-    """The user's network, or distances of descriptors."""
-    if options.lightglue_model is not None:
-        return LightGlue(options.lightglue_model).match
-    return partial(match, ratio=options.ratio)
+def _matching(options: StitchOptions) -> FeatureMatching:
+    """By the user's network, or by distances of descriptors."""
+    network = options.lightglue_model
+    matcher = partial(match, ratio=options.ratio) if network is None else LightGlue(network).match
+    return FeatureMatching(matcher, options.ratio, network)
 
 
 def _low_contrast(equalized: Sequence[int], alignment: Alignment, paths: Sequence[str]) -> list[Message]:

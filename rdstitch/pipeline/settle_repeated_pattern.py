@@ -10,8 +10,8 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import RegistrationError
 from rdstitch.geometry.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.inputs.source import Source
-from rdstitch.matching.two_view import PairRegistration
-from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.matching.pair_estimator import PairEstimator
+from rdstitch.matching.repeated_pattern import rematch_elsewhere, shows_repeated_pattern
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE
@@ -28,7 +28,7 @@ _UNDECIDED = "shows a repeated pattern, and nothing unique in it decides where i
 
 def settle_repeated_pattern(
     aligner: Aligner,
-    pairing: Pairing,
+    estimator: PairEstimator,
     aligned: AlignedPairs,
     sources: Sequence[Source],
     stretch: tuple[float, float] | None,
@@ -43,7 +43,7 @@ def settle_repeated_pattern(
     the pairs: why images have no place any more, by their index.
     """
     alignment = aligned.alignment
-    if alignment.poses is None or len(sources) > _MAX_IMAGES or not pairing.shows_repeated_pattern:
+    if alignment.poses is None or len(sources) > _MAX_IMAGES or not shows_repeated_pattern(estimator):
         return aligned, {}
     used = [pair for pair in aligned.pairs if pair.relation and alignment.used[[pair.image1, pair.image2]].all()]
     compared = sorted(used, key=lambda pair: pair.image2 - pair.image1)[: _PAIRS_OF_AN_IMAGE * len(sources)]
@@ -61,7 +61,7 @@ def settle_repeated_pattern(
 
     decided = [pair for pair in compared if pair.images in shifts]
     sound = [pair for pair in compared if pair.images not in doubtful]
-    again = {pair.images: pair for pair in [*sound, *pairing.rematch_elsewhere(decided, transfer)]}
+    again = {pair.images: pair for pair in [*sound, *rematch_elsewhere(estimator, decided, transfer)]}
     try:
         settled = aligner.align([again.get(pair.images, _undecided(pair)) for pair in aligned.pairs])
     except RegistrationError:

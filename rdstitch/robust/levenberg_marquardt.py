@@ -1,5 +1,6 @@
 """Levenberg-Marquardt for many small problems in lockstep."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol, Self, TypeVar
 
@@ -131,7 +132,10 @@ def _damped_step(equations: BatchedNormalEquations, damping: FloatArray) -> Floa
     damped[~solvable] = np.eye(damped.shape[1])
     try:
         step = -np.linalg.solve(damped, equations.gradient[:, :, None])[:, :, 0]
-    except np.linalg.LinAlgError:
-        step = -(np.linalg.pinv(damped) @ equations.gradient[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:  # one of them is singular nevertheless
+        step = np.full(equations.gradient.shape, np.nan)
+        for row in range(len(step)):
+            with suppress(np.linalg.LinAlgError):
+                step[row] = -np.linalg.solve(damped[row], equations.gradient[row])
     step[~solvable] = np.nan
     return np.asarray(step, dtype=np.float64)

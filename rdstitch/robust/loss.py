@@ -37,8 +37,8 @@ def normal_std(values: NDArray[Any]) -> float:
 
 
 def sigma_of(squared: FloatArray) -> float:
-    """Standard deviation of an error's coordinate, pixels, from the median of the squared lengths (M,), or inf."""
-    return max(float(np.sqrt(np.median(squared))) / RAYLEIGH_MEDIAN, _MIN_SIGMA) if len(squared) else _MIN_SIGMA
+    """Standard deviation of an error's coordinate, pixels, from the median of the squared lengths (M,); inf of none."""
+    return max(float(np.sqrt(np.median(squared))) / RAYLEIGH_MEDIAN, _MIN_SIGMA) if len(squared) else np.inf
 
 
 def noise_of(errors: FloatArray, threshold: FloatArray | float, fitted: int = 0) -> FloatArray:

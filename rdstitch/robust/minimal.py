@@ -32,7 +32,9 @@ class MinimalSolver:
 
 
 @lru_cache(maxsize=64)
-def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortion: float | None) -> list[MinimalSolver]:
+def minimal_solvers(
+    focal: float, focal_std: float, tilts_known: bool, distortion: float | None
+) -> tuple[MinimalSolver, ...]:
     """The solvers that the known quantities allow, those with the fewest points first.
 
     ``focal``: focal length in half diagonals; ``focal_std``: standard deviation of its logarithm; ``tilts_known``:
@@ -45,11 +47,11 @@ def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortio
         points2 = partial(solvers.two_point_similarity, distortion=known)
         dlt = partial(solvers.four_point_dlt, distortion=distortion)
         turn = partial(solvers.rotation_two_point_focal, distortion=distortion)
-        return [
+        return (
             MinimalSolver("rotation_two_point_focal", 2, _scaled(turn), HomographyPairModel(), True),
             MinimalSolver("two_point_similarity", 2, _scaled(points2, focal, tilted=True), similarity, True),
             MinimalSolver("four_point_dlt", 4, _scaled(dlt), HomographyPairModel(), True),
-        ]
+        )
     low, high = SEARCHED_DISTORTION
     searched = {"distortion_range": (low * focal**2, high * focal**2)}
     if tilts_known:
@@ -62,7 +64,7 @@ def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortio
     four_point = partial(solvers.four_point, **searched)
     five_point = partial(solvers.five_point, distortion_range=SEARCHED_DISTORTION)
     turn = partial(solvers.rotation_two_point, **searched)
-    return [
+    return (
         # A camera that turns: two points find pairs of a tenth of inliers three times as often as five do, whatever the
         # focal length is taken for.
         MinimalSolver("rotation_two_point", 2, _scaled(turn, focal), HomographyPairModel()),
@@ -71,7 +73,7 @@ def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortio
         MinimalSolver("four_point", 4, _scaled(four_point, focal), rigid),
         MinimalSolver("five_point", 5, _scaled(five_point), HomographyPairModel()),
         MinimalSolver("four_point_dlt", 4, _scaled(_sampled_distortion), HomographyPairModel()),
-    ]
+    )
 
 
 def _sampled_distortion(x1: FloatArray, x2: FloatArray) -> Solutions:

@@ -5,14 +5,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, read_only
 
 
 @lru_cache
 def chebyshev_nodes(degree: int) -> FloatArray:
     """Chebyshev nodes of the first kind in [-1, 1], enough for a polynomial of this degree; shape (degree + 1,)."""
     count = degree + 1
-    return np.cos((2 * np.arange(count) + 1) * np.pi / (2 * count))
+    return read_only(np.cos((2 * np.arange(count) + 1) * np.pi / (2 * count)))
 
 
 @lru_cache
@@ -22,7 +22,7 @@ def chebyshev_from_values(degree: int) -> FloatArray:
     angles = (2 * np.arange(count) + 1) * np.pi / (2 * count)
     matrix = 2.0 / count * np.cos(np.arange(count)[:, None] * angles)
     matrix[0] /= 2.0
-    return np.asarray(matrix)
+    return read_only(matrix)
 
 
 @lru_cache
@@ -33,7 +33,7 @@ def value_and_slope_from_values(degree: int) -> FloatArray:
     """
     series = chebyshev_from_values(degree)
     slope = np.polynomial.chebyshev.chebder(series)
-    return np.stack([series, np.pad(slope, ((0, len(series) - len(slope)), (0, 0)))])
+    return read_only(np.stack([series, np.pad(slope, ((0, len(series) - len(slope)), (0, 0)))]))
 
 
 def chebyshev_values(series: FloatArray, t: FloatArray) -> FloatArray:
@@ -72,7 +72,7 @@ def bernstein_from_values(degree: int, cells: int) -> FloatArray:
             for node in others:
                 product = np.convolve(product, (a - node, b - node))
             matrix[cell, :, k] = product / binomials / np.prod(nodes[k] - others)
-    return matrix
+    return read_only(matrix)
 
 
 @lru_cache
@@ -88,7 +88,7 @@ def bernstein_subdivision(degree: int, parts: int) -> FloatArray:
             for _ in range(j):
                 product = np.convolve(product, (1.0 - b, b))
             matrix[part, j] = product
-    return matrix
+    return read_only(matrix)
 
 
 def bernstein_value(coefficients: FloatArray, s: FloatArray) -> FloatArray:
@@ -105,4 +105,4 @@ def _binomials(degree: int) -> FloatArray:
     row = np.ones(1)
     for _ in range(degree):
         row = np.convolve(row, (1.0, 1.0))
-    return row
+    return read_only(row)

@@ -8,20 +8,35 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions
+from rdstitch.alignment.given_checks import judged_focal
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, at_delay, change_with_delay
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
+from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
 from rdstitch.tracking.metric_plane import MetricPlane
 from rdstitch.tracking.placement import CameraPose
-from rdstitch.tracking.shown_camera import judged_focal
-from rdstitch.tracking.tracked_frame import TrackedFrame
+from rdstitch.tracking.tracked_frame import Frame, PlacedFrame
 
 _KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of an image of 640 x 480 pixels, over half of it
 _MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
+
+
+@dataclass(frozen=True)
+class CameraRevision:
+    """What keyframes show of a camera whose focal length was given, and what that changes for the frames before."""
+
+    focal: float  # half diagonals
+    length_std: float
+    plane: MetricPlane | None
+    delay: float  # delay, delay_std: s
+    delay_std: float
+    longer: float | None = None  # all keyframes are placed anew, with lengths so many times as long; None: none are
+    given_again: bool = False  # whether the places of earlier frames are given again, as lengths are far surer
+    messages: tuple[Message, ...] = ()
 
 
 @dataclass
@@ -84,18 +99,26 @@ class CameraKnowledge:
         """Whether lens and focal length of a camera are given."""
         return self.lens_given and camera.focal is not None and camera.focal_source in ("option", "file")
 
-    def attitude(self, frame: TrackedFrame) -> tuple[float, float] | None:
+    def attitude(self, frame: Frame) -> tuple[float, float] | None:
         """(ψ, θ), radians, as measured when the frame was taken."""
         if frame.attitude is None:
             return None
         psi, theta = at_delay(frame.attitude, self.delay).tolist()
         return psi, theta
 
-    def attitude_std(self, frame: TrackedFrame) -> float:
+    def attitude_std(self, frame: Frame) -> float:
         """Its standard deviation, radians, with what the delay leaves open."""
         assert frame.attitude is not None
         late = self.delay_std * float(change_with_delay(frame.attitude).max())
         return math.hypot(self.given.attitudes_std, late)
+
+    def revise(self, revision: CameraRevision) -> None:
+        """Take over what keyframes show."""
+        self.delay, self.delay_std = revision.delay, revision.delay_std
+        self.focal_contradicted |= revision.focal != self.focal
+        self.focal, self.length_std, self.plane = revision.focal, revision.length_std, revision.plane
+        if revision.given_again:
+            self.given_length_std = self.length_std
 
     def vote(self, links: Sequence[Link]) -> None:
         """λ by the pairs alone, until there is an alignment."""
@@ -104,7 +127,7 @@ class CameraKnowledge:
             consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
             self.distortion, self.distortion_std = consensus.distortion, consensus.std
 
-    def cameras_for(self, keyframes: Sequence[TrackedFrame], focal_std: float | None) -> list[Camera]:
+    def cameras_for(self, keyframes: Sequence[Frame], focal_std: float | None) -> list[Camera]:
         """Those of keyframes that are aligned, with the focal length of the map if it is to be kept so closely."""
         cameras = [keyframe.camera.with_focal() for keyframe in keyframes]
         if self.pair.distortion is not None and not self.lens_given:
@@ -114,7 +137,7 @@ class CameraKnowledge:
         focal = self.focal
         return [c.with_focal(focal * c.scale, "file", focal_std * focal * c.scale) for c in cameras]
 
-    def options_for(self, keyframes: Sequence[TrackedFrame]) -> AlignmentOptions:
+    def options_for(self, keyframes: Sequence[Frame]) -> AlignmentOptions:
         """Of an alignment of keyframes."""
         attitudes = [attitude for keyframe in keyframes if (attitude := self.attitude(keyframe)) is not None]
         measured, known = len(attitudes) == len(keyframes), self.distortion_known
@@ -130,7 +153,7 @@ class CameraKnowledge:
             pose_covariance=not known,
         )
 
-    def learn(self, alignment: Alignment, keyframes: Sequence[TrackedFrame], *, keeps_focal: bool) -> None:
+    def learn(self, alignment: Alignment, keyframes: Sequence[Frame], *, keeps_focal: bool) -> None:
         """Keep what an alignment shows of the camera, for the frames to come."""
         if not self.distortion_known and alignment.distortion_std < self.distortion_std:
             self.distortion, self.distortion_std = alignment.distortion, alignment.distortion_std
@@ -165,9 +188,9 @@ class CameraKnowledge:
             self.pair = replace(self.pair, distortion=self.distortion, solver="auto")
             self.model = alignment.model
 
-    def covariance(self, frame: TrackedFrame, pose: CameraPose) -> FloatArray | None:
+    def covariance(self, placed: PlacedFrame, pose: CameraPose) -> FloatArray | None:
         """Of a frame's pose, with what all frames have in common but for the unit of lengths."""
-        known, (relative, yaw_std) = frame.covariance, self.shape_std
+        known, (relative, yaw_std) = placed.place.covariance, self.shape_std
         if known is None:
             if not relative:
                 return None
@@ -176,7 +199,7 @@ class CameraKnowledge:
         if self.plane is not None and not relative:
             relative = yaw_std = self.plane.bend_std(self.length_std)
         place = (relative * far) ** 2
-        if frame.attitude is not None:
+        if placed.frame.attitude is not None:
             # The foot of the camera is off by the error of its tilt, and so is that of the first frame.
-            place += 2.0 * (pose.height * self.attitude_std(frame)) ** 2
+            place += 2.0 * (pose.height * self.attitude_std(placed.frame)) ** 2
         return np.asarray(known + np.diag([place, place, 0.0, yaw_std**2]))

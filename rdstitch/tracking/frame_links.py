@@ -16,13 +16,13 @@ from rdstitch.matching.links import Link
 from rdstitch.robust import PairMatches, estimate_radial_homographies
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.placement import Placement
-from rdstitch.tracking.tracked_frame import MIN_INLIERS, TrackedFrame
+from rdstitch.tracking.tracked_frame import MIN_INLIERS, Frame, PlacedFrame
 
 MATCH_ERROR = 1.5  # pixels by which a corner that was followed may be off the motion of the plane
 _AGREEING = 0.5  # share of the corners that must agree on it
 _WRONG = 0.05  # share of the matches that agree by chance
 
-Matched = tuple[TrackedFrame, FloatArray, FloatArray, FloatArray | None]
+Matched = tuple[PlacedFrame, FloatArray, FloatArray, FloatArray | None]
 """A keyframe, its points (N, 2), those of the frame, and their quality (N,)."""
 
 
@@ -31,7 +31,7 @@ def agree(inliers: BoolArray) -> bool:
     return bool(inliers.sum() >= max(MIN_INLIERS, _AGREEING * len(inliers)))
 
 
-def camera_beside(frame: TrackedFrame, beside: Placement, *, lens_given: bool) -> Camera:
+def camera_beside(frame: Frame, beside: Placement, *, lens_given: bool) -> Camera:
     """The camera of a frame with the lens of another one."""
     return frame.camera if lens_given else frame.camera.with_coefficients(*beside.camera.coefficients)
 
@@ -55,29 +55,28 @@ def fitted_homography(
     return np.asarray(homography, dtype=np.float64), inliers
 
 
-def links_by_corners(frame: TrackedFrame, others: Sequence[TrackedFrame], known: CameraKnowledge) -> list[Link]:
+def links_by_corners(placed: PlacedFrame, others: Sequence[PlacedFrame], known: CameraKnowledge) -> list[Link]:
     """Links of keyframes with a frame whose place is about known."""
-    if frame.place is None:
-        return []
+    frame = placed.frame
     matched: list[Matched] = [
-        (other, *matched_corners(other.image, frame.image, frame.corners, partial(frame.motion_to, other)), None)
+        (other, *matched_corners(other.frame.image, frame.image, frame.corners, partial(placed.points_in, other)), None)
         for other in others
     ]
     return _registered(frame, matched, known)
 
 
 def links_by_features(
-    frame: TrackedFrame, others: Sequence[TrackedFrame], match: Matcher, known: CameraKnowledge
+    frame: Frame, others: Sequence[PlacedFrame], match: Matcher, known: CameraKnowledge
 ) -> list[Link]:
     """The same where nothing is known of its place."""
-    found = [(other, match(other.features, frame.features)) for other in others]
+    found = [(other, match(other.frame.features, frame.features)) for other in others]
     return _registered(frame, [(other, m.points1, m.points2, -m.ratio) for other, m in found], known)
 
 
-def _registered(frame: TrackedFrame, matched: Sequence[Matched], known: CameraKnowledge) -> list[Link]:
+def _registered(frame: Frame, matched: Sequence[Matched], known: CameraKnowledge) -> list[Link]:
     if not known.distortion_known:
         pairs = [
-            PairMatches(points1, points2, other.camera.with_focal(), frame.camera.with_focal(), quality)
+            PairMatches(points1, points2, other.frame.camera.with_focal(), frame.camera.with_focal(), quality)
             for other, points1, points2, quality in matched
         ]
         return [
@@ -89,8 +88,8 @@ def _registered(frame: TrackedFrame, matched: Sequence[Matched], known: CameraKn
         ]
     links = []  # where the lens is known, a homography of undistorted points
     for other, points1, points2, _ in matched:
-        assert other.place is not None
-        camera, camera2 = (camera_beside(one, other.place, lens_given=known.lens_given) for one in (other, frame))
+        beside = other.place.placement
+        camera, camera2 = (camera_beside(one, beside, lens_given=known.lens_given) for one in (other.frame, frame))
         homography, inliers = fitted_homography(camera2, camera, points2, points1, MATCH_ERROR)
         # A few wrong matches do not make a link: a homography takes four of any.
         if homography is None or inliers.sum() < MIN_INLIERS + _WRONG * len(points1):

@@ -11,10 +11,11 @@ from importlib import import_module
 import numpy as np
 
 from rdstitch.alignment import Alignment, align
+from rdstitch.errors import ImpossibleCameraError, RegistrationError
 from rdstitch.results.messages import Message
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.placement import Placement, PlaneSimilarity
-from rdstitch.tracking.tracked_frame import TrackedFrame
+from rdstitch.tracking.tracked_frame import PlacedFrame
 
 _IMPORTS = "scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial"  # of alignments
 _FIRST = 5  # keyframes that the first alignment takes
@@ -30,7 +31,7 @@ _MATCHES = 80  # of a link, that the alignment uses
 class _Window:
     """Keyframes that are being aligned."""
 
-    keyframes: list[TrackedFrame]
+    keyframes: list[PlacedFrame]
     alignment: Future[Alignment]
     keeps_focal: bool
 
@@ -74,57 +75,60 @@ class MapRefinement:
         """Begin to align the last keyframes among themselves."""
         window, known, keeps_focal = list(frames.keyframes), frames.known, frames.keeps_focal
         executor = self._executor if frames.state.has_plane else self._first_executor
-        options = replace(known.options_for(window), most=_MATCHES, reference=None)
-        cameras = known.cameras_for(window, _EXACT if keeps_focal else None)
+        came = [keyframe.frame for keyframe in window]
+        options = replace(known.options_for(came), most=_MATCHES, reference=None)
+        cameras = known.cameras_for(came, _EXACT if keeps_focal else None)
         place = {keyframe.number: index for index, keyframe in enumerate(window)}
         links = [replace(link, image1=place[link.image1], image2=place[link.image2]) for link in frames.links]
         self._window = _Window(window, executor.submit(align, cameras, links, options), keeps_focal)
 
-    def take_over(self, frames: KeyframeMap, patience: float | None) -> list[TrackedFrame]:
+    def take_over(self, frames: KeyframeMap, patience: float | None) -> list[PlacedFrame]:
         """Take over what has been aligned; frames whose places are new, those between keyframes among them.
 
         It is waited for so many seconds at most, None for as long as it takes.
         """
         window = self._window
-        if window is None:
+        if window is None or (alignment := self._finished(window, patience)) is None:
             return []
+        waiting = {number for number, frame in frames.frames.items() if not frame.place.aligned}
+        longer = _place(frames, window, alignment)
+        came = [keyframe.frame for keyframe in window.keyframes]
+        frames.known.learn(alignment, came, keeps_focal=window.keeps_focal)
+        if frames.known.plane is not None:
+            _continue_covariances(frames.keyframes)
+        used = {number for number, one in zip((k.number for k in came), alignment.used, strict=True) if one}
+        for keyframe in frames.keyframes:
+            if keyframe.number not in used:
+                keyframe.place = frames.place_by_links(keyframe.frame, frames.links) or keyframe.place
+        # What was said of the lengths before is replaced, so that all lengths of a map are wrong by the same.
+        anew = not window.keeps_focal and abs(math.log(longer)) > _SAME_LENGTHS * frames.known.length_std
+        return frames.revise(None if anew else waiting)
+
+    def _finished(self, window: _Window, patience: float | None) -> Alignment | None:
+        """The alignment of a window; None while it is under way, and, once the user knows, where there is none."""
         try:
             alignment = window.alignment.result(patience)
         except NotYet:
-            return []
-        except Exception as error:  # noqa: BLE001 - what one window cannot do the next one may
+            return None
+        except (RegistrationError, ImpossibleCameraError, np.linalg.LinAlgError) as error:
             self.drop()
             self._tell(Message(f"an alignment of the last keyframes failed ({error}); the next one is tried"))
-            return []
+            return None
         self.drop()
         for message in alignment.messages:
             if message.severity in ("warning", "note"):
                 self._tell(message)
         if alignment.on_sphere:
             self._tell(Message("the camera turns on the spot: there is no path"))
-            return []
-        waiting = {number for number, frame in frames.frames.items() if not frame.aligned}
-        longer = _placed(frames, window, alignment)
-        frames.known.learn(alignment, window.keyframes, keeps_focal=window.keeps_focal)
-        if frames.known.plane is not None:  # until there is a window, errors have nothing to grow from
-            reached = np.zeros((4, 4))
-            for keyframe in frames.keyframes:
-                if keyframe.aligned:
-                    reached = keyframe.covariance = reached if keyframe.covariance is None else keyframe.covariance
-        used = {k.number for k, one in zip(window.keyframes, alignment.used, strict=True) if one}
-        for keyframe in frames.keyframes:
-            if keyframe.number not in used:
-                frames.settle(keyframe)
-        # What was said of the lengths before is replaced, so that all lengths of a map are wrong by the same.
-        anew = not window.keeps_focal and abs(math.log(longer)) > _SAME_LENGTHS * frames.known.length_std
-        return frames.revise(None if anew else waiting)
+            return None
+        return alignment
 
     def is_waited_for(self, seen: int) -> bool:
         """Whether the alignment is taken over when so many keyframes have been seen."""
         return self.patient and seen >= self._taken_over_at
 
 
-def _placed(frames: KeyframeMap, window: _Window, alignment: Alignment) -> float:
+def _place(frames: KeyframeMap, window: _Window, alignment: Alignment) -> float:
     """Place keyframes on the map as they were aligned; how much longer lengths become."""
     aligned = zip(window.keyframes, alignment.cameras, alignment.homographies, alignment.used, strict=True)
     placed = [(keyframe, Placement(camera, h, alignment.focal)) for keyframe, camera, h, used in aligned if used]
@@ -134,17 +138,26 @@ def _placed(frames: KeyframeMap, window: _Window, alignment: Alignment) -> float
         move = PlaneSimilarity.to_origin(pose)  # the others are relative to it
     frames.state = frames.state.with_plane()
     for keyframe, placement in placed:
-        keyframe.place, keyframe.aligned = move.applied(placement), True
+        keyframe.place = replace(keyframe.place, placement=move.applied(placement), aligned=True)
     return longer
 
 
-def _to_map(placed: Sequence[tuple[TrackedFrame, Placement]]) -> tuple[PlaneSimilarity, float]:
+def _continue_covariances(keyframes: Sequence[PlacedFrame]) -> None:
+    """Give keyframes that have none the covariance of the one before, from which errors grow again."""
+    reached = np.zeros((4, 4))
+    for keyframe in keyframes:
+        if keyframe.place.aligned:
+            reached = reached if keyframe.place.covariance is None else keyframe.place.covariance
+            keyframe.place = replace(keyframe.place, covariance=reached)
+
+
+def _to_map(placed: Sequence[tuple[PlacedFrame, Placement]]) -> tuple[PlaneSimilarity, float]:
     """From the plane of an alignment to that of the map, which the first one defines; how much longer lengths become.
 
     The unit of lengths is the height of the first keyframe: heights stay as they are, whatever focal length they are
     computed by.
     """
-    shared = [(new, keyframe.place) for keyframe, new in placed if keyframe.aligned and keyframe.place is not None]
+    shared = [(new, keyframe.place.placement) for keyframe, new in placed if keyframe.place.aligned]
     if not shared:
         pose = placed[0][1].pose
         return PlaneSimilarity(1.0, 0.0) if pose is None else PlaneSimilarity.to_origin(pose), 1.0

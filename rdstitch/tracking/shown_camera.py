@@ -9,7 +9,6 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.inputs.delays import DELAY_STD, at_delay, smooth
-from rdstitch.robust.posterior import WRONG_GIVEN_FOCAL
 
 _POINTS = 32  # of a pair
 _OUTLIER = 3.0  # medians of the errors
@@ -146,20 +145,3 @@ def _fitted(pairs: SeenPairs, start: FloatArray, free: list[int]) -> tuple[Float
         if abs(step).max() < _SETTLED:
             break
     return camera, value, change
-
-
-def judged_focal(stated_std: float, shown: float, shown_std: float) -> tuple[float, float]:
-    """Root mean square error of the logarithm of a given focal length, and the probability that it is wrong.
-
-    It is right within ``stated_std``, or wrong by anything (:data:`WRONG_GIVEN_FOCAL`); the images show one that is
-    ``shown`` longer, as a logarithm, with a standard deviation that is inf where they show none.
-    """
-    share, far = WRONG_GIVEN_FOCAL
-    logs, squares = [], []
-    for weight, std in ((1.0 - share, stated_std), (share, far)):
-        spread = std**2 + shown_std**2
-        gain = std**2 / spread if math.isfinite(spread) else 0.0
-        logs.append(math.log(weight) - (0.5 * (math.log(spread) + shown**2 / spread) if gain else 0.0))
-        squares.append((gain * shown) ** 2 + (1.0 - gain) * std**2)
-    wrong = 1.0 / (1.0 + math.exp(min(logs[0] - logs[1], 700.0)))
-    return math.sqrt((1.0 - wrong) * squares[0] + wrong * squares[1]), wrong

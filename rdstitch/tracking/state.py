@@ -46,3 +46,10 @@ class TrackState:
         if self.initialising and keyframes == 1:
             return TrackState(self.map_number)
         return TrackState(self.map_number + 1) if self.lost_frames >= _MAX_LOST_FRAMES and all_searched else None
+
+    def why_waiting(self, keyframes: int, *, is_keyframe: bool) -> str:
+        """Why a frame that some of so many keyframes show has no place on the plane of the map yet."""
+        if not self.initialising:
+            return "it is not linked with the map yet"
+        moved = keyframes > 1 or is_keyframe
+        return "the first keyframes are being aligned" if moved else "the camera has not moved far enough yet"

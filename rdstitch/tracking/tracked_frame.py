@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Features
 from rdstitch.features.corner_flow import corners_of
-from rdstitch.features.prepared_image import PreparedImage
+from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane
 from rdstitch.inputs.odometry import BodyPose
@@ -18,6 +18,7 @@ from rdstitch.tracking.placement import CameraPose, Placement
 
 MIN_INLIERS = 15
 _GRID = 8  # points a side by which it is measured how much two frames share
+_NO_IMAGE = prepare(View(np.zeros((1, 1), np.uint8)), None)  # of frames that are not looked at again
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,13 @@ class Tracked:
         return None if self.placement is None else self.placement.pose
 
 
-@dataclass(eq=False)
-class TrackedFrame:
-    """A frame, and what is known of its place so far."""
+def _nothing_static(points: FloatArray) -> BoolArray:
+    return np.zeros(len(points), dtype=np.bool_)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame as it came."""
 
     number: int
     camera: Camera
@@ -61,12 +66,7 @@ class TrackedFrame:
     detect: Callable[[PreparedImage], Features]
     attitude: FloatArray | None = None  # (S, 2): (ψ, θ) as measured at DELAYS, radians
     body: BodyPose | None = None  # by odometry
-    place: Placement | None = None  # relative to the other keyframes, from the first one on
-    aligned: bool = False  # whether that is on the plane of the map
-    keyframe: bool = False
-    covariance: FloatArray | None = None
-    quality: float = 0.0
-    static: Callable[[FloatArray], BoolArray] = lambda points: np.zeros(len(points), dtype=np.bool_)
+    static: Callable[[FloatArray], BoolArray] = _nothing_static  # which points (N, 2) do not move with the floor
 
     @cached_property
     def corners(self) -> FloatArray:
@@ -80,32 +80,57 @@ class TrackedFrame:
         features = self.detect(self.image)
         return features.take(np.flatnonzero(~self.static(features.points)))
 
-    def unplace(self) -> None:
-        """Forget its place."""
-        self.place, self.aligned, self.covariance = None, False, None
-
-    @property
-    def seen_from(self) -> tuple[complex, float, BodyPose | None] | None:
-        """Place of the camera on the map, x to the right and y to the top, and its yaw, with the body's pose."""
-        pose = self.place.pose if self.aligned and self.place is not None else None
-        return None if pose is None else (complex(pose.x, -pose.y), pose.yaw, self.body)
-
     @property
     def textured(self) -> bool:
         """Whether it shows enough to be placed by."""
         return len(self.corners) >= MIN_INLIERS or len(self.features) >= MIN_INLIERS
 
-    def motion_to(self, other: "TrackedFrame", points: FloatArray) -> FloatArray:
-        """Where another frame shows points (N, 2) of this one, by the places of both."""
-        assert self.place is not None
-        assert other.place is not None
-        return from_plane(other.place.camera, other.place.homography, self.place.to_plane(points))
+    def without_image(self) -> "Frame":
+        """The same where its image is not looked at again."""
+        return replace(self, image=_NO_IMAGE)
 
-    def share_shown_by(self, other: "TrackedFrame") -> float:
-        """Share of the frame that another one shows; 0 where its place is not known."""
-        if self.place is None:
-            return 0.0
-        axes = [(np.arange(_GRID) + 0.5) * side / _GRID - 0.5 for side in self.camera.image_size]
-        points = self.motion_to(other, np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
-        inside = (points >= 0.0).all(axis=1) & (points <= np.array(other.camera.image_size) - 1.0).all(axis=1)
+
+@dataclass(frozen=True, eq=False)
+class MapPlace:
+    """Where a frame lies relative to the keyframes."""
+
+    placement: Placement
+    aligned: bool = False  # whether that is on the plane of the map
+    covariance: FloatArray | None = None  # (4, 4): of x, y, height and yaw; None: not known
+    inliers: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))  # of the matches that it is by
+
+    @property
+    def quality(self) -> float:
+        """Share of the matches that agree; 0 without any."""
+        return float(self.inliers.mean()) if len(self.inliers) else 0.0
+
+    @property
+    def pose(self) -> CameraPose | None:
+        """Pose of the camera on the map."""
+        return self.placement.pose if self.aligned else None
+
+
+@dataclass(eq=False)
+class PlacedFrame:
+    """A frame with its place, instead of which it may be given another one."""
+
+    frame: Frame
+    place: MapPlace
+    keyframe: bool = False
+
+    @property
+    def number(self) -> int:
+        """That of the frame."""
+        return self.frame.number
+
+    def points_in(self, other: "PlacedFrame", points: FloatArray) -> FloatArray:
+        """Where another frame shows points (N, 2) of this one, by the places of both."""
+        there = other.place.placement
+        return from_plane(there.camera, there.homography, self.place.placement.to_plane(points))
+
+    def share_shown_by(self, other: "PlacedFrame") -> float:
+        """Share of the frame that another one shows."""
+        axes = [(np.arange(_GRID) + 0.5) * side / _GRID - 0.5 for side in self.frame.camera.image_size]
+        points = self.points_in(other, np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
+        inside = (points >= 0.0).all(axis=1) & (points <= np.array(other.frame.camera.image_size) - 1.0).all(axis=1)
         return float(inside.mean())

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -11,7 +11,7 @@ from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
 from rdstitch.features import Features, Matcher
 from rdstitch.features.corner_flow import CornerFlow, matched_corners
-from rdstitch.features.prepared_image import PreparedImage, View, prepare
+from rdstitch.features.prepared_image import PreparedImage
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.odometry import BodyPose
 from rdstitch.matching.links import Link
@@ -26,11 +26,10 @@ from rdstitch.tracking.odometry_prediction import OdometryPrediction
 from rdstitch.tracking.placement import Placement
 from rdstitch.tracking.relocalisation import links_with_map
 from rdstitch.tracking.state import TrackState
-from rdstitch.tracking.tracked_frame import Tracked, TrackedFrame
+from rdstitch.tracking.tracked_frame import Frame, MapPlace, PlacedFrame, Tracked
 
 _PATIENCE = 0.015  # seconds a frame that are waited for the first alignment
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
-_NO_IMAGE = prepare(View(np.zeros((1, 1), np.uint8)), None)  # of frames that are not looked at again
 
 
 @dataclass(frozen=True)
@@ -79,18 +78,13 @@ class Tracker:
         ``camera`` is of the size of ``image``; ``attitude`` (S, 2) is ψ and θ, radians, as they were measured at
         :data:`rdstitch.inputs.delays.DELAYS`; ``body`` is by odometry.
         """
-        frame = TrackedFrame(self._count, camera, image, self._detect, attitude, body, static=self._flow.is_static)
+        frame = Frame(self._count, camera, image, self._detect, attitude, body, self._flow.is_static)
         self._count += 1
         if not self._map.keyframes:
             return [self._first(frame, self._map.state)]
         patience = _PATIENCE if self._map.state.initialising else 0.0
-        revised = [] if self._refinement.patient else self._take_over(frame, patience)
-        results = [*revised, *self._registered(frame)]
-        if results[-1].pose is not None and body is not None:
-            self._odometry.latest = frame
-        if not frame.keyframe:
-            frame.image = _NO_IMAGE
-        return results
+        revised = [] if self._refinement.patient else self._take_over(None, patience)
+        return [*revised, *self._registered(frame)]
 
     def finish(self) -> list[Tracked]:
         """Frames that find their place, or another one, when no other frame comes."""
@@ -101,117 +95,141 @@ class Tracker:
             results += self._take_over(None, None)
         return list({result.number: result for result in results}.values())
 
-    def _registered(self, frame: TrackedFrame) -> list[Tracked]:
+    def _registered(self, frame: Frame) -> list[Tracked]:
         """By the corners that were followed, else by links with keyframes, else by odometry."""
-        inliers, links = self._follow(frame), list[Link]()
-        if not inliers or self._is_new(frame):
-            links = links_with_map(frame, self._map, self._match)
-        if links:
-            self._map.settle(frame, links)
-        if frame.place is None:
-            return self._predicted(frame) or [self._without_place(frame)]
-        self._map.state = self._map.state.placed()
-        keyframe = bool(links)
-        if links:
-            inliers, last = max(map(len, links)), self._map.keyframes[-1].number
-            shown = next((link for link in links if link.image1 == last), None)
-            if shown is not None and not self._is_new(frame):
-                self._flow.begin(frame.image, shown.points1, shown.points2)
-                self._map.keep_between(frame, shown.points1, shown.points2)
-                keyframe = False
-        results = self._confirmed_by(frame)
-        if keyframe:
-            results += self._add_keyframe(frame, links)
-        return [*results, self._result(frame, inliers)]
+        placed, links = self._follow(frame), list[Link]()
+        if placed is None or self._is_new(placed):
+            links = links_with_map(frame, placed, self._map, self._match)
+            if (place := self._map.place_by_links(frame, links)) is not None:
+                placed = PlacedFrame(frame, place)
+        if placed is not None:
+            results = self._placed(placed, links)
+        elif (place := self._odometry.place(frame, self._known)) is not None:
+            placed = PlacedFrame(frame, place)
+            results = self._predicted(placed)
+        else:
+            return [self._without_place(frame)]
+        if placed.place.pose is not None and frame.body is not None:
+            self._odometry.latest = placed
+        if not placed.keyframe:
+            placed.frame = frame.without_image()
+        return results
 
-    def _first(self, frame: TrackedFrame, state: TrackState) -> Tracked:
+    def _first(self, frame: Frame, state: TrackState) -> Tracked:
         """The first keyframe of a map."""
         known, self._odometry.latest = self._known, None
-        self._map = KeyframeMap(known, state, [frame])
-        self._refinement.start_map()
-        camera, frame.keyframe = known.camera_of(frame.camera), True
-        frame.place = Placement(camera, np.eye(3), None)
+        camera = known.camera_of(frame.camera)
+        place = MapPlace(Placement(camera, np.eye(3), None))
         known.plane = known.plane or known.given_plane(frame.camera)
         if known.plane is not None:
-            frame.place = known.plane.below(camera, known.attitude(frame))
-            frame.covariance = np.zeros((4, 4))
+            place = MapPlace(known.plane.below(camera, known.attitude(frame)), covariance=np.zeros((4, 4)))
+        first = PlacedFrame(frame, place, keyframe=True)
+        self._map = KeyframeMap(known, state, [first])
+        self._refinement.start_map()
         self._flow.begin(frame.image, frame.corners)
         reason = "first frame" if not state.map_number else "no keyframe shows what it shows: it begins a new map"
-        return self._result(frame, reason=reason if frame.textured else "no floor texture")
+        return self._result(first, reason=reason if frame.textured else "no floor texture")
 
-    def _confirmed_by(self, frame: TrackedFrame) -> list[Tracked]:
+    def _placed(self, placed: PlacedFrame, links: list[Link]) -> list[Tracked]:
+        """A frame that keyframes show; where it has links and shows anything new, it is the next keyframe."""
+        self._map.state = self._map.state.placed()
+        inliers, last = int(placed.place.inliers.sum()), self._map.keyframes[-1].number
+        shown = next((link for link in links if link.image1 == last), None)
+        known = shown is not None and not self._is_new(placed)
+        if shown is not None and known:
+            self._flow.begin(placed.frame.image, shown.points1, shown.points2)
+            self._map.keep_between(placed, shown.points1, shown.points2)
+        results = self._confirmed_by(placed)
+        if links:
+            inliers = max(map(len, links))
+            results += [] if known else self._add_keyframe(placed, links)
+        return [*results, self._result(placed, inliers)]
+
+    def _confirmed_by(self, placed: PlacedFrame) -> list[Tracked]:
         """The first keyframe, where it has its place by what is given, and a second frame shows that it is one."""
         first = self._map.keyframes[0]
-        if self._known.plane is None or first.aligned or len(self._map.keyframes) > 1 or frame.covariance is None:
+        if self._known.plane is None or first.place.aligned or len(self._map.keyframes) > 1:
+            return []
+        if placed.place.covariance is None:
             return []
         self._map.state = self._map.state.with_plane()
-        first.aligned = frame.aligned = True
+        for one in (first, placed):
+            one.place = replace(one.place, aligned=True)
         return [self._result(first, revised=True)]
 
-    def _follow(self, frame: TrackedFrame) -> int:
-        """Place the frame by the corners of the last keyframe; how many agree, 0 where they do not place it."""
+    def _follow(self, frame: Frame) -> PlacedFrame | None:
+        """The frame at its place by the corners of the last keyframe; None where too few of them agree on one."""
         matched, last = self._flow.follow(frame.image), self._map.keyframes[-1]
-        if matched is None:
-            return 0
-        if agree(self._map.place(frame, last, *matched, rough=True)):
-            # Where the view turns, what is followed from frame to frame drifts.
-            now, before = matched_corners(frame.image, last.image, last.corners, partial(last.motion_to, frame))
-            inliers = self._map.place(frame, last, before, now)
-            if agree(inliers):
-                self._flow.begin(frame.image, before, now)
-                self._map.keep_between(frame, before[inliers], now[inliers])
-                return int(inliers.sum())
-        frame.unplace()
-        return 0
+        place = None if matched is None else self._map.place(frame, last, *matched, rough=True)
+        if place is None or not agree(place.inliers):
+            return None
+        # Where the view turns, what is followed from frame to frame drifts.
+        to_frame = partial(last.points_in, PlacedFrame(frame, place))
+        now, before = matched_corners(frame.image, last.frame.image, last.frame.corners, to_frame)
+        place = self._map.place(frame, last, before, now)
+        if place is None or not agree(place.inliers):
+            return None
+        placed = PlacedFrame(frame, place)
+        self._flow.begin(frame.image, before, now)
+        self._map.keep_between(placed, before[place.inliers], now[place.inliers])
+        return placed
 
-    def _predicted(self, frame: TrackedFrame) -> list[Tracked]:
-        """A frame placed by odometry, as the next keyframe where it shows anything new; empty where it cannot be."""
-        if not self._odometry.place(frame, self._known):
-            return []
+    def _predicted(self, placed: PlacedFrame) -> list[Tracked]:
+        """A frame placed by odometry, as the next keyframe where it shows anything new."""
         revised = list[Tracked]()
-        if frame.textured and self._is_new(frame):
+        if placed.frame.textured and self._is_new(placed):
             self._map.state = self._map.state.placed()
-            revised = self._add_keyframe(frame, [])
-        return [*revised, self._result(frame)]
+            revised = self._add_keyframe(placed, [])
+        return [*revised, self._result(placed)]
 
-    def _without_place(self, frame: TrackedFrame) -> Tracked:
+    def _without_place(self, frame: Frame) -> Tracked:
         """A frame that no keyframe shows; after many of them, a new map begins with the last."""
         self._map.state = self._map.state.unplaced()
         if not frame.textured:
-            return self._result(frame, reason="no floor texture")
+            return self._unplaced(frame, "no floor texture")
         state = self._map.state.next_map(len(self._map.keyframes), all_searched=self._map.all_searched)
         if state is not None:
             return self._first(frame, state)
-        return self._result(frame, reason="no keyframe shows what it shows")
+        return self._unplaced(frame, "no keyframe shows what it shows")
 
-    def _is_new(self, frame: TrackedFrame) -> bool:
+    def _is_new(self, placed: PlacedFrame) -> bool:
         """Whether the last keyframe shows too little of it."""
-        return frame.share_shown_by(self._map.keyframes[-1]) < _KEYFRAME_OVERLAP
+        return placed.share_shown_by(self._map.keyframes[-1]) < _KEYFRAME_OVERLAP
 
-    def _add_keyframe(self, frame: TrackedFrame, links: list[Link]) -> list[Tracked]:
+    def _add_keyframe(self, placed: PlacedFrame, links: list[Link]) -> list[Tracked]:
         """Keep the frame; take over an alignment of the last keyframes, which may place others, and begin the next."""
-        self._flow.begin(frame.image, frame.corners)
-        self._map.add(frame, links)
+        self._flow.begin(placed.frame.image, placed.frame.corners)
+        self._map.add(placed, links)
         if self._map.state.initialising:
             self._known.vote(self._map.links)
-        revision, revised = check_camera(self._map, frame, self._tell), list[Tracked]()
-        if revision is not None:
-            if revision.new_focal:
-                self._refinement.drop()
-            if revision.longer is not None:
-                self._map.place_anew(revision.longer)
-            revised = self._revised(self._map.revise(), frame)
-        if frame.body is not None:
+        revised = self._with_checked_camera(placed)
+        if placed.frame.body is not None:
             self._odometry.learn(self._map.by_number.values())
         if self._refinement.is_waited_for(self._map.seen):
-            revised += self._take_over(frame, None)
+            revised += self._take_over(placed, None)
         self._refinement.begin_if_due(self._map)
         return revised
 
-    def _take_over(self, latest: TrackedFrame | None, patience: float | None) -> list[Tracked]:
+    def _with_checked_camera(self, latest: PlacedFrame) -> list[Tracked]:
+        """Earlier frames whose places are others, or surer, by what keyframes show of a camera that was given."""
+        revision = check_camera(self._map, latest.frame)
+        if revision is None:
+            return []
+        for message in revision.messages:
+            self._tell(message)
+        if revision.focal != self._known.focal:
+            self._refinement.drop()
+        self._known.revise(revision)
+        if revision.longer is not None:
+            self._map.place_anew(revision.longer)
+        elif not revision.given_again:
+            return []
+        return self._revised(self._map.revise(), latest)
+
+    def _take_over(self, latest: PlacedFrame | None, patience: float | None) -> list[Tracked]:
         return self._revised(self._refinement.take_over(self._map, patience), latest)
 
-    def _revised(self, frames: Iterable[TrackedFrame], latest: TrackedFrame | None) -> list[Tracked]:
+    def _revised(self, frames: Iterable[PlacedFrame], latest: PlacedFrame | None) -> list[Tracked]:
         return [self._result(frame, revised=True) for frame in frames if frame is not latest]
 
     def _tell(self, message: Message) -> None:
@@ -220,28 +238,31 @@ class Tracker:
         if (message.code or message.text) not in kinds:
             self.messages.append(message)
 
-    def _result(self, frame: TrackedFrame, inliers: int = 0, *, reason: str = "", revised: bool = False) -> Tracked:
-        placement, known, state = frame.place if frame.aligned else None, self._known, self._map.state
-        if placement is not None:
-            reason = "" if placement.pose is not None else "the model has no metric poses"
-        elif not reason and not state.initialising:
-            reason = "it is not linked with the map yet"
-        elif not reason:
-            alone = len(self._map.keyframes) == 1 and not frame.keyframe
-            reason = "the camera has not moved far enough yet" if alone else "the first keyframes are being aligned"
-        pose, (unit, unit_std) = None if placement is None else placement.pose, self._odometry.unit
+    def _result(self, placed: PlacedFrame, inliers: int = 0, *, reason: str = "", revised: bool = False) -> Tracked:
+        place, pose, keyframes = placed.place, placed.place.pose, len(self._map.keyframes)
+        if not place.aligned:
+            reason = reason or self._map.state.why_waiting(keyframes, is_keyframe=placed.keyframe)
+        elif pose is None:
+            reason = "the model has no metric poses"
+        return replace(
+            self._unplaced(placed.frame, reason),
+            placement=place.placement if place.aligned else None,
+            keyframe=placed.keyframe,
+            inliers=inliers,
+            revised=revised,
+            quality=place.quality,
+            covariance=None if pose is None else self._known.covariance(placed, pose),
+        )
+
+    def _unplaced(self, frame: Frame, reason: str) -> Tracked:
+        """A frame without a place, and what is known of its camera."""
+        known, (unit, unit_std) = self._known, self._odometry.unit
         return Tracked(
             number=frame.number,
-            placement=placement,
             distortion=known.distortion,
             distortion_std=known.distortion_std,
             distortion_known=known.distortion_known,
-            map_number=state.map_number,
-            keyframe=frame.keyframe,
-            inliers=inliers,
-            revised=revised,
-            quality=frame.quality,
-            covariance=None if pose is None else known.covariance(frame, pose),
+            map_number=self._map.state.map_number,
             length_std=known.length_std,
             unit=unit,
             unit_std=unit_std,

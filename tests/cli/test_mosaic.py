@@ -12,7 +12,8 @@ import pytest
 from examples.judging import alignment_error
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image, write_image
-from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.matching import prescreen
+from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.pipeline import accept
 from rdstitch.results.messages import Message
 from rdstitch.synthetic import Sequence
@@ -65,9 +66,9 @@ def test_every_image_finds_its_place_whatever_the_prescreen_does(
     frames: list[Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    glance: Callable[[Pairing, list[tuple[int, int]]], dict[tuple[int, int], None]],
+    glance: Callable[[PairEstimator, list[tuple[int, int]]], dict[tuple[int, int], None]],
 ) -> None:
-    monkeypatch.setattr(Pairing, "prescreen_pairs", glance)
+    monkeypatch.setattr(prescreen, "prescreen_pairs", glance)
     rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", "--strict", *CACHED)
 
 

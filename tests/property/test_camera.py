@@ -1,5 +1,7 @@
 """Random cameras: what is undone is as before."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import assume, example, given
@@ -89,11 +91,23 @@ def test_a_camera_turns_with_its_image(orientation: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"distortion": 1.0}, {"distortion": np.nan}, {"focal": 0.0}, {"focal": 1e9}, {"focal_source": "x"}]
+    "bad",
+    [
+        {"distortion": 1.0},
+        {"distortion": np.nan},
+        {"distortion_std": np.nan},
+        {"center": (np.nan, np.nan)},
+        {"focal": 0.0},
+        {"focal": 1e9},
+        {"focal": 500.0, "focal_std": -3.0},
+        {"focal_source": "x"},
+        {"tilt": (np.nan, 0.0)},
+        {"tilt": (0.0, 0.0), "tilt_std": (0.0, np.nan)},
+    ],
 )
-def test_impossible_cameras_are_refused(bad: dict[str, float]) -> None:
+def test_impossible_cameras_are_refused(bad: dict[str, Any]) -> None:
     with pytest.raises(ArgumentError):
-        Camera((640, 480), **bad)  # type: ignore[arg-type]
+        Camera((640, 480), **bad)
 
 
 def _numbers(low: float, high: float) -> st.SearchStrategy[float]:

@@ -30,7 +30,7 @@ def all_solvers(camera: Camera, tilt: tuple[float, float]) -> list[MinimalSolver
     assert camera.focal is not None
     given = partial(minimal_solvers, camera.focal / camera.scale, 0.01)
     told, untold, flat = given(True, None), given(False, None), given(True, 0.0)
-    told = [replace(solver, solve=_with_tilt(solver, tilt)) for solver in told]
+    told = tuple(replace(solver, solve=_with_tilt(solver, tilt)) for solver in told)
     names = {
         "2 points, tilt given": (told, "two_point"),
         "3 points, tilt given, height free": (told, "three_point_similarity"),

@@ -102,6 +102,7 @@ def test_a_focal_length_that_the_images_contradict_is_not_used(factor: float, ri
     alignment = align(told, given.links, AlignmentOptions(lens="division", tilt=tilt if tilt_given else None))
     found = [message for message in alignment.messages if message.code == "focal-contradicted"]
     assert bool(found) is not right
+    assert right or f"they show {alignment.cameras[0].focal:.1f}" in found[0].text
     assert abs(math.log(alignment.cameras[0].focal / true)) < 4.0 * alignment.length_std
     if tilt_given or right:
         assert alignment.length_std < 0.012

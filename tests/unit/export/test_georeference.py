@@ -16,9 +16,10 @@ from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.georeference import Georeference, Located, georeference, world_file_paths
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.crs import Crs, NamedSystem
+from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import from_plane, to_plane
+from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.io import ImageSpec, write_strips
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply

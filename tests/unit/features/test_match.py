@@ -226,6 +226,10 @@ def test_a_rival_within_the_radius_counts_one_at_the_same_place_does_not() -> No
     # Signs must be equal.
     up, down = (features(looks, points, "surf", np.array([sign])) for sign in (1, -1))
     assert [len(match_near(up, other, points, 5.0, known)) for other in (up, down)] == [1, 0]
+    with pytest.raises(ArgumentError, match="different kinds"):
+        match_near(up, features(looks, points, "sift"), points, 5.0, known)
+    with pytest.raises(ArgumentError, match="one match at least"):
+        match_near(up, up, points, 5.0, known[:0])
 
 
 SHIFT = np.array([560.0, 0.0])  # three tenths of the first image are in the second

@@ -14,7 +14,7 @@ from rdstitch.features import Correspondences, FeatureOptions, Features, detect
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
-from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
+from rdstitch.matching.repeated_pattern import _MIN_REPETITION, match_pattern, repetition
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features, show_motion
 from rdstitch.matching.two_view import PairRegistration
@@ -191,8 +191,8 @@ def _features(sequence: Sequence, index: int) -> Features:
 
 def test_boards_repeat_themselves_and_ground_does_not(board: Sequence) -> None:
     plain = sequence_over(partial(ground, seed=3), _LENS, board.poses)
-    assert repetition(_features(board, 0)) > 2 * MIN_REPETITION
-    assert repetition(_features(plain, 0)) < MIN_REPETITION / 2
+    assert repetition(_features(board, 0)) > 2 * _MIN_REPETITION
+    assert repetition(_features(plain, 0)) < _MIN_REPETITION / 2
 
 
 def test_matches_are_right_or_off_by_whole_squares(board: Sequence) -> None:

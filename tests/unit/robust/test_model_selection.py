@@ -8,7 +8,7 @@ import pytest
 
 from rdstitch.alignment.noise import evidence_of
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, damping_by_gain, descend
+from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, _damped_step, damping_by_gain, descend
 from rdstitch.robust.loss import (
     PAIR_WIDTH,
     RAYLEIGH_MEDIAN,
@@ -17,6 +17,7 @@ from rdstitch.robust.loss import (
     noise_of,
     robust_cost,
     robust_weight,
+    sigma_of,
 )
 from rdstitch.robust.model_selection import rms_of
 from rdstitch.robust.posterior import LENS, TILT, Evidence, Prior, exact, focal_prior
@@ -56,6 +57,7 @@ def test_the_noise_is_that_of_the_median_below_the_threshold() -> None:
     np.testing.assert_allclose(noise_of(np.array([[1.0, 2.0, 4.0]]), 10.0), 2.0 / 1.1774)
     # Six numbers to which two parameters were fitted have four degrees of freedom.
     np.testing.assert_allclose(noise_of(np.array([[1.0, 2.0, 4.0]]), 10.0, 2), np.sqrt(6 / 4) * 2.0 / 1.1774)
+    assert sigma_of(np.empty(0)) == np.inf
 
 
 def test_the_loss_is_no_wider_than_the_threshold() -> None:
@@ -266,3 +268,13 @@ def test_a_measurement_and_a_prior_meet_by_their_variances(value: float, std: fl
 def test_near_the_crossing_of_two_parts_they_meet_where_both_together_put_them(value: float, std: float) -> None:
     found = LENS[0].combined(value, std)
     assert LENS[0].slope(found) + (found - value) / std**2 == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_singular_problem_leaves_the_others_as_if_they_were_alone() -> None:
+    damping = np.full(2, 1e-4)
+    singular = 1.0 + (damping[0] + 1e-12)
+    information = np.array([[[2.0, 1.0], [1.0, 3.0]], [[1.0, singular], [singular, 1.0]]])
+    equations = BatchedNormalEquations(np.ones(2), information, np.array([[0.3, -0.7], [1.0, 1.0]]), np.ones((2, 1)))
+    together, alone = _damped_step(equations, damping), _damped_step(equations.take(np.arange(1)), damping[:1])
+    assert together[0].tobytes() == alone[0].tobytes()
+    assert np.isnan(together[1]).all()

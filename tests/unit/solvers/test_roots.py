@@ -8,6 +8,7 @@ import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers.batch import IndexArray
+from rdstitch.solvers.polynomials import bernstein_from_values, chebyshev_nodes
 from rdstitch.solvers.roots import real_roots
 
 
@@ -107,3 +108,9 @@ def test_a_polynomial_without_meaning_has_no_roots(value: float) -> None:
     with np.errstate(invalid="ignore"):
         sample, _ = real_roots(equation, 1, *interval(2))
     assert sample.tolist() == [0]
+
+
+def test_what_is_kept_for_all_cannot_be_changed_by_one() -> None:
+    for kept in (chebyshev_nodes(4), bernstein_from_values(4, 2)):
+        with pytest.raises(ValueError, match="read-only"):
+            kept[0] = 0.0

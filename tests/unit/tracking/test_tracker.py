@@ -257,8 +257,15 @@ def test_where_no_homography_fits_frames_are_lost_and_keyframes_stay(
     )
     later = [tracker.add(image, Camera(SIZE, focal=256.0))[-1] for image in images[12:14]]
     assert [result.placement for result in later] == [None, None]
+    # Keyframes by odometry have no links either: their lengths change all the same.
+    before = [keyframe.place.pose for keyframe in tracker._map.keyframes[1:]]
     tracker._map.place_anew(1.1)
-    assert all(keyframe.place is not None for keyframe in tracker._map.keyframes)
+    after = [keyframe.place.pose for keyframe in tracker._map.keyframes[1:]]
+    tracker._map.links = []
+    tracker._map.place_anew(1.1)
+    again = [keyframe.place.pose for keyframe in tracker._map.keyframes[1:]]
+    for scale, poses in ((1.1, after), (1.21, again)):
+        np.testing.assert_allclose([p.x for p in poses], [scale * p.x for p in before], rtol=1e-9)
 
 
 def test_a_cut_is_no_motion(video: tuple[Sequence, list[NDArray[np.uint8]]]) -> None:

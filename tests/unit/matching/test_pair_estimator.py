@@ -1,4 +1,4 @@
-"""Rounds of pairing: what rests does not hide what moves; pairs that hang on little find more where it must be."""
+"""Rounds of estimator: what rests does not hide what moves; pairs that hang on little find more where it must be."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -12,9 +12,15 @@ from rdstitch.features import Correspondences, Features, match
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.candidate_pairs import loop_closures
 from rdstitch.matching.feature_store import FeatureStore
-from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features
+from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
+from rdstitch.matching.prescreen import prescreen_pairs
+from rdstitch.matching.static_background import (
+    has_static_background,
+    is_static_pair,
+    moving_features,
+    without_static_background,
+)
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.robust import EstimationOptions
 from rdstitch.system.progress import silent
 
@@ -28,7 +34,7 @@ def _features(points: FloatArray, descriptors: FloatArray) -> Features:
     return Features(points, descriptors.astype(np.float32), one, one, one, None, "rootsift", LENS.image_size)
 
 
-def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pairing:
+def _estimator(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> PairEstimator:
     """Images in which some points rest, while a board with others is carried about, or is not there.
 
     Of the points of the board so many look like one another, in fives.
@@ -50,29 +56,27 @@ def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pai
         seen_as = names + rng.normal(scale=0.01, size=names.shape)
         inside = ((points > 0) & (points < (639, 479))).all(axis=1)
         found.append(_features(points[inside], seen_as[inside]))
-    matcher = partial(match, ratio=None)
-    cameras = [LENS.with_focal()] * IMAGES
-    return Pairing(
-        FeatureStore.of(found), cameras, matcher, EstimationOptions(select_below=50), silent, ThreadPoolExecutor(1)
-    )
+    cameras, matching = [LENS.with_focal()] * IMAGES, FeatureMatching(partial(match, ratio=None))
+    options, executor = EstimationOptions(select_below=50), ThreadPoolExecutor(1)
+    return PairEstimator(FeatureStore.of(found), cameras, matching, options, silent, executor)
 
 
 ALL = [(i, j) for i in range(IMAGES) for j in range(i + 1, IMAGES)]
 
 
 def test_a_moving_board_is_found_before_a_static_background() -> None:
-    pairing = _pairing(400, 150)
-    alone = pairing.estimate(ALL)
+    estimator = _estimator(400, 150)
+    alone = estimator.estimate(ALL)
     assert all(is_static_pair(pair, 3.0) for pair in alone)
-    moving = pairing.without_static_background(alone)
+    moving = without_static_background(estimator, alone)
     assert all(pair.relation and not is_static_pair(pair, 3.0) for pair in moving[1])
     distortion = np.median([pair.relation.distortion for pair in moving[1]])
     assert abs(distortion - LENS.distortion) < 0.02
 
 
 def test_matches_of_a_pair_are_read_once_to_find_what_is_static(monkeypatch: pytest.MonkeyPatch) -> None:
-    pairing = _pairing(400, 150)
-    pairs, read, loaded = pairing.estimate(ALL), list[PairRegistration](), PairRegistration.correspondences
+    estimator = _estimator(400, 150)
+    pairs, read, loaded = estimator.estimate(ALL), list[PairRegistration](), PairRegistration.correspondences
 
     def noted(pair: PairRegistration) -> Correspondences:
         read.append(pair)
@@ -81,64 +85,64 @@ def test_matches_of_a_pair_are_read_once_to_find_what_is_static(monkeypatch: pyt
     monkeypatch.setattr(PairRegistration, "correspondences", property(noted))
     has_static_background(pairs, 3.0)
     assert len(read) == len(pairs)
-    moving_features(pairing.features, pairs, 3.0)
+    moving_features(estimator.features, pairs, 3.0)
     assert len(read) == 2 * len(pairs)
 
 
 def test_images_that_are_really_static_stay_together() -> None:
-    pairing = _pairing(400, 0)
-    alone = pairing.estimate(ALL)
-    assert pairing.without_static_background(alone) is None
+    estimator = _estimator(400, 0)
+    alone = estimator.estimate(ALL)
+    assert without_static_background(estimator, alone) is None
     assert all(is_static_pair(pair, 3.0) for pair in alone)
 
 
 def test_an_overlay_is_removed_though_every_pair_moves() -> None:
-    pairing = _pairing(40, 300)
-    alone = pairing.estimate(ALL)
+    estimator = _estimator(40, 300)
+    alone = estimator.estimate(ALL)
     assert not any(is_static_pair(pair, 3.0) for pair in alone)
-    moving = pairing.without_static_background(alone)
+    moving = without_static_background(estimator, alone)
     for before, after in zip(alone, moving[1], strict=True):
         assert len(after.correspondences) <= len(before.correspondences) - 35
         assert after.relation.inliers.sum() >= 0.95 * before.relation.inliers.sum()
 
 
 def test_a_few_static_matches_change_nothing() -> None:
-    pairing = _pairing(4, 300)
-    alone = pairing.estimate(ALL)
-    assert pairing.without_static_background(alone) is None
+    estimator = _estimator(4, 300)
+    alone = estimator.estimate(ALL)
+    assert without_static_background(estimator, alone) is None
 
 
 def test_static_features_that_were_matched_otherwise_are_dropped_too() -> None:
-    pairing = _pairing(40, 300)
-    alone = pairing.estimate(ALL)
+    estimator = _estimator(40, 300)
+    alone = estimator.estimate(ALL)
     wrong = [pair for pair in alone if pair.images != (0, 1)]  # image 0 has its static matches with others
-    left = moving_features(pairing.features, wrong, 3.0)
-    for before, after in zip(pairing.features, left, strict=True):
+    left = moving_features(estimator.features, wrong, 3.0)
+    for before, after in zip(estimator.features, left, strict=True):
         assert len(before) - 48 <= len(after) <= len(before) - 38
 
 
 def test_images_that_share_nothing_are_rejected_by_the_prescreen() -> None:
-    one, other = _pairing(0, 400), _pairing(0, 400, seed=1)
+    one, other = _estimator(0, 400), _estimator(0, 400, seed=1)
     together = replace(one, features=FeatureStore((*one.features.items[:2], *other.features.items[:2])))
-    assert list(together.prescreen_pairs(ALL)) == [(0, 1), (2, 3)]
+    assert list(prescreen_pairs(together, ALL)) == [(0, 1), (2, 3)]
 
 
 def test_a_few_matches_beside_hundreds_do_not_pass_the_prescreen() -> None:
     shared = {(0, 1): 300, (0, 2): 16, (0, 3): 14, (1, 2): 400, (1, 3): 7, (2, 3): 200}
-    pairing = _pairing(0, 400)
+    estimator = _estimator(0, 400)
     # Told apart by their number of features.
-    several = [found.take(np.arange(100 + index)) for index, found in enumerate(pairing.features)]
+    several = [found.take(np.arange(100 + index)) for index, found in enumerate(estimator.features)]
 
     def matcher(one: Features, two: Features) -> Correspondences:
         count = shared[len(one) - 100, len(two) - 100]
         points = np.zeros((count, 2))
         return Correspondences(points.astype(np.intp), points, points, points[:, 0])
 
-    known = replace(pairing, features=FeatureStore.of(several), matcher=matcher)
+    known = replace(estimator, features=FeatureStore.of(several), matching=FeatureMatching(matcher))
     # The most that they share with another: 300, 400, 400 and 200.
-    assert list(known.prescreen_pairs(ALL)) == [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)]
+    assert list(prescreen_pairs(known, ALL)) == [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)]
     shared[0, 3], shared[0, 2] = 9, 14
-    assert list(known.prescreen_pairs(ALL)) == [(0, 1), (1, 2), (2, 3)]
+    assert list(prescreen_pairs(known, ALL)) == [(0, 1), (1, 2), (2, 3)]
 
 
 def test_images_behind_the_horizon_have_no_neighbours() -> None:
@@ -149,8 +153,8 @@ def test_images_behind_the_horizon_have_no_neighbours() -> None:
 
 
 def test_with_a_static_background_every_candidate_pair_is_compared() -> None:
-    pairing = _pairing(400, 150)
+    estimator = _estimator(400, 150)
     # What is static has chosen these.
     few = [pair for pair in ALL if 0 in pair]
-    moving = pairing.without_static_background(pairing.estimate(few), ALL)
+    moving = without_static_background(estimator, estimator.estimate(few), ALL)
     assert [(pair.image1, pair.image2) for pair in moving[1]] == ALL
