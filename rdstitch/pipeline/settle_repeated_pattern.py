@@ -12,6 +12,7 @@ from rdstitch.geometry.radial_homography import RadialHomography, from_plane, to
 from rdstitch.inputs.source import Source
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.repeated_pattern import rematch_elsewhere, shows_repeated_pattern
+from rdstitch.matching.two_view import PairRegistration
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE
