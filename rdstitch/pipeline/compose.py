@@ -23,11 +23,12 @@ from rdstitch.compositing import (
 )
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.tiles import BlockRunner
-from rdstitch.export.georeference import Georeference, has_place, world_file_paths
+from rdstitch.export.georeference import Georeference, world_file_paths
+from rdstitch.export.place_on_map import has_place
 from rdstitch.inputs.source import Source
+from rdstitch.io.formats import check_memory, check_size
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
-from rdstitch.io.write import check_memory, check_size
 from rdstitch.options.upright_options import Corners
 from rdstitch.pipeline.compose_messages import (
     cut_away_messages,
