@@ -60,7 +60,6 @@ class ImageSpec:
     metadata: Metadata = field(default_factory=lambda: Metadata((1, 1)))  # colour profile, EXIF and resolution to keep
     quality: int = 95  # of JPEG and WebP, 1 to 100
     background: int = 0  # grey (0 to 255) of what is transparent, in a format without transparency
-    workers: int = 1  # threads that may encode
 
     def __post_init__(self) -> None:
         if min(self.size) < 1 or self.channels < 1:
@@ -160,10 +159,13 @@ def _reread(spill: IO[bytes], size: tuple[int, int], kind: NDArray[Any]) -> Iter
     spill.close()
 
 
-def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes | memoryview]:
-    """The pieces of a JPEG file, three strips in memory at a time; transparency becomes the background."""
+def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip], workers: int = 1) -> Iterator[bytes | memoryview]:
+    """The pieces of a JPEG file, three strips in memory at a time; transparency becomes the background.
+
+    ``workers``: threads that may encode.
+    """
     first = True
-    for data in _encoded(spec, strips):
+    for data in _encoded(spec, strips, workers):
         head, scan = _header_and_scan(data)
         if first:
             yield from _embedded(_with_height(head, spec.size[1]), spec.metadata)
@@ -174,12 +176,12 @@ def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes | me
     yield _END_OF_IMAGE
 
 
-def _encoded(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes]:
+def _encoded(spec: ImageSpec, strips: Iterable[Strip], workers: int) -> Iterator[bytes]:
     """Each strip as a JPEG file; with several workers, beside what makes the next strips."""
-    if spec.workers == 1:
+    if workers == 1:
         yield from (_jpeg(spec, *strip) for strip in strips)
         return
-    with ThreadPoolExecutor(min(spec.workers, _ENCODERS)) as pool:
+    with ThreadPoolExecutor(min(workers, _ENCODERS)) as pool:
         under_way: deque[Future[bytes]] = deque()
         for strip in strips:
             under_way.append(pool.submit(_jpeg, spec, *strip))

@@ -11,7 +11,7 @@ from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened
 
-_VISIBLE_CUT = 0.02  # share of the images that is cut away, from which on it is said
+_VISIBLE_CUT = 0.02  # share of the images that is cut away, from which on a note says so
 
 
 def masked_messages(placed: PlacedImages) -> list[Message]:
@@ -50,12 +50,14 @@ def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
     if not seams.breaks:
         return []
     worst = list({one.images: one for one in reversed(seams.breaks)}.values())[::-1][:MAX_NAMED]
-    told = []
+    breaks = []
     for one in worst:
         (x, y), (first, second) = one.position, names_of(paths[k] for k in one.images)
-        told.append(f"a break of {one.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}")
+        breaks.append(f"a break of {one.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}")
     more = f", and {rest} more" if (rest := len(seams.breaks) - len(worst)) else ""
-    text = f"{'; '.join(told)}{more}: something moved, or is nearer than the rest; leave one of the two out, or mask it"
+    text = (
+        f"{'; '.join(breaks)}{more}: something moved, or is nearer than the rest; leave one of the two out, or mask it"
+    )
     images = tuple(dict.fromkeys(paths[k] for one in worst for k in one.images))
     return [Message(text, images, "warning" if seams.visible else "detail", code="seam-break")]
 

@@ -21,7 +21,7 @@ from rdstitch.inputs.delays import DELAYS
 from rdstitch.inputs.frame import Frame, Image, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.odometry import BodyPose, Odometry, read_odometry
-from rdstitch.inputs.selection import is_selected, mask_of, with_masks
+from rdstitch.inputs.selection import is_selected, with_masks
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import time_of, timestamps_of
 from rdstitch.io.opening import check_readable
@@ -32,8 +32,7 @@ from rdstitch.pipeline.pose import FollowedPoses, Pose
 from rdstitch.pipeline.read_inputs import read_frames, with_camera_read
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message
-from rdstitch.tracking import Tracked, TrackingOptions
-from rdstitch.tracking import Tracker as FrameTracker
+from rdstitch.tracking import FrameTracker, Tracked, TrackingOptions
 
 _FEATURES = 600  # of a frame, that suffice to follow it
 _MEGAPIXELS = 0.1  # 10⁶ pixels in which they are detected: a frame of 640 x 480 pixels is halved once
@@ -131,7 +130,7 @@ class Tracker:
         self._labels: dict[int, Pose] = {}  # of the frames that may still find their place
         self._numbers = count()
         self.revised: tuple[Pose, ...] = ()
-        self._told = 0  # messages that poses had
+        self._reported = 0  # messages that poses had
 
     @property
     def messages(self) -> tuple[Message, ...]:
@@ -194,10 +193,9 @@ class Tracker:
             return source, None, str(error)
 
     def _measured(self, source: Source) -> list[Source]:
-        """The frame with its mask and attitude; of a folder of masks not every frame needs one."""
+        """The frame with its mask and attitude."""
         options = self._options
-        if options.mask is None or not Path(options.mask).is_dir() or mask_of(source, options.mask) is not None:
-            source = with_masks([source], options.mask)[0]
+        (source,) = with_masks([source], options.mask, all_known=False)
         return [source] if source.attitude is not None else with_attitudes([source], options.attitude)
 
     def register(
@@ -230,9 +228,9 @@ class Tracker:
 
     def _poses_of(self, results: Sequence[Tracked]) -> list[Pose]:
         poses = [replace(self._labels[result.number], tracked=result, reason=result.reason) for result in results]
-        told, self._told = self._frames.messages[self._told :], len(self._frames.messages)
+        new, self._reported = self._frames.messages[self._reported :], len(self._frames.messages)
         if poses:
-            poses[-1] = replace(poses[-1], messages=tuple(told))
+            poses[-1] = replace(poses[-1], messages=tuple(new))
         revisable = self._frames.revisable
         self._labels = {number: known for number, known in self._labels.items() if number in revisable}
         return poses

@@ -156,7 +156,7 @@ def _registered(
             raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
         nominal = _grid(sources, stored, options)
         try:
-            sources, tiled, said = _placed(sources, nominal, options, run.progress)
+            sources, tiled, messages = _placed(sources, nominal, options, run.progress)
             break
         except InputError:
             sources, damaged = _readable(sources)
@@ -164,7 +164,7 @@ def _registered(
                 raise
             unread += damaged
     tiled = replace(tiled, z=options.z, time=options.time)
-    return tiles_as_registration(sources, tiled).with_messages([*unread, *listed.messages, *notes, *said]), tiled
+    return tiles_as_registration(sources, tiled).with_messages([*unread, *listed.messages, *notes, *messages]), tiled
 
 
 def _of_one_kind(sources: list[Source], strict: bool) -> tuple[list[Source], list[Message]]:
@@ -203,25 +203,25 @@ def _placed(
 ) -> tuple[list[Source], TileRegistration, list[Message]]:
     """The tiles with their illumination taken out, where they are, and what there is to say of that."""
     if len({source.camera.image_size for source in sources}) > 1:
-        said = [Message("tiles of several sizes have no flat field in common", severity="note", code="flat-field")]
+        messages = [Message("tiles of several sizes have no flat field in common", severity="note", code="flat-field")]
         if options.flat_field not in ("auto", "off") or isinstance(options.distortion, float):
             raise ArgumentError("tiles of several sizes have neither a flat field nor a lens in common")
     else:
-        sources, said = with_flat_field(sources, options.flat_field)
+        sources, messages = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
     plan = SearchPlan.of(nominal, options.search)
     factor = plan.factor
     grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
     if shown:
-        said.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
+        messages.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
     tiled = register_tiles(replace(plan, grid=grid), read, distortion=options.distortion, progress=progress)
     for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
         read(index)
     if options.flat_field == "auto" and sources[0].flat_field is not None and not _overlaps_show(sources, tiled):
-        sources, said = [replace(source, flat_field=None) for source in sources], [*said[1:], NO_FLAT_FIELD]
-    return sources, tiled, said
+        sources, messages = [replace(source, flat_field=None) for source in sources], [*messages[1:], NO_FLAT_FIELD]
+    return sources, tiled, messages
 
 
 def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
@@ -289,6 +289,6 @@ def _grid(sources: Sequence[Source], stored: Mapping[Path, StoredTile], options:
         numbers = [source.number(k) for k, source in enumerate(sources)]
         grid = grid_from_arrays(options.positions, numbers, size, pixel_size)
     else:
-        told = [stored.get(source.path) or StoredTile(source.path, {}) for source in sources]
-        grid = grid_from_tiles(told, size, options.pixel_size)
+        known = [stored.get(source.path) or StoredTile(source.path, {}) for source in sources]
+        grid = grid_from_tiles(known, size, options.pixel_size)
     return grid if (sizes == sizes[0]).all() else replace(grid, own_sizes=sizes)
