@@ -117,7 +117,7 @@ def _check_files(
     if stitch.save_camera is not None:
         format_of(stitch.save_camera, stitch.camera_format)
         planned.append(stitch.save_camera)
-    check_outputs([*planned, *others, *files_beside(beside, [])], stitch.overwrite, [source])
+    check_outputs([*planned, *others, *files_beside(beside, output, [])], stitch.overwrite, [source])
 
 
 def _print_poses(

@@ -60,9 +60,6 @@ class FilesBeside:
         check_options(self)
         if self.whole_layers and self.layers is None:
             raise ArgumentError("whole layers need a folder of layers: --whole-layers goes with --layers DIR")
-        if self.map_server is not None and self.height is None:
-            text = "--map-server is in metres: give the height of the first image's camera with --height"
-            raise ArgumentError(text)
         if self.report is not None:
             from rdstitch.system.outputs import check_suffix
 

@@ -67,10 +67,12 @@ def map_files(folder: Path) -> list[Path]:
     return [folder / "map.yaml", folder / "map.png"]
 
 
-def check_map_server(output: Path) -> None:
+def check_map(output: Path, height: float | None) -> None:
     """Refuse an output of which no map can be made."""
     if (suffix := output.suffix.lower()) in (".dzi", ".zarr"):
         raise ArgumentError(f"--map-server is made from the output: write .png, .jpg or .tif instead of {suffix}")
+    if height is None:
+        raise ArgumentError("--map-server is in metres: give the height of the first image's camera with --height")
 
 
 def _pixel_to_metres(result: StitchResult, height: float) -> FloatArray:

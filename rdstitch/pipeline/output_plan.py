@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.pipeline.compose import image_files
-from rdstitch.pipeline.map_server import check_map_server, map_files, write_map
+from rdstitch.pipeline.map_server import check_map, map_files, write_map
 from rdstitch.pipeline.result_files import layer_files, make_folder, poses_file, write_layers
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
@@ -15,10 +15,11 @@ from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, text_bytes
 
 
-def files_beside(beside: FilesBeside, names: Iterable[str]) -> list[Path]:
-    """All files beside the result of images of these names; makes the folders of the layers and of the map."""
+def files_beside(beside: FilesBeside, output: Path | None, names: Iterable[str]) -> list[Path]:
+    """All files beside the output of images of these names; makes the folders of the layers and of the map."""
     files = [file for file in (beside.report, beside.hugin_project, beside.poses) if file is not None]
-    if beside.map_server is not None:
+    if beside.map_server is not None and output is not None:
+        check_map(output, beside.height)
         make_folder(beside.map_server)
         files += map_files(beside.map_server)
     if beside.layers is not None:
@@ -82,12 +83,10 @@ def check_run(
     options = run.options
     images = [*([] if run.output is None else [run.output]), *further]
     files = [file for image in images for file in image_files(check_suffix(image))]
-    if run.beside.map_server is not None and run.output is not None:
-        check_map_server(Path(run.output))
     if options.save_camera is not None:
         from rdstitch.camera_files import format_of
 
         format_of(options.save_camera, options.camera_format)
         files.append(options.save_camera)
-    files += [*others, *files_beside(run.beside, names)]
+    files += [*others, *files_beside(run.beside, None if run.output is None else Path(run.output), names)]
     check_outputs(files, options.overwrite, [*inputs, *options.files])
