@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.pipeline.compose import image_files
-from rdstitch.pipeline.map_server import check_map, map_files, write_map
+from rdstitch.pipeline.map_server import check_map_server, map_files, write_map
 from rdstitch.pipeline.result_files import layer_files, make_folder, poses_file, write_layers
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
@@ -19,7 +19,7 @@ def files_beside(beside: FilesBeside, output: Path | None, names: Iterable[str])
     """All files beside the output of images of these names; makes the folders of the layers and of the map."""
     files = [file for file in (beside.report, beside.hugin_project, beside.poses) if file is not None]
     if beside.map_server is not None and output is not None:
-        check_map(output, beside.height)
+        check_map_server(output, beside.height)
         make_folder(beside.map_server)
         files += map_files(beside.map_server)
     if beside.layers is not None:
