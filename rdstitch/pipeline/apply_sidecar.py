@@ -26,7 +26,7 @@ from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recomposition import Recomposition
 from rdstitch.pipeline.replacements import Replacements, read_replacements
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.straighten import turned_anew
+from rdstitch.pipeline.straighten import reoriented
 from rdstitch.results.messages import Message
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
 from rdstitch.sidecar.write_applied import applied_sidecar
@@ -164,7 +164,7 @@ def _laid_out(
     lens, messages = (None, []) if tiles else _lens_of_band(saved, given.frames, sources, progress)
     if lens is not None:
         sources = {index: replace(source, camera=lens.camera(source.camera)) for index, source in sources.items()}
-    placed, of_turn = turned_anew(_placed(saved, sources, lens), composite, saved.composite)
+    placed, of_turn = reoriented(_placed(saved, sources, lens), composite, saved.composite)
     if (grid := _same_grid(saved, sources, composite)) is not None:
         placed, composite = replace(placed, grid=grid), replace(composite, crop="none")
     return Layout.of(placed, composite), composite, [*messages, *of_turn]

@@ -21,14 +21,16 @@ from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import timestamps_of, with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty, with_reference_of
+from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.along_odometry import along_odometry, with_odometry_of_bag
-from rdstitch.pipeline.choose_layout import LaidOut, choose_layout
+from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import check_world_files, compose_images
 from rdstitch.pipeline.deep_zoom_page import viewed_images, write_page
+from rdstitch.pipeline.lay_out import LaidOut
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.output_plan import check_run, report_refused, stage_beside
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag, with_camera_read
+from rdstitch.pipeline.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.remote_blocks import blocks_on
 from rdstitch.pipeline.run import Run
@@ -304,7 +306,8 @@ def _accepted(
         first = accepted.alignment.used.tolist().index(True)
         if run.beside.frame == "first" and accepted.alignment.reference != first:
             run = replace(run, options=replace(run.options, reference=accepted.sources[first].name))
-            accepted = accept(with_reference_of(registration, run), run)
+            again = with_reference_of(registration, aligner_of(registration, run.options, run.purpose))
+            accepted = accept(again, run)
         return accepted, run
     except RegistrationError as error:
         unread = [message for message in known if message.severity == "left out"]
