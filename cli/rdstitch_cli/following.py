@@ -68,7 +68,7 @@ def followed(
     ``refresh`` is None where no image is made; ``plot`` will be written at the end too. ``poses`` says how poses are
     printed: as the file that is written at the end has them.
     """
-    from rdstitch.inputs.arrivals import Arrivals
+    from rdstitch.inputs.arrivals import open_arrivals
     from rdstitch.system.file_access import file_state
     from rdstitch.system.temporary_folder import TemporaryFolder
 
@@ -79,7 +79,7 @@ def followed(
     _check_files(source, stitch, output, [file for file in (preview, plot) if file is not None], beside, refresh)
     before = file_state(preview) if preview else None
     with TemporaryFolder() as folder:
-        arrivals = Arrivals(
+        arrivals = open_arrivals(
             str(inputs[0]),
             frames_folder=lambda: folder,
             names=sys.stdin,

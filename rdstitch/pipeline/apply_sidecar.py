@@ -31,7 +31,7 @@ from rdstitch.results.messages import Message
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
 from rdstitch.sidecar.write_applied import applied_sidecar
 from rdstitch.stage.tile_frames import with_position_folders
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent
 
@@ -52,7 +52,7 @@ _GEOMETRY = (
 """Options of compositing that say which pixels the output has."""
 
 
-@one_opencv_thread()
+@one_native_thread()
 def apply(
     sidecar: str | Path | SavedRegistration,
     images: Images,

@@ -15,8 +15,8 @@ from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import ImageSpec, write_strips
-from rdstitch.io.encoding import Strip
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.strips import Strip
 from rdstitch.io.tiff import written_strips
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
@@ -29,7 +29,7 @@ from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.read import read_sidecar
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_outputs
 from rdstitch.system.progress import Progress, StageTimer, silent
 
@@ -44,7 +44,7 @@ def parse_bands(text: str) -> dict[str, str]:
     return bands
 
 
-@one_opencv_thread()
+@one_native_thread()
 def mosaic_bands(
     inputs: Images,
     output: str | Path,

@@ -44,7 +44,7 @@ from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.system.outputs import Outputs, check_outputs, text_bytes
 from rdstitch.system.process_memory import return_freed_memory
-from rdstitch.viewer import viewer_path
+from rdstitch.viewer.page import viewer_path
 
 
 @dataclass(frozen=True)

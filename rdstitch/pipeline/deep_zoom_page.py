@@ -9,7 +9,7 @@ from rdstitch.compositing import Canvas
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import OutputImage, StitchResult
 from rdstitch.system.outputs import Outputs
-from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
+from rdstitch.viewer.page import ViewedImage, viewer_page, viewer_path
 
 
 def write_page(result: OutputImage, outputs: Outputs, images: Callable[[], Sequence[ViewedImage]]) -> list[Message]:

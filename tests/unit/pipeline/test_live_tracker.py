@@ -235,5 +235,6 @@ def test_masks_lie_in_folders_as_their_frames_do(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("rdstitch.inputs.selection.os.walk", listed)
     source, _, _ = tracker.read(Frame(tmp_path / "frames" / "east" / "f.png", label="east/f.png"))
     assert source is not None
-    assert source.mask == tmp_path / "masks" / "east" / "f.png"
+    assert source.mask is not None
+    assert source.mask.path == tmp_path / "masks" / "east" / "f.png"
     listed.assert_called_once()
