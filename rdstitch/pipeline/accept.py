@@ -76,10 +76,7 @@ def accept(registration: Registration, run: Run) -> Registration:
 
 
 def _repairs(
-    first: _Checked,
-    check: Callable[[Registration], _Checked],
-    undamaged: Registration | None,
-    aligner: Aligner,
+    first: _Checked, check: Callable[[Registration], _Checked], undamaged: Registration | None, aligner: Aligner
 ) -> Iterator[_Checked]:
     """What may pass where ``first`` fails: without damaged files, the plane of most images, without what fails."""
     if undamaged is not None and not (checked := check(undamaged)).failures:

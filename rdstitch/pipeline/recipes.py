@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.errors import RegistrationError
@@ -18,11 +17,12 @@ from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.times import timestamps_of, with_times
+from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept, scale_uncertainty
-from rdstitch.pipeline.along_odometry import along_odometry, with_odometry_of_bag
+from rdstitch.pipeline.along_odometry import with_odometry_of_bag
+from rdstitch.pipeline.camera_path import camera_path
 from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import check_world_files, compose_images
 from rdstitch.pipeline.deep_zoom_page import viewed_images, write_page
@@ -250,17 +250,17 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = replace(options or StitchOptions(), pose_covariance=True)
-    replaced: list[Path] = []  # a bag that is a folder
     if layout == "bag" and output is not None:
         check_bag(Path(output), overwrite=options.overwrite)
-        replaced = [Path(output)] if Path(output).is_dir() and options.overwrite else []
     given = as_inputs(inputs, options.channel_order)
     options, notes = with_camera_in_bag(given, options)
     options = with_odometry_of_bag(given, options)
     with found_images(given, every=every, topic=options.topic) as listed:
         files = [Path(file) for file in (output, plot) if file is not None]
-        check_outputs([f for f in files if f not in replaced], options.overwrite, [*listed.files, *options.files])
-        check_not_read(replaced, [Path(name) for name in given if not isinstance(name, Frame)])
+        # The bag of ROS 2 is a folder, which another one takes the place of.
+        bags = [file for file in files[:1] if layout == "bag" and file.is_dir() and options.overwrite]
+        check_outputs([f for f in files if f not in bags], options.overwrite, [*listed.files, *options.files])
+        check_not_read(bags, [Path(name) for name in given if not isinstance(name, Frame)])
         # Numbered as they were named: what is left out leaves a gap.
         frames = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
         guard = InputGuard(options.strict)
@@ -269,16 +269,8 @@ def trajectory(
         with run.executor(len(sources)) as executor:
             accepted, _ = _accepted(sources, [*unread, *listed.messages, *notes], run, executor)
     registration = _finished(at_full_size(accepted), run)
-    registration = registration.with_messages(scale_uncertainty(registration.alignment))
-    # Of the camera itself, whatever EXIF says of how its images are looked at.
-    stored = QuarterTurns.of(registration.sources).stored_alignment(registration.alignment)
-    path = Trajectory.from_alignment(stored, height or 1.0)
-    if options.odometry is not None:
-        path, notes = along_odometry(path, sources, options.odometry, keep_unit=height is not None)
-        registration = registration.with_messages(notes)
-    path = path.labelled(
-        [s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], timestamps_of(sources)
-    )
+    path, messages = camera_path(registration, options.odometry, height)
+    registration = registration.with_messages([*scale_uncertainty(registration.alignment), *messages])
     if layout in ("tum", "bag") and not has_times(path):
         registration = registration.with_messages([_NO_TIMES])
     with Outputs(options.overwrite) as outputs:

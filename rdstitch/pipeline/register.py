@@ -39,11 +39,7 @@ _STATIC_BACKGROUND = Message(
 
 
 @impossible_estimates_fail()
-def register(
-    sources: Sequence[Source],
-    run: Run,
-    executor: Executor,
-) -> Registration:
+def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registration:
     """Detect features, register pairs, and align all images as one.
 
     Once there are poses, images that these put beside each other are tried too (loop closures), and every pair of an
@@ -65,15 +61,7 @@ def register(
     candidates = first_pairs(features, options.seed, positions_of(sources))
     return_freed_memory()
     estimator = PairEstimator(
-        features,
-        cameras,
-        _matching(options),
-        options.estimation,
-        progress,
-        executor,
-        cache,
-        store,
-        aligner.exact_tilts,
+        features, cameras, _matching(options), options.estimation, progress, executor, cache, store, aligner.exact_tilts
     )
     pairs = estimate_candidates(estimator, candidates)
     moving = without_static_background(estimator, pairs, candidates)

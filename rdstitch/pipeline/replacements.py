@@ -30,11 +30,7 @@ class Replacements:
 
 
 def read_replacements(
-    saved: SavedRegistration,
-    frames: Sequence[Frame],
-    options: ApplyOptions,
-    guard: InputGuard,
-    max_memory: int | None,
+    saved: SavedRegistration, frames: Sequence[Frame], options: ApplyOptions, guard: InputGuard, max_memory: int | None
 ) -> Replacements:
     """Find, read and correct the images of the output: at least one, or, if strict, all that were registered."""
     messages: list[Message] = []

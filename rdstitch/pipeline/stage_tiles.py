@@ -237,11 +237,7 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
 
 
 def _write_beside(
-    outputs: Outputs,
-    file: str | Path | None,
-    options: TileOptions,
-    registration: Registration,
-    tiled: TileRegistration,
+    outputs: Outputs, file: str | Path | None, options: TileOptions, registration: Registration, tiled: TileRegistration
 ) -> None:
     """The table of places, and the flat field, where they are wanted."""
     if file is not None:

@@ -88,15 +88,7 @@ def trajectory(
         else:
             paths = resolve(inputs)
         _, registration = recipe(
-            paths,
-            output,
-            options,
-            layout=layout,
-            plot=plot,
-            height=height,
-            frame=frame,
-            every=every,
-            progress=reporter,
+            paths, output, options, layout=layout, plot=plot, height=height, frame=frame, every=every, progress=reporter
         )
         if following:
             print_result(registration, reporter, output)
