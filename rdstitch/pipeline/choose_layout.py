@@ -72,7 +72,7 @@ class _Trials:
         laid_out = lay_out(whole, local, options.composite)
         if options.dry_run:
             return laid_out
-        return replace(laid_out, layout=laid_out.layout.decided(options.composite, options.threads))
+        return replace(laid_out, layout=laid_out.layout.decided(options.compositing))
 
     def attempt(self, registration: Registration) -> LaidOut | None:
         """The same of an alternative; None where it has no canvas, or none that the options can turn."""
