@@ -14,7 +14,6 @@ from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.results.messages import Message, names_of
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
-from rdstitch.verification.limits import limit
 from rdstitch.verification.rival_planes import planes_of_pairs, second_motions
 
 Offenders = Mapping[tuple[int, ...], Message]
@@ -27,11 +26,16 @@ def aligner_of(registration: Registration, options: StitchOptions, purpose: Purp
     return replace(aligner, needs_poses=purpose.poses)
 
 
+def with_reference_of(registration: Registration, aligner: Aligner) -> Registration:
+    """The pairs of a registration aligned anew, in the frame of the reference image of the aligner."""
+    return _aligned_anew(registration, aligner.align(registration.pairs), aligner, {})
+
+
 def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Alignment], bool]) -> Registration | None:
-    """The images that are used aligned by another aligner; None where a draft does not fit, or is not wanted."""
+    """The images that are used aligned by another aligner; None where a draft is not wanted."""
     try:
         draft = aligner.draft(_between_used(registration))
-        if draft.alignment.rms > limit("error of rough ground") * aligner.threshold or not wanted(draft.alignment):
+        if not wanted(draft.alignment):
             return None
         return _aligned_anew(registration, aligner.completed(draft), aligner, {})
     except RegistrationError:

@@ -1,6 +1,7 @@
 """Layouts that are chosen by their seams, and what is said of those that break."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,15 @@ from rdstitch.executors import open_executor
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.choose_layout import choose_layout
-from rdstitch.pipeline.compose import Layout, seam_messages
+from rdstitch.pipeline.choose_layout import _error, choose_layout
+from rdstitch.pipeline.compose import Layout
+from rdstitch.pipeline.compose_messages import seam_messages
 from rdstitch.pipeline.lay_out import is_stretched
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.realign import aligner_of, by_second_motions
 from rdstitch.pipeline.recipes import mosaic, pano
 from rdstitch.pipeline.register import register
+from rdstitch.pipeline.run import Run
 from rdstitch.synthetic.textures import ground
 from tests.registrations import CAMERA, source
 
@@ -58,12 +61,14 @@ def test_images_aligned_by_the_surface_whose_seams_break_are_aligned_by_the_othe
     options = StitchOptions(workers=1, local_alignment="off", model="rigid", distortion=0.0)
     sources = read_sources(_of_two_surfaces(tmp_path), camera=None, focal=None, distortion=0.0, skip_bad=False)[0]
     with open_executor(1, len(sources)) as executor:
-        far = register(sources, options, executor)
+        far = register(sources, Run(options), executor)
     aligner = aligner_of(far, options, Purpose.MOSAIC)
     near = by_second_motions(far, [(0, 1)], aligner)
     assert near is not None
     offsets = [one.alignment.transfer(0, 1, np.array([[380.0, 240.0]]))[0] for one in (far, near)]
     np.testing.assert_allclose(offsets[1] - offsets[0], [9.0, 13.0], atol=0.5)
+    assert _error(near) < 1.0
+    assert _error(replace(far, alignment=near.alignment)) > 10.0  # the far matches count, though none of them fits
     for given in (far, near):
         chosen = choose_layout(given, options, aligner).registration.alignment
         np.testing.assert_allclose(chosen.transfer(0, 1, np.array([[380.0, 240.0]]))[0], offsets[0], atol=0.1)
