@@ -16,9 +16,9 @@ from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason, names_of
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
-from rdstitch.verification.evidence import Evidence
+from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Scope, messages_of
-from rdstitch.verification.limits import limit
+from rdstitch.verification.limits import Limits
 from rdstitch.verification.rival_planes import planes_of_pairs
 from rdstitch.verification.verdict import RefusedError, judge
 
@@ -41,7 +41,7 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
         registration, undamaged = undamaged, None
 
     def checked(candidate: Registration) -> tuple[Finding, ...]:
-        return judge(Evidence(candidate, options.threshold, options.threads, aligner.cache, purpose))
+        return judge(ResultEvidence(candidate, options.threshold, options.threads, aligner.cache, purpose))
 
     current, findings = registration, checked(registration)
     first, first_findings = registration, findings
@@ -85,7 +85,7 @@ def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Al
     """The pairs of a registration aligned by another aligner; None where a draft does not fit, or is not wanted."""
     try:
         draft = aligner.draft(registration.pairs)
-        if draft.alignment.rms > limit("error of rough ground") * aligner.threshold or not wanted(draft.alignment):
+        if draft.alignment.rms > Limits.rough_error.value * aligner.threshold or not wanted(draft.alignment):
             return None
         return _aligned_anew(registration, aligner.completed(draft), aligner.paths, {})
     except RegistrationError:
@@ -226,7 +226,7 @@ def _aligned_anew(
 
 def scale_uncertainty(alignment: Alignment) -> list[Message]:
     """A warning where the focal length, and with it the length of every step, is hardly known."""
-    if not alignment.length_std > limit("length"):
+    if not alignment.length_std > Limits.length_std.value:
         return []
     off = f"all lengths may be off together by {alignment.length_std:.0%}"
     text = f"{off}: the images hardly show the focal length; give --focal"
