@@ -4,11 +4,7 @@ A homography ``G`` maps the half-diagonal-normalized undistorted coordinates of 
 which have no unit; the canvas is the plane scaled, turned and shifted to pixels. Where images were taken by turning
 on the spot, G maps them to directions, and the canvas is what a projection makes of these.
 
-Of an oblique image the near part is drawn, which is not much coarser than the reference image. A plane seen obliquely
-gets coarser towards the horizon, along the line of sight with the square of the distance. The distance is one over the
-third coordinate of ``G p``, undistorted points p of the image mapped to the plane; so a limit on the stretch is, in
-undistorted coordinates, a straight line parallel to the horizon. What the lens itself stretches, towards the corners
-of a wide-angle image, does not count.
+Of an oblique image the near part is drawn (:mod:`rdstitch.compositing.near_part`).
 """
 
 import math
@@ -16,129 +12,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box
+from rdstitch.compositing.near_part import POINTS_PER_SIDE, PROBES, NearPart, near_parts
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.geometry.radial_homography import to_directions, to_plane
-from rdstitch.io.read import DecodedImage
 
-_PROBES = 33  # points of a grid over the image, and along its outline, a side, at which the stretch is measured
-_POINTS_PER_SIDE = 64  # as the canvas samples outlines: undistorted, straight sides are curved
-_ROWS = 64  # rows of a mask that are computed at a time, so that they stay in the processor's cache
-
-
-@dataclass(frozen=True, eq=False)
-class NearPart:
-    """The part of an image that is drawn."""
-
-    camera: Camera
-    # (3,): what is drawn has ``depth · (x, y, 1) > 0``; x, y undistorted, in half diagonals from the distortion centre
-    depth: FloatArray
-
-    def outline(self) -> FloatArray:
-        """Its border, measured pixels (K, 2), clockwise; empty where nothing is drawn."""
-        border = self.camera.outline(_POINTS_PER_SIDE)
-        flat = self.camera.normalize(self.camera.undistort(border))
-        inside = self._value(flat) > 0.0
-        if inside.all() or not inside.any():
-            return border if inside.all() else np.empty((0, 2))
-        # Begin where the border comes back from beyond the limit, so that the drawn part is in one piece.
-        start = int(np.flatnonzero(inside & ~np.roll(inside, 1))[0])
-        border, flat, inside = np.roll(border, -start, axis=0), np.roll(flat, -start, axis=0), np.roll(inside, -start)
-        last = int(np.flatnonzero(inside)[-1])
-        ends = [self._crossing(flat[last], flat[(last + 1) % len(flat)]), self._crossing(flat[-1], flat[0])]
-        cut = ends[0] + np.linspace(0.0, 1.0, _POINTS_PER_SIDE)[:, None] * (ends[1] - ends[0])
-        measured = np.asarray(self.camera.distort(self.camera.denormalize(cut)))
-        kept = border[: last + 1][inside[: last + 1]]
-        return np.concatenate([kept, measured[np.isfinite(measured).all(axis=1)]])
-
-    def shows(self, points: FloatArray) -> NDArray[np.bool_]:
-        """Which measured pixels (K, 2) are drawn."""
-        with np.errstate(invalid="ignore"):
-            return np.asarray(self._value(self.camera.normalize(self.camera.undistort(points))) > 0.0)
-
-    def masked(self, image: DecodedImage) -> DecodedImage:
-        """The image, whole or reduced, with the rest transparent."""
-        height, width = image.pixels.shape[:2]
-        shown = self._shown(width, height)
-        alpha = np.where(shown, np.uint8(255) if image.alpha is None else image.alpha, np.uint8(0))
-        return replace(image, alpha=alpha)
-
-    def _shown(self, width: int, height: int) -> NDArray[np.bool_]:
-        """Which pixels of the image at a size are drawn; in measured coordinates the limit is a conic."""
-        camera = self.camera.resized((width, height))
-        x = (np.arange(width) - camera.center[0]) / camera.scale
-        shown = np.empty((height, width), dtype=np.bool_)
-        for top in range(0, height, _ROWS):
-            y = ((np.arange(top, min(top + _ROWS, height)) - camera.center[1]) / camera.scale)[:, None]
-            radius2 = x**2 + y**2
-            lens = np.zeros_like(radius2)
-            for coefficient in (*reversed(camera.coefficients), 1.0):  # Horner's scheme, in place
-                lens *= radius2
-                lens += coefficient
-            shown[top : top + _ROWS] = self.depth[0] * x + self.depth[1] * y + self.depth[2] * lens > 0.0
-        return shown
-
-    def _value(self, flat: FloatArray) -> FloatArray:
-        """What is positive where undistorted points (K, 2) are drawn."""
-        value: FloatArray = flat @ self.depth[:2] + self.depth[2]
-        return value
-
-    def _crossing(self, inside: FloatArray, outside: FloatArray) -> FloatArray:
-        """Where the line between two undistorted points meets the limit."""
-        a, b = self._value(np.stack([inside, outside]))
-        crossing: FloatArray = inside + (outside - inside) * (a / (a - b))
-        return crossing
-
-
-def near_parts(
-    cameras: Sequence[Camera], homographies: Sequence[FloatArray], resolution: float, max_stretch: float
-) -> list[NearPart | None]:
-    """What of each image is drawn; None for all of it.
-
-    ``homographies`` lead to the plane, with positive third coordinates in front of the camera; at ``resolution`` canvas
-    pixels per unit of it the reference image keeps its size.
-    """
-    parts: list[NearPart | None] = []
-    if max_stretch == np.inf:
-        return [None] * len(cameras)
-    for camera, matrix in zip(cameras, homographies, strict=True):
-        stretch, depth = _stretch(camera, matrix, resolution)
-        finest = max(1.0, float(stretch.min()))
-        beyond = depth[stretch > max_stretch * finest]
-        if not len(beyond):
-            parts.append(None)
-            continue
-        parts.append(NearPart(camera, matrix[2] - np.array([0.0, 0.0, max(float(beyond.max()), 0.0)])))
-    return parts
-
-
-def _stretch(camera: Camera, matrix: FloatArray, resolution: float) -> tuple[FloatArray, FloatArray]:
-    """Canvas pixels per undistorted pixel, in the direction in which they are most, and depth, over an image (K,)."""
-    grid = points_over(camera.image_size, _PROBES)
-    drawn = grid[np.linalg.norm(grid - camera.center, axis=1) <= camera.drawn_radius]
-    flat = camera.normalize(camera.undistort(np.concatenate([drawn, camera.outline(_PROBES)])))
-    flat = flat[np.isfinite(flat).all(axis=1)]  # a fisheye may see beyond its horizon
-    moved = flat @ matrix[:, :2].T + matrix[:, 2]
-    depth: FloatArray = moved[:, 2]
-    with np.errstate(all="ignore"):
-        plane = moved[:, :2] / depth[:, None]
-        jacobian = (matrix[None, :2, :2] - plane[:, :, None] * matrix[None, 2:, :2]) / depth[:, None, None]
-        (a, b), (c, d) = jacobian.transpose(1, 2, 0)
-        # Its larger singular value: half the sum of two lengths.
-        largest = (np.hypot(a + d, b - c) + np.hypot(a - d, b + c)) / 2.0 * resolution / camera.scale
-    return np.where(depth > 0.0, largest, np.inf), depth
-
-
-# Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 pixels on 4000 pixels.
 _MAX_GROWTH = 100.0
 _MAX_ENLARGEMENT = 400.0  # pixels of the canvas for each of the images, where --scale requests it
-
-
 _LEVEL = 1e-9  # rounding of what a turn within the plane leaves as it is
 
 
@@ -219,7 +104,7 @@ class Canvas:
         """Share of what the images show that has no place here, because it would be stretched too much."""
         drawn = []
         for k, (camera, matrix) in enumerate(zip(cameras, homographies, strict=True)):
-            points = points_over(camera.image_size, _PROBES)
+            points = points_over(camera.image_size, PROBES)
             part, places = self.near[k] if self.near else None, self.place(camera, matrix, points)
             with np.errstate(invalid="ignore"):
                 beside = (places < -1.0) | (places > np.array(self.size))
@@ -248,9 +133,14 @@ class Canvas:
         width, height = (-(-n // factor) for n in self.size)
         shift = 0.5 / factor - 0.5
         to_reduced = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift], [0.0, 0.0, 1.0]])
-        footprints = tuple(outline / factor + shift for outline in self.footprints)
-        period = None if self.period is None else self.period / factor
-        return Canvas((width, height), to_reduced @ self.matrix, footprints, self.projection, period, self.near)
+        return replace(
+            self,
+            size=(width, height),
+            matrix=to_reduced @ self.matrix,
+            footprints=tuple(outline / factor + shift for outline in self.footprints),
+            period=None if self.period is None else self.period / factor,
+            cropped_to=None,  # what a crop leaves is decided at full size
+        )
 
 
 def plan_canvas(
@@ -327,7 +217,7 @@ def _oriented(camera: Camera, matrix: FloatArray) -> FloatArray:
 
 def _outline_on_plane(camera: Camera, matrix: FloatArray, near: NearPart | None, name: str) -> FloatArray:
     """Densely sampled outline of what is drawn, in plane coordinates."""
-    outline = to_plane(camera, matrix, camera.outline(_POINTS_PER_SIDE) if near is None else near.outline())
+    outline = to_plane(camera, matrix, camera.outline(POINTS_PER_SIDE) if near is None else near.outline())
     # What is in front of the horizon on the outline is so inside.
     if not len(outline) or not np.isfinite(outline).all():
         raise LimitError(f"{name}: the horizon crosses the image; leave it out, or choose another reference image")

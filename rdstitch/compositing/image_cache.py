@@ -83,17 +83,32 @@ class ImageCache:
                 self._read(index)
 
     def _read(self, index: int) -> LoadedImage:
-        """Read an image and hold it; those used longest ago go to disk where there is no room."""
+        """Read an image and hold it; those used longest ago go to disk where there is no room. One thread at a time."""
         loaded = self._reader.prepared(index, self._shrinks[index])
+        while (oldest := self._oldest_beyond(self.limit - loaded.nbytes)) is not None:
+            on_disk = self._written(*oldest)  # without the lock, which every ``get`` needs
+            with self._lock:
+                still_wanted = self._held.pop(oldest[0], None) is not None
+                if on_disk is not None and still_wanted:
+                    self._on_disk[oldest[0]] = on_disk
+                elif on_disk is not None:
+                    on_disk.remove()
         with self._lock:
             self._wanted.add(index)
-            while self._held and self._nbytes() + loaded.nbytes > self.limit:
-                oldest, image = self._held.popitem(last=False)
-                with suppress(OSError):
-                    self._folder = self._folder or TemporaryFolder()
-                    self._on_disk[oldest] = ImageOnDisk.write(image, self._folder.path / str(oldest))
             self._held[index] = loaded
         return loaded
+
+    def _oldest_beyond(self, room: int) -> tuple[int, LoadedImage] | None:
+        """The image used longest ago, where those that are held take more than there is room for."""
+        with self._lock:
+            return next(iter(self._held.items())) if self._held and self._nbytes() > room else None
+
+    def _written(self, index: int, image: LoadedImage) -> ImageOnDisk | None:
+        """An image in a temporary file, where one can be written."""
+        with suppress(OSError):
+            self._folder = self._folder or TemporaryFolder()
+            return ImageOnDisk.write(image, self._folder.path / str(index))
+        return None
 
     def _nbytes(self) -> int:
         """Memory in use; call with the lock held."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.source_images import OPACITY_BYTES
+from rdstitch.compositing.transparency import OPACITY_BYTES
 from rdstitch.errors import LimitError
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.composite_options import CompositeOptions

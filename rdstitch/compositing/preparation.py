@@ -9,6 +9,7 @@ from typing import Self
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.cropping import covered_pixels, crop_box, crop_rows
 from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.photometric import Exposure, no_exposure
@@ -18,7 +19,7 @@ from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import SeamMap, find_seams
 from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.compositing.source_images import ImageReader, PlacedImage
-from rdstitch.compositing.survey import covered_pixels, crop_box, crop_rows, survey_factor, survey_images
+from rdstitch.compositing.survey import survey_factor, survey_images
 from rdstitch.compositing.tiles import BlockRunner, OutputStrip, TiledOutput, strips_of_blocks
 from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError

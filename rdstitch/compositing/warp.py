@@ -17,19 +17,25 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box, Float32Array, encloses, grown, intersection
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.projection import PLANE, Projection
-from rdstitch.compositing.source_images import OPAQUE, Displacement, LoadedImage, PlacedImage
+from rdstitch.compositing.source_images import Displacement, LoadedImage, PlacedImage
+from rdstitch.compositing.transparency import OPAQUE
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
 
 LATTICE_STEPS = (32, 16, 8, 4, 2, 1)
 """Spacings of lattices, canvas pixels; all have the nodes of the first."""
 
+INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
 _NOWHERE = np.float32(-1e6)
 # Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many pixels of the image or,
 # where that gets smaller, of the canvas. OpenCV rounds them to as many afterwards.
 _LATTICE_ERROR = 1.0 / 32.0
 
 _PROBES = 16
+# OpenCV resamples from no side as long as this, pixels.
+_TOO_LONG = 32767
+_KERNEL_MARGIN = 8  # room around a piece of an image for the kernel of the resampling, pixels
+_MIN_WEIGHT = np.float32(1e-6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,14 +277,6 @@ def _shrink(warp: Warp, probes: FloatArray) -> float:
     left, right, top, bottom = np.moveaxis(warp.source_points(around[..., 0], around[..., 1]), 1, 0)
     (ax, ay), (bx, by) = (right - left).T, (bottom - top).T
     return math.sqrt(float(np.nanmedian(np.abs(ax * by - ay * bx))))
-
-
-INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
-
-# OpenCV resamples from no side as long as this, pixels.
-_TOO_LONG = 32767
-_KERNEL_MARGIN = 8  # room around a piece of an image for the kernel of the resampling, pixels
-_MIN_WEIGHT = np.float32(1e-6)
 
 
 def border_weight(geometry: Geometry) -> Float32Array:

@@ -1,6 +1,8 @@
 """A project of Hugin: all images with lens and pose, and control points."""
 
 import math
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -41,35 +43,51 @@ def project_of_hugin(registration: Registration, canvas: Canvas) -> str:
         matrix = matrix @ np.linalg.inv(canvas.orientation)
     seen = np.tensordot(matrix * np.sign(np.linalg.det(matrix)), _seen_on(canvas), axes=1)
     used = np.flatnonzero(alignment.used).tolist()
-    number = {k: place for place, k in enumerate(used)}
+    lines, variables = _image_lines(alignment, used, [source.path.absolute() for source in sources])
+    control = _control_lines(registration, alignment, used, quarters)
+    parts = [f"{HEAD}{_panorama(alignment, used, seen)}", "m i0", *lines, *variables, "v", *control]
+    return "\n".join(parts) + "\n"
+
+
+def _image_lines(alignment: Alignment, used: list[int], files: Sequence[Path]) -> tuple[list[str], list[str]]:
+    """An image a line, and what is to be optimized of each; a lens that several have is linked."""
     lenses: dict[Camera, int] = {}
     lines, variables = [], []
     for place, k in enumerate(used):
-        camera = alignment.cameras[k]
+        if set('"\n') & set(str(files[k])):
+            raise ArgumentError(f"{files[k]}: Hugin's projects cannot name files with quotes or line ends; rename it")
+        camera, pose = alignment.cameras[k], _pose(alignment, k)
         values = hugin_lens(camera)[0]
         lens = image_line(values)
-        if camera in lenses:  # linked with the image that has the same
+        if camera in lenses:
             own = {name: values[name] for name in "whf"}
             lens = " ".join([image_line(own), *(f"{name}={lenses[camera]}" for name in values if name not in own)])
         lenses.setdefault(camera, place)
-        lines.append(f'i {lens} {image_line(_pose(alignment, k))} n"{sources[k].path.absolute()}"')
+        lines.append(f'i {lens} {image_line(pose)} n"{files[k]}"')
         if k != alignment.reference:
-            variables += [f"v {name}{place}" for name in _pose(alignment, k)]
-    control = []
+            variables += [f"v {name}{place}" for name in pose]
+    return lines, variables
+
+
+def _control_lines(
+    registration: Registration, alignment: Alignment, used: list[int], quarters: QuarterTurns
+) -> list[str]:
+    """Control points of all pairs that support the alignment, as pixels of the files."""
+    number = {k: place for place, k in enumerate(used)}
+    lines = []
     for pair in registration.pairs:
-        ends = pair.images
-        if ends in alignment.support and set(ends) <= number.keys():
-            link = pair.link().thinned(_CONTROL_POINTS)
-            points = [
-                _in_file(points, registration.alignment.cameras[k], alignment.cameras[k], quarters.upright[k])
-                for points, k in zip((link.points1, link.points2), ends, strict=True)
-            ]
-            control += [
-                f"c n{number[ends[0]]} N{number[ends[1]]} x{x:.4f} y{y:.4f} X{X:.4f} Y{Y:.4f} t0"
-                for (x, y), (X, Y) in zip(*(ends.tolist() for ends in points), strict=True)
-            ]
-    parts = [f"{HEAD}{_panorama(alignment, used, seen)}", "m i0", *lines, *variables, "v", *control]
-    return "\n".join(parts) + "\n"
+        if pair.images not in alignment.support or not set(pair.images) <= number.keys():
+            continue
+        (i, j), link = pair.images, pair.link().thinned(_CONTROL_POINTS)
+        first, second = (
+            _in_file(points, registration.alignment.cameras[k], alignment.cameras[k], quarters.upright[k]).tolist()
+            for k, points in ((i, link.points1), (j, link.points2))
+        )
+        lines += [
+            f"c n{number[i]} N{number[j]} x{x:.4f} y{y:.4f} X{X:.4f} Y{Y:.4f} t0"
+            for (x, y), (X, Y) in zip(first, second, strict=True)
+        ]
+    return lines
 
 
 def _pose(alignment: Alignment, k: int) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """What every image of a camera gets of the light, pixel by pixel, and taking it out of samples."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rdstitch.errors import InputError
 from rdstitch.io.opening import check_readable, decoding
 from rdstitch.io.reduction import block_mean
+from rdstitch.io.tiff_pages import image_pages
 from rdstitch.system.late_imports import tifffile
 
 
@@ -46,10 +47,8 @@ def read_flat_field(file: str | Path, size: tuple[int, int], channels: int) -> F
     """The flat field of an image file, and the dark field where it has a second page."""
     path = Path(file)
     check_readable(path)
-    read: Callable[[Any], NDArray[np.float32]] = lambda page: np.asarray(page.asarray(), dtype=np.float32)  # noqa: E731
     with decoding(path), tifffile.TiffFile(path) as tiff:
-        every = [page.aspage() for page in tiff.pages]
-        pages = [read(page) for page in [page for page in every if not (page.is_reduced or page.is_mask)][:2]]
+        pages = [np.asarray(page.asarray(), dtype=np.float32) for page in islice(image_pages(tiff), 2)]
     for number, page in enumerate(pages, 1):
         if page.shape[:2] != size[::-1]:
             has = f"page {number} has {page.shape[1]} x {page.shape[0]} pixels"

@@ -13,6 +13,7 @@ from rdstitch.system.records import parse_xml
 MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
 """What units of length count."""
 
+_MAX_PLANES = 2**16  # of another file of a set, which is not opened
 _COUNTED = "CZT"  # axes beside those of a plane
 
 
@@ -58,8 +59,13 @@ def ome_pixel_size(pixels: ElementTree.Element) -> float | None:
     return float(size) * scale if size and scale else None
 
 
-def ome_planes(file: Path, pixels: ElementTree.Element, own: str | None) -> dict[tuple[int, int, int], Page]:
-    """Where the planes of an image are; the file is known by its name, or by its UUID where that is not there."""
+def ome_planes(
+    file: Path, pages: int, pixels: ElementTree.Element, own: str | None
+) -> dict[tuple[int, int, int], Page]:
+    """Where the planes of an image are, of ``file`` no more than it has pages.
+
+    The file is known by its name, or by its UUID where that is not there.
+    """
     samples = [int(channel.get("SamplesPerPixel", 1)) for channel in pixels.iter("Channel")]
     counts = {axis: int(pixels.get(f"Size{axis}", 1)) for axis in _COUNTED}
     counts["C"] = len(samples) or counts["C"]
@@ -76,9 +82,10 @@ def ome_planes(file: Path, pixels: ElementTree.Element, own: str | None) -> dict
         first = np.ravel_multi_index(
             [int(data.get(f"First{axis}", 0)) for axis in reversed(order)], [counts[axis] for axis in reversed(order)]
         )
+        page = int(data.get("IFD", 0))
         count = int(data.get("PlaneCount", total if data.get("IFD") is None else 1))
-        for k in range(min(count, total - int(first))):
+        for k in range(min(count, total - int(first), pages - page if holder == file else _MAX_PLANES)):
             index = np.unravel_index(int(first) + k, [counts[axis] for axis in reversed(order)])
             at = dict(zip(reversed(order), (int(i) for i in index), strict=True))
-            planes[at["C"], at["Z"], at["T"]] = Page(holder, int(data.get("IFD", 0)) + k)
+            planes[at["C"], at["Z"], at["T"]] = Page(holder, page + k)
     return planes

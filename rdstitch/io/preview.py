@@ -23,9 +23,9 @@ def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[
         return read_deep_zoom(path, size, side), None
     if size[0] * size[1] > _OVERVIEW_FROM and suffix in (".tif", ".tiff"):
         with tifffile.TiffFile(path) as file:
-            levels = file.series[0].levels
-            enough = [level for level in levels if max(level.sizes["height"], level.sizes["width"]) >= side]
-            level = (enough or levels)[-1 if enough else 0]
+            large, *overviews = file.series[0].levels
+            enough = [level for level in overviews if max(level.sizes["height"], level.sizes["width"]) >= side]
+            level = enough[-1] if enough else large
             pixels = level.asarray()
             return (np.moveaxis(pixels, 0, -1) if level.axes == "CYX" else pixels), None
     if suffix in (".jpg", ".jpeg"):

@@ -15,12 +15,12 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turned
 from rdstitch.io.colour import without_inks
 from rdstitch.io.metadata import Metadata, is_grey_palette, metadata_of, read_metadata
-from rdstitch.io.ome import read_ome
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image
 from rdstitch.io.raw import read_raw
 from rdstitch.io.read_tiff import as_opacity, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME
+from rdstitch.io.tiff_pages import first_image_pages
 from rdstitch.system.file_access import open_regular, read_beginning
 from rdstitch.system.late_imports import imagecodecs, tifffile
 
@@ -184,18 +184,10 @@ def _split(samples: Pixels) -> tuple[Pixels, Pixels | None]:
 def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
     """Samples and alpha of the first page, or of the channels of a microscope."""
     with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
-        planes = _channel_planes(tiff)
-        return (planes, None) if planes is not None else read_page(tiff, tiff.pages.first)
-
-
-def _channel_planes(tiff: "tifffile.TiffFile") -> Pixels | None:
-    """The channels of an OME-TIFF that has them on pages of their own, (h, w, C); None of other files."""
-    told = read_ome(tiff.ome_metadata)
-    if told is None or not 1 < told.channels <= len(tiff.pages):
-        return None
-    pages = [page for page in tiff.pages[: told.channels] if isinstance(page, tifffile.TiffPage)]
-    alike = len({(page.shape, page.dtype) for page in pages}) == 1 and pages[0].axes == "YX"
-    return np.stack([page.asarray() for page in pages], axis=-1) if alike and len(pages) == told.channels else None
+        pages = first_image_pages(tiff)
+        if len(pages) == 1:
+            return read_page(tiff, pages[0])
+        return np.stack([page.asarray() for page in pages], axis=-1), None
 
 
 def as_image(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadata) -> DecodedImage:

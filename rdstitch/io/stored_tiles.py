@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -21,6 +22,7 @@ from rdstitch.errors import InputError
 from rdstitch.io.ome import MICROMETRES, Page, ome_pixel_size, ome_planes, ome_tree
 from rdstitch.io.opening import TIFF_MAGIC, decoding
 from rdstitch.io.read_tiff import read_page
+from rdstitch.io.tiff_pages import image_pages
 from rdstitch.system.file_access import canonical_name, canonical_text, open_regular
 from rdstitch.system.late_imports import tifffile
 
@@ -127,7 +129,7 @@ def _of_file(file: Path) -> list[StoredTile]:
             return [plain]
         stream.seek(0)
         with _tiff(stream, file) as tiff:
-            tiles = _ome(file, tiff.ome_metadata) if tiff.is_ome else []
+            tiles = _ome(file, tiff) if tiff.is_ome else []
             if tiles:
                 return tiles
             tags = [_micro_manager_tag(page) for page in tiff.pages[:1]]
@@ -140,8 +142,7 @@ def _of_file(file: Path) -> list[StoredTile]:
 
 def _stack(plain: StoredTile, tiff: "tifffile.TiffFile") -> StoredTile:
     """A file of several pages by its shape; without further ones, such as masks and overviews."""
-    pages = [page for page in tiff.pages[:2] if isinstance(page, tifffile.TiffPage) and not page.subfiletype]
-    if not tiff.is_imagej and len(pages) < 2:
+    if not tiff.is_imagej and len(list(islice(image_pages(tiff), 2))) < 2:
         return plain
     series = tiff.series[0]
     leading = [
@@ -161,9 +162,9 @@ def _stack(plain: StoredTile, tiff: "tifffile.TiffFile") -> StoredTile:
     return replace(plain, planes=planes, pixel_size=size)
 
 
-def _ome(file: Path, text: str | None) -> list[StoredTile]:
+def _ome(file: Path, tiff: "tifffile.TiffFile") -> list[StoredTile]:
     """The images of OME-XML that have a plane in a file."""
-    root = ome_tree(text)
+    root = ome_tree(tiff.ome_metadata)
     if root is None:
         return []
     own, elsewhere = root.get("UUID", ""), root.find("BinaryOnly")
@@ -179,7 +180,7 @@ def _ome(file: Path, text: str | None) -> list[StoredTile]:
         pixels = image.find("Pixels")
         if pixels is None:
             continue
-        planes = ome_planes(file, pixels, None if by_name else own)
+        planes = ome_planes(file, len(tiff.pages), pixels, None if by_name else own)
         if any(page.file == file for page in planes.values()):
             tiles.append(_ome_tile(file, image, pixels, planes))
     shared = len(tiles) > 1

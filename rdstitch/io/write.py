@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.errors import ArgumentError, LimitError, OutputError
+from rdstitch.errors import ArgumentError
 from rdstitch.io.deepzoom import write_deep_zoom
 from rdstitch.io.encoding import STRIP_ROWS, ImageSpec, Strip, as_eight_bit, check_strips, jpeg_pieces, png_pieces
+from rdstitch.io.formats import check_format
 from rdstitch.io.metadata import Metadata
-from rdstitch.io.ome_zarr import check_zarr, write_ome_zarr
+from rdstitch.io.ome_tiff import OME_SUFFIXES, write_ome_tiff
+from rdstitch.io.ome_zarr import write_ome_zarr
 from rdstitch.io.samples import OPAQUE
-from rdstitch.io.tiff import OME_SUFFIXES, ExtraTag, write_ome_tiff, write_tiff
+from rdstitch.io.tiff import ExtraTag, write_tiff
 from rdstitch.system.outputs import (
-    WRITABLE_SUFFIXES,
     Fingerprint,
     Outputs,
     check_folder,
@@ -32,13 +33,9 @@ from rdstitch.system.outputs import (
     tiles_folder,
 )
 
-# Width and height that the formats (or their one encoder) can hold.
-SIDE_LIMITS = {".jpg": 65500, ".jpeg": 65500, ".webp": 16383, ".png": 1_000_000}
 _TIFF = (".tif", ".tiff")
 _JPEG = (".jpg", ".jpeg")
 _WEBP_EFFORT = 4
-# The samples, Pillow's copy of them, the encoder's own, and the output; measured: 13 to 16 with 4 and 16 megapixels.
-_WEBP_BYTES_PER_PIXEL = 20
 _ROWS_AT_A_TIME = 4 * STRIP_ROWS
 
 
@@ -81,36 +78,33 @@ def write_strips(
     outputs: Outputs | None = None,
 ) -> Fingerprint:
     """Write an image that comes in strips; see :func:`write_image`. Gives size and digest of what was written."""
-    if outputs is None:
-        with Outputs(overwrite=True) as alone:
-            return write_strips(path, spec, strips, extra_tags, outputs=alone)
     file = Path(path)
     check_format(file, spec)
-    suffix = file.suffix.lower()
-    checked = check_strips(spec, strips)
-    tiles = None
-    if suffix == ".dzi":
-        folder = tiles_folder(Path(os.path.realpath(file)))
-        check_folder(folder, overwrite=True)
-        with outputs.writing(folder, is_folder=True) as tiles, outputs.writing(file) as staged:
-            write_deep_zoom(staged, tiles, spec, checked)
-    elif is_zarr(file):
-        with outputs.writing(file, is_folder=True) as staged:
-            write_ome_zarr(staged, spec, checked)
-    else:
-        with outputs.writing(file) as staged:
-            if file.name.lower().endswith(OME_SUFFIXES):
-                write_ome_tiff(staged, spec, checked, extra_tags)
-            else:
-                _write_file(staged, suffix, spec, checked, extra_tags)
-    with naming(file):
-        return fingerprint(staged, tiles)
+    checked, tiles = check_strips(spec, strips), None
+    with Outputs.or_own(outputs) as staging:
+        if file.suffix.lower() == ".dzi":
+            folder = tiles_folder(Path(os.path.realpath(file)))
+            check_folder(folder, overwrite=True)
+            with staging.writing(folder, is_folder=True) as tiles, staging.writing(file) as staged:
+                write_deep_zoom(staged, tiles, spec, checked)
+        elif is_zarr(file):
+            with staging.writing(file, is_folder=True) as staged:
+                write_ome_zarr(staged, spec, checked)
+        else:
+            with staging.writing(file) as staged:
+                _write_file(staged, file.name.lower(), spec, checked, extra_tags)
+        with naming(file):
+            return fingerprint(staged, tiles)
 
 
 def _write_file(
-    file: Path, suffix: str, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag]
+    file: Path, name: str, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag]
 ) -> None:
-    """Write one file in the format of a suffix."""
+    """Write one file in the format that the end of a name stands for."""
+    if name.endswith(OME_SUFFIXES):
+        write_ome_tiff(file, spec, strips, extra_tags)
+        return
+    suffix = Path(name).suffix
     if suffix in _TIFF:
         write_tiff(file, spec, strips, extra_tags)
         return
@@ -125,45 +119,8 @@ def _write_file(
         stream.writelines(pieces)
 
 
-def check_format(path: str | Path, spec: ImageSpec) -> None:
-    """Find out before long work whether the format of ``path`` can hold an image."""
-    suffix = Path(path).suffix.lower()
-    if suffix not in WRITABLE_SUFFIXES:
-        raise OutputError(f"{path}: unknown file type '{suffix}'; use one of {' '.join(WRITABLE_SUFFIXES)}")
-    if suffix == ".zarr":
-        check_zarr(Path(path))
-    if suffix in (*_TIFF, ".zarr"):
-        return
-    if spec.channels not in (1, 3):
-        raise OutputError(f"{path}: {spec.channels} channels do not fit into {suffix[1:]}; write a .tif")
-    if spec.dtype == np.float32:
-        raise OutputError(f"{path}: floating-point samples do not fit into {suffix[1:]}; write a .tif")
-    check_size(path, spec.size)
-
-
-def check_size(path: str | Path, size: tuple[int, int]) -> None:
-    """Refuse an image of ``size`` (width, height) that the format of ``path`` cannot hold."""
-    suffix = Path(path).suffix.lower()
-    limit = SIDE_LIMITS.get(suffix)
-    if limit is not None and max(size) > limit:
-        raise LimitError(
-            f"{path}: {size[0]} x {size[1]} pixels is more than {suffix[1:]} can hold ({limit} pixels a side); "
-            "write a .tif, or use a smaller --scale"
-        )
-
-
-def check_memory(path: str | Path, size: tuple[int, int], max_memory: int | None) -> None:
-    """Refuse an image that the format of ``path`` needs whole in memory, where that is limited."""
-    need = size[0] * size[1] * _WEBP_BYTES_PER_PIXEL
-    if Path(path).suffix.lower() == ".webp" and max_memory is not None and need > max_memory:
-        raise LimitError(
-            f"{path}: {size[0]} x {size[1]} pixels of WebP need {need / 2**20:.0f} MB, and --max-memory allows "
-            f"{max_memory / 2**20:.0f} MB; write a .tif, .png or .jpg, which are written in strips"
-        )
-
-
 def _webp(spec: ImageSpec, strips: Iterable[Strip]) -> bytes:
-    """WebP file in memory: the encoder takes the image whole; see :data:`_WEBP_BYTES_PER_PIXEL`."""
+    """WebP file in memory: the encoder takes the image whole; see :data:`rdstitch.io.formats.FORMATS`."""
     width, height = spec.size
     samples = np.empty((height, width, 3 + spec.transparent), dtype=np.uint8)
     top = 0

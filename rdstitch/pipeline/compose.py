@@ -28,14 +28,15 @@ from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.projection import PLANE
 from rdstitch.compositing.tiles import Block, BlockRunner, OutputStrip
 from rdstitch.executors import in_order
-from rdstitch.export.georeference import Georeference, has_place, world_file_paths
+from rdstitch.export.georeference import Georeference, world_file_paths
+from rdstitch.export.place_on_map import has_place
 from rdstitch.inputs.input_guard import GuardState
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
+from rdstitch.io.formats import check_memory, check_size
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
-from rdstitch.io.write import check_memory, check_size
 from rdstitch.options.upright_options import Corners
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages

@@ -8,8 +8,10 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, CompositeOptions
 from rdstitch.errors import ArgumentError
-from rdstitch.export.georeference import MIN_POSITIONS, Georeference, georeference, has_place
+from rdstitch.export.georeference import Georeference
+from rdstitch.export.georeference_text import check_summary, map_summary
 from rdstitch.export.map_grid import MapGrid, grid_of_extent, read_grid
+from rdstitch.export.place_on_map import MIN_POSITIONS, has_place, place_on_map
 from rdstitch.geometry.crs import Crs
 from rdstitch.inputs.source import Source
 from rdstitch.pipeline.placed_images import PlacedImages, plan
@@ -51,7 +53,7 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
             if epsg is not None:
                 place = place.in_system(Crs(epsg), np.concatenate(canvas.footprints))
         else:
-            place, reason = georeference(placed.located(canvas), epsg, force=options.georeference == "force")
+            place, reason = place_on_map(placed.located(canvas), epsg, force=options.georeference == "force")
     if place is None:
         for name in ("gsd", "like", "extent"):
             if getattr(options, name) is not None:
@@ -112,11 +114,11 @@ def place_messages(place: Georeference | None, reason: str, placed: PlacedImages
         known = reason and placed.has_place
         return [*messages, Message(f"not georeferenced: {reason}")] if known else messages
     messages += [Message(reason)] if reason else []
-    messages.append(Message(place.summary, severity="note"))
+    messages.append(Message(map_summary(place), severity="note"))
     if place.assumption:
         messages.append(Message(place.assumption))
     if place.checks:
-        messages.append(Message(place.check_summary, severity="note"))
+        messages.append(Message(check_summary(place), severity="note"))
     if place.rejected:
         names = [name for name, _ in place.rejected]
         more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.choices import LocalAlignmentMode
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
-from rdstitch.compositing.canvas import NearPart
+from rdstitch.compositing.near_part import NearPart
 from rdstitch.compositing.source_images import Displacement, PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.errors import ArgumentError
-from rdstitch.export.georeference import Georeference, Located, has_place
+from rdstitch.export.georeference import Georeference
+from rdstitch.export.place_on_map import Located, has_place
 from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.places import GpsPosition

@@ -18,7 +18,7 @@ from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.poses_files import geo_of_opendronemap, images_of_colmap
 from rdstitch.export.trajectory_files import as_csv
 from rdstitch.inputs.times import timestamps_of
-from rdstitch.io.tiff import write_cropped_tiff
+from rdstitch.io.cropped_tiff import write_cropped_tiff
 from rdstitch.pipeline.composer import placed_by
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.opencv_state import one_opencv_thread
@@ -85,13 +85,11 @@ def write_layers(
     """
     placed, options = placed_by(result), result.options.composite
     files = layer_files([source.name for source in placed.sources], folder)
-    if outputs is None:
-        with Outputs(overwrite) as staging:
-            return write_layers(result, folder, whole=whole, overwrite=overwrite, outputs=staging)
     make_folder(folder)
     check_outputs(files, overwrite, [source.path for source in placed.sources])
     images = placed.images(result.canvas.near)
-    with prepare_composite(decide(images, result.canvas, replace(options, crop="none"))) as prepared:
+    task = decide(images, result.canvas, replace(options, crop="none"))
+    with prepare_composite(task) as prepared, Outputs.or_own(outputs, overwrite) as staging:
         canvas = prepared.tiles.box
         size = canvas[2] - canvas[0], canvas[3] - canvas[1]
         for index, warp in enumerate(prepared.renderer.warps):
@@ -102,9 +100,9 @@ def write_layers(
             tags = () if result.georeference is None else result.georeference.after(shift).tiff_tags()
             write = partial(write_cropped_tiff, offset=offset, size=size, extra_tags=tags)
             alpha, shown = (np.where(where, np.uint8(255), np.uint8(0)) for where in (covered, mask))
-            with outputs.writing(files[2 * index]) as staged:
+            with staging.writing(files[2 * index]) as staged:
                 write(staged, samples, alpha)
-            with outputs.writing(files[2 * index + 1]) as staged:
+            with staging.writing(files[2 * index + 1]) as staged:
                 write(staged, shown, None)
     return files
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rdstitch.export.georeference_text import map_summary
 from rdstitch.report.lens import lens_curve, votes
 from rdstitch.report.mosaic import mosaic
 from rdstitch.report.pairs import match_graph, matched, residual_map
@@ -71,14 +72,11 @@ def write_report(
     OutputError
         When the file cannot be written.
     """
-    if outputs is None:
-        with Outputs(overwrite=True) as alone:
-            write_report(path, result, stages, command, outputs=alone)
-        return
     output = result.output if isinstance(result, StitchResult) else None
-    page = report_page(result, stages, command, None if output is None else outputs.staged(output))
-    # Names of files need not be UTF-8.
-    outputs.write(path, page.encode("utf-8", "backslashreplace"))
+    with Outputs.or_own(outputs) as staging:
+        page = report_page(result, stages, command, None if output is None else staging.staged(output))
+        # Names of files need not be UTF-8.
+        staging.write(path, page.encode("utf-8", "backslashreplace"))
 
 
 def report_page(
@@ -199,7 +197,9 @@ def place(result: StitchResult) -> str:
         return ""
     residuals = sorted(placed.residuals, key=lambda residual: -residual.off)[:_MAX_ROWS]
     rows = [(r.name, f"{r.east:+.3f}", f"{r.north:+.3f}", "" if r.used else "not used") for r in residuals]
-    explanation = f"{placed.summary}. Where the output has them less where they were measured to be, the largest first:"
+    explanation = (
+        f"{map_summary(placed)}. Where the output has them less where they were measured to be, the largest first:"
+    )
     return section("Place on the Earth", explanation, table([("", "east, m", "north, m", ""), *rows]))
 
 

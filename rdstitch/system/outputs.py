@@ -11,7 +11,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -218,6 +218,11 @@ class Outputs:
         self._overwrite = overwrite
         self._folders: dict[Path, TemporaryFolder] = {}
         self._items: list[_Item] = []
+
+    @classmethod
+    def or_own(cls, outputs: "Outputs | None", overwrite: bool = True) -> AbstractContextManager["Outputs"]:
+        """Outputs that are given, which their owner ends, or else those of the block."""
+        return cls(overwrite) if outputs is None else nullcontext(outputs)
 
     def __enter__(self) -> Self:
         """Begin; nothing is made before it is needed."""

@@ -16,9 +16,9 @@ from rdstitch.compositing import PlacedImage, compose_decided, decide
 from rdstitch.compositing import plan as planning
 from rdstitch.compositing.compositor import compose
 from rdstitch.compositing.plan import CompositePlan, default_memory, plan_composite
-from rdstitch.compositing.source_images import OPACITY_BYTES
 from rdstitch.compositing.tables import CompositeTables
 from rdstitch.compositing.tiles import Block, OutputStrip
+from rdstitch.compositing.transparency import OPACITY_BYTES
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.io import DecodedImage
 from rdstitch.options.composite_options import CompositeOptions

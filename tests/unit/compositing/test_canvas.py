@@ -1,5 +1,6 @@
 """The canvas: its size, its boxes and what is cropped."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import BoolArray
 from rdstitch.compositing import plan_canvas
 from rdstitch.compositing.boxes import Box, aligned, bounds, cut, encloses, grown, intersection, without
-from rdstitch.compositing.survey import crop_box, crop_rows, largest_rectangle
+from rdstitch.compositing.cropping import crop_box, crop_rows, largest_rectangle
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.geometry.camera import Camera
 
@@ -102,7 +103,9 @@ def test_cropped_and_reduced_keep_the_geometry() -> None:
     assert part.size == (100, 50)
     point = np.append(FLAT.normalize((30.0, 40.0)), 1.0)
     np.testing.assert_allclose((part.matrix @ point)[:2], [0, 0], atol=1e-9)
-    half = canvas.reduced(2)
+    half = replace(canvas, orientation=np.diag([1.0, 1.0, 2.0]), cropped_to=(0, 0, 9, 9)).reduced(2)
+    np.testing.assert_array_equal(half.orientation, np.diag([1.0, 1.0, 2.0]))
+    assert half.cropped_to is None  # of the whole canvas' pixels
     assert half.size == (200, 150)
     # The centre of the first reduced px is the middle of four px.
     np.testing.assert_allclose((half.matrix @ np.append(FLAT.normalize((0.5, 0.5)), 1.0))[:2], [0, 0], atol=1e-9)

@@ -22,9 +22,9 @@ from examples.worlds.compositing_scenes import (
     side_by_side,
 )
 from rdstitch.compositing import CompositeOptions, compose, compose_to_file
+from rdstitch.compositing.cropping import largest_rectangle
 from rdstitch.compositing.preparation import decide, prepare_composite
 from rdstitch.compositing.source_images import ImageLoader
-from rdstitch.compositing.survey import largest_rectangle
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.io import Metadata, read_image
 from rdstitch.synthetic.rendering import Photometry

@@ -4,6 +4,7 @@ import tempfile
 import tracemalloc
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from errno import ENOSPC
 from functools import partial
@@ -20,7 +21,8 @@ from scipy.spatial import KDTree
 from examples.worlds.compositing_scenes import Scene, as_image, place_images, render
 from rdstitch.compositing import CompositeOptions, compose
 from rdstitch.compositing.image_cache import ImageCache
-from rdstitch.compositing.source_images import ImageOnDisk, ImageReader, PlacedImage, filled, prepare_image
+from rdstitch.compositing.source_images import ImageOnDisk, ImageReader, LoadedImage, PlacedImage, prepare_image
+from rdstitch.compositing.transparency import filled
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import DecodedImage
@@ -113,6 +115,29 @@ def _until(told: Callable[[], bool]) -> None:
     while not told():
         assert monotonic() < end
         sleep(0.001)
+
+
+def test_images_can_be_had_while_another_one_goes_to_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded_images, writing, go_on = DecodedImageCache(), Event(), Event()
+    cache = decoded_images.cache(limit=40_000)
+    cache.get(0)
+    cache.get(1)
+
+    def slow(image: LoadedImage, file: Path) -> ImageOnDisk:
+        writing.set()
+        assert go_on.wait(30)
+        return write(image, file)
+
+    write = ImageOnDisk.write
+    monkeypatch.setattr(ImageOnDisk, "write", slow)
+    with ThreadPoolExecutor(2) as pool:
+        third = pool.submit(cache.get, 2)
+        assert writing.wait(30)
+        for index in (1, 0):  # 0 is what is being written
+            np.testing.assert_array_equal(pool.submit(cache.get, index).result(10).pixels, decoded_images.frames[index])
+        go_on.set()
+        np.testing.assert_array_equal(third.result(30).pixels, decoded_images.frames[2])
+    assert decoded_images.reads == {0: 1, 1: 1, 2: 1}
 
 
 def wait_for_all_read_ahead(cache: ImageCache) -> None:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from examples.worlds.compositing_scenes import as_image, place_images, render, side_by_side
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing import gain_compensation, plan_canvas
+from rdstitch.compositing import gain_compensation, overlap_cells, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
-from rdstitch.compositing.gain_compensation import compare_overlaps
+from rdstitch.compositing.gain_fit import Differences, fit_gain_and_vignetting
+from rdstitch.compositing.overlap_cells import compare_overlaps
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
 from rdstitch.compositing.source_images import ImageReader, PlacedImage
 from rdstitch.compositing.static_pixels import static_pixels
@@ -80,7 +81,7 @@ def test_cells_are_spread_over_the_overlap_of_images_of_any_size(width: int) -> 
 def test_gains_of_thousands_of_overlaps_take_a_few_cells_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
     survey, images = _row(60)
     of_all = gain_compensation.estimate_exposure(survey, images, "gain").log_gain
-    monkeypatch.setattr(gain_compensation, "_MAX_CELLS", 600)
+    monkeypatch.setattr(overlap_cells, "_MAX_CELLS", 600)
     cells = compare_overlaps(survey)
     assert 59 <= len(cells.pair) <= 600
     np.testing.assert_allclose(gain_compensation.estimate_exposure(survey, images, "gain").log_gain, of_all, atol=1e-3)
@@ -134,8 +135,8 @@ def test_an_image_without_overlap_has_the_gain_that_its_camera_wrote_down() -> N
     sets = [place_images(scene.sources, scene.cameras, apart, exposure=e) for e in (None, [0.5, 0.5, 1.0])]
     survey = survey_images(ImageReader(sets[0]), sets[0], canvas)
     cells = compare_overlaps(survey)
-    differences = gain_compensation._Differences.of(cells, 0.055)
-    gains = [gain_compensation._fit(differences, images)[0].log_gain for images in sets]
+    differences = Differences.of(cells, 0.055)
+    gains = [fit_gain_and_vignetting(differences, images)[0].log_gain for images in sets]
     assert np.abs(gains[0][2]).max() < 0.01
     np.testing.assert_allclose(gains[1][2] - gains[1][:2].mean(axis=0), np.log(2.0) / 2.4, atol=0.02)
 

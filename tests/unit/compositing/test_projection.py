@@ -10,7 +10,8 @@ from examples.worlds.compositing_scenes import as_image, gradient, grey, place_i
 from examples.worlds.turns import TurningSequence, camera_rotations, turning_sequence
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
-from rdstitch.compositing.canvas import NearPart, near_parts, plan_canvas
+from rdstitch.compositing.canvas import plan_canvas
+from rdstitch.compositing.near_part import NearPart, near_parts
 from rdstitch.compositing.panorama_canvas import (
     center_of_view,
     choose_projection,

@@ -14,7 +14,9 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import camera_file_text
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, OutputError
-from rdstitch.export.georeference import Georeference, Located, georeference, world_file_paths
+from rdstitch.export.georeference import Georeference, world_file_paths
+from rdstitch.export.georeference_text import map_summary
+from rdstitch.export.place_on_map import Located, place_on_map
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.places import GpsPosition, GroundControl
@@ -94,7 +96,7 @@ def test_a_tiff_lies_in_the_right_place_and_north_is_up(
     assert (record["positions"], record["positions_used"]) == (6, 6)
     assert record["gsd_m"] == pytest.approx(transform.a)
     assert record["rms_m"] < 4 * METRES_PER_TEXEL
-    assert result.georeference.summary in [message.text for message in result.messages]
+    assert map_summary(result.georeference) in [message.text for message in result.messages]
 
 
 def test_the_references_frame_on_request(located: tuple[list[Path], FloatArray], cached: StitchOptions) -> None:
@@ -190,24 +192,24 @@ def _row(count: int) -> Located:
 
 def test_positions_that_do_not_fit_are_refused() -> None:
     row = _row(8)
-    place, reason = georeference(row)
+    place, reason = place_on_map(row)
     assert place is not None
     assert reason == ""
     assert "the image centres" in place.assumption
     mixed = replace(row, positions=[row.positions[k] for k in (4, 0, 7, 2, 5, 1, 6, 3)])
-    place, reason = georeference(mixed)
+    place, reason = place_on_map(mixed)
     assert place is None
     assert "the GPS positions contradict the images" in reason
-    place, again = georeference(mixed, force=True)
+    place, again = place_on_map(mixed, force=True)
     assert place is not None
     assert again.partition(";")[0] == reason.partition(";")[0]
-    place, reason = georeference(replace(row, positions=[*row.positions[:2], *[None] * 6]))
+    place, reason = place_on_map(replace(row, positions=[*row.positions[:2], *[None] * 6]))
     assert place is None
     assert reason == "2 of 8 images have a GPS position, and 3 are needed"
-    place, reason = georeference(replace(row, positions=[row.positions[0]] * 8))
+    place, reason = place_on_map(replace(row, positions=[row.positions[0]] * 8))
     assert (place, reason) == (None, "all images have the same GPS position")
     in_one_place = replace(row, to_output=np.tile(row.to_output[:1], (8, 1, 1)))
-    place, reason = georeference(in_one_place, force=True)
+    place, reason = place_on_map(in_one_place, force=True)
     assert place is None
     assert "no scale and direction of the map fit the GPS positions" in reason
 
@@ -216,8 +218,8 @@ def test_positions_that_do_not_fit_are_refused() -> None:
 def test_one_bad_position_of_eight_is_named_and_left_out(wrong: GpsPosition, off: float) -> None:
     row = _row(8)
     before, after = row.positions[:4], row.positions[5:]
-    whole, _ = georeference(replace(row, positions=[*before, None, *after]))
-    place, _ = georeference(replace(row, positions=[*before, wrong, *after]))
+    whole, _ = place_on_map(replace(row, positions=[*before, None, *after]))
+    place, _ = place_on_map(replace(row, positions=[*before, wrong, *after]))
     assert (place.used, len(place.residuals)) == (7, 8)
     ((name, away),) = place.rejected
     assert name == "4.jpg"
@@ -239,7 +241,7 @@ def test_control_points_place_the_output_instead_of_positions() -> None:
         for image in range(int(x // 300), int(x // 300) + 1 + (number == 1)):
             u, v = from_plane(row.cameras[image], row.to_output[image], np.array([(x, y)]))[0]
             control[image].append(GroundControl(f"P{number}", GpsPosition(latitude, longitude), 32632, (u, v)))
-    place, _ = georeference(replace(row, control=control))
+    place, _ = place_on_map(replace(row, control=control))
     assert (place.crs, place.source, place.used) == (Crs(32632), "ground control points", 5)
     assert [name for name, _ in place.rejected] == ["P4"]
     assert place.rejected[0][1] == pytest.approx(2.0 * 2**0.5, rel=0.01)
@@ -248,7 +250,7 @@ def test_control_points_place_the_output_instead_of_positions() -> None:
     )
     assert max(r.off for r in place.residuals if r.used) < 0.01
     few = [points if k < 2 else [] for k, points in enumerate(control)]
-    assert georeference(replace(row, control=few))[1] == ("2 ground control points are in the images, and 3 are needed")
+    assert place_on_map(replace(row, control=few))[1] == ("2 ground control points are in the images, and 3 are needed")
 
 
 @pytest.mark.parametrize(
@@ -304,7 +306,7 @@ def test_the_map_of_places_all_round_the_world(latitude: float, longitude: list[
 
 def test_the_ground_sample_distance_is_that_on_the_ground() -> None:
     row = _row(8)
-    utm_map, web = (georeference(row, epsg)[0] for epsg in (32632, 3857))
+    utm_map, web = (place_on_map(row, epsg)[0] for epsg in (32632, 3857))
     assert web.gsd == pytest.approx(utm_map.gsd, rel=0.005)
     assert abs(web.scale) == pytest.approx(utm_map.gsd / np.cos(np.radians(50.0)), rel=0.005)
     other = utm_map.in_system(Crs(3857), [(0.0, 0.0), (2000.0, 100.0), (0.0, 300.0)])
@@ -340,12 +342,12 @@ def _survey(
 def test_positions_are_those_of_cameras(yaw: float, slope: float, altitude_std: float | None) -> None:
     """Image centres are 5.6 m from what is below a camera pitched by 8 degrees, and those of sloping ground 2 m."""
     located, truth = _survey(1, (-0.14, 0.0), yaw, 0.02, slope, altitude_std)
-    place, _ = georeference(located)
+    place, _ = place_on_map(located)
     corners = [(-100.0, -100.0), (700.0, 600.0), (300.0, 300.0)]
     assert np.hypot(*(place.to_map(corners) - truth.to_map(corners)).T).max() < 0.1
     assert place.rms < 0.04
     assert not place.assumption
-    assert "GPS agree with the map to 0.0" in place.summary
+    assert "GPS agree with the map to 0.0" in map_summary(place)
 
 
 @pytest.mark.parametrize("std", [0.02, 3.0])
@@ -354,7 +356,7 @@ def test_the_error_of_the_map_is_as_large_as_told(std: float) -> None:
     errors = []
     for seed in range(40):
         located, truth = _survey(seed, (-0.05, 0.03), 3.0, std, altitude_std=2 * std)
-        place, _ = georeference(located)
+        place, _ = place_on_map(located)
         errors.append((place.to_map(middle_of_field) - truth.to_map(middle_of_field)) / place.std)
     assert 0.4 < np.mean(np.square(errors)) < 2.0
     assert np.abs(errors).max() < 5.0

@@ -11,6 +11,7 @@ from PIL import Image
 from examples.worlds.turns import panorama_rotations, turning_sequence
 from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import read_camera_file
+from rdstitch.choices import ModelName
 from rdstitch.errors import ArgumentError
 from rdstitch.export.hugin_project import project_of_hugin
 from rdstitch.geometry.camera import Camera
@@ -111,8 +112,16 @@ def test_control_points_meet(taken: Callable[[Path], list[Path]], tmp_path: Path
     assert lens.nearest_distortion == pytest.approx(result.distortion, abs=0.01)
 
 
-def test_free_homographies_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("model", "name", "reason"),
+    [
+        ("homography", "a.png", "no images with a homography of their own"),
+        ("pose", 'a".png', r'a"\.png: .*cannot name files with quotes'),
+    ],
+)
+def test_what_hugin_does_not_know_is_refused(tmp_path: Path, model: ModelName, name: str, reason: str) -> None:
     paths = flight(3, 2).write(tmp_path)
-    result = mosaic(paths, options=StitchOptions(workers=1, dry_run=True, model="homography"))
-    with pytest.raises(ArgumentError, match="no images with a homography of their own"):
+    paths[0] = paths[0].rename(paths[0].with_name(name))
+    result = mosaic(paths, options=StitchOptions(workers=1, dry_run=True, model=model))
+    with pytest.raises(ArgumentError, match=reason):
         project_of_hugin(result.registration, result.canvas)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError
 from rdstitch.inputs.frame import Frame
+from rdstitch.io import read_image, read_metadata
 from rdstitch.io.stored_tiles import stored_tiles
 from rdstitch.stage.tile_frames import tile_frames, with_position_folders
 
@@ -69,6 +70,18 @@ def test_of_a_set_each_file_is_the_image_that_names_it(tmp_path: Path) -> None:
     assert [tile.position for tile in tiles] == [(0.0, 7.0), (1.0, 7.0), (2.0, 7.0)]
     assert {(tile.unit, tile.pixel_size, tile.channel_names) for tile in tiles} == {(1e3, 0.5, ("DAPI", "GFP"))}
     assert [tile.read(0, 0)[0][0, 0].tolist() for tile in tiles] == [[0, 1], [10, 11], [20, 21]]
+
+
+@pytest.mark.parametrize("counts", ['SizeZ="1000000000"', 'SizeC="1000000000"', 'SizeC="-3"', f'SizeT="{10**40}"'])
+@pytest.mark.parametrize("data", ["<TiffData/>", '<TiffData IFD="1" PlaneCount="2000000000"/>', '<TiffData IFD="9"/>'])
+def test_no_more_planes_than_pages_whatever_the_header_says(tmp_path: Path, counts: str, data: str) -> None:
+    told = f'SizeX="16" SizeY="12" {counts} DimensionOrder="XYZCT" Type="uint16"'
+    xml = _ome(f'<Image ID="Image:0"><Pixels ID="Pixels:0" {told}>{data}</Pixels></Image>')
+    file = tmp_path / "a.ome.tif"
+    tifffile.imwrite(file, _planes(3), description=xml, metadata=None, photometric="minisblack")
+    (tile,) = stored_tiles([file])
+    assert len(tile.planes) <= 3
+    assert read_image(file).pixels.shape == read_metadata(file).size[::-1] == SHAPE
 
 
 def test_series_of_one_file_are_tiles_of_their_own_and_labels_say_where(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ from PIL import ExifTags, Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.io import ImageSpec, Metadata, read_image, write_image, write_strips
+from rdstitch.io.formats import FORMATS
+from rdstitch.system.outputs import WRITABLE_SUFFIXES
 
 Pixels = NDArray[Any]
 
@@ -146,6 +148,10 @@ def test_tiff_has_the_same_bytes_every_time(tmp_path: Path, writes: int) -> None
         # Whatever the compressor finds in memory must not matter.
         np.random.default_rng(write).bytes(300_000 + 10_000 * write)
     assert len(written) == 1
+
+
+def test_every_format_has_its_limits() -> None:
+    assert tuple(FORMATS) == WRITABLE_SUFFIXES
 
 
 def test_floats_need_tiff(tmp_path: Path) -> None:

@@ -1,0 +1,70 @@
+"""A smooth field over each image, for what gains and vignetting leave of the differences in overlaps."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.compositing.cell_least_squares import DECIMALS, Prior, fit_robustly, solve
+from rdstitch.compositing.overlap_cells import Cells
+from rdstitch.compositing.photometric import bilinear_weights
+from rdstitch.geometry.camera import Camera
+from rdstitch.system.late_imports import sparse
+
+# Along each side of an image; of more than some 1,000 images fewer, so that the system stays bounded.
+_NODES, _MAX_NODES = 7, 50_000
+_CELL_SIGMA = 0.03  # how well fields can explain the means of a cell, log units
+# How far a field may stray from 0, and rise, and bend, from one side of an image to the other. Where images follow
+# their own brightness, they do so to the second figure, and over a distance of that by the third, in images.
+_FIELD_SIGMA, _OWN_SIGMA = 0.3, 0.02
+_RISE_SIGMA, _BEND_SIGMA = 0.1, 0.5
+
+
+def fit_fields(cells: Cells, values: FloatArray, cameras: Sequence[Camera]) -> tuple[FloatArray, FloatArray]:
+    """Fields (N, B, B, C) beside gains and vignetting, and the errors (M, C)."""
+    side, channels = _field_side(len(cameras)), values.shape[1]
+    design = _field_design(cells, cameras, side)
+    prior = _field_prior(np.zeros((len(cameras), channels)), side, _FIELD_SIGMA)
+    weight = cells.content / _CELL_SIGMA**2
+    fields, errors = fit_robustly(cells, design, weight, values, prior, clipped_weight=_CELL_SIGMA**-2)
+    return fields.reshape(len(cameras), side, side, channels), errors
+
+
+def fit_own_brightness(cells: Cells, wanted: FloatArray, cameras: Sequence[Camera]) -> FloatArray:
+    """Fields (N, B, B, C) of means ``wanted`` (N, C), that agree in the overlaps."""
+    side, channels = _field_side(len(cameras)), wanted.shape[1]
+    design = _field_design(cells, cameras, side)
+    agree = np.zeros((len(cells.pair), channels))
+    start = np.zeros((design.shape[1], channels))
+    prior = _field_prior(wanted, side, _OWN_SIGMA)
+    fields = solve(design, np.full(len(agree), _CELL_SIGMA**-2), agree, prior, start)
+    return np.round(fields, DECIMALS).reshape(len(cameras), side, side, channels)
+
+
+def _field_side(count: int) -> int:
+    """Nodes of a field along each side of one of so many images."""
+    return max(2, min(_NODES, math.isqrt(_MAX_NODES // count)))
+
+
+def _field_design(cells: Cells, cameras: Sequence[Camera], side: int) -> "sparse.csr_array":
+    """What all nodes do to the cells, (M, nodes): four in either image."""
+    rows, nodes = len(cells.pair), side**2
+    columns, entries = np.empty((rows, 2, 4), dtype=np.int32), np.empty((rows, 2, 4))
+    for end, image, chosen in cells.by_image():
+        places, shares = bilinear_weights(cameras[image], cells.points[end, chosen], side)
+        columns[chosen, end], entries[chosen, end] = image * nodes + places, (1 - 2 * end) * shares
+    ends = 8 * np.arange(rows + 1, dtype=np.int32)
+    return sparse.csr_array((entries.ravel(), columns.ravel(), ends), shape=(rows, len(cameras) * nodes))
+
+
+def _field_prior(wanted: FloatArray, side: int, sigma: float) -> Prior:
+    """Fields of means ``wanted`` (N, C), give or take ``sigma``, that rise and bend little."""
+    nodes, one = side**2, np.eye(side)
+    block = np.eye(nodes) / (sigma**2 * nodes)
+    for order, change in ((1, _RISE_SIGMA), (2, _BEND_SIGMA)):
+        step = np.diff(one, order, axis=0) * (side - 1) ** order
+        for both in (np.kron(step, one), np.kron(one, step)):
+            block += both.T @ both / (change**2 * max(1, len(both)))
+    precision = sparse.csr_array(sparse.kron(sparse.eye_array(len(wanted)), block))
+    return Prior(precision, np.repeat(wanted, nodes, axis=0) / (sigma**2 * nodes), nodes)

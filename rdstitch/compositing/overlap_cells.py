@@ -1,0 +1,183 @@
+"""What two images show of the same ground, as means of small cells: the measurements of gain compensation."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any, NamedTuple, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.compositing.boxes import Box, Float32Array, cut
+from rdstitch.compositing.photometric import full_scale
+from rdstitch.compositing.survey import Survey, SurveyTile
+from rdstitch.system.late_imports import sparse
+
+# Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.
+_CELLS, _MAX_CELLS = 16, 150_000
+_SAMPLES = 10  # pixels along each side of a cell that are looked at, at least, where it has so many
+# Integer samples outside this part of the range are clipped or mostly noise.
+_DARKEST, BRIGHTEST = 0.02, 0.97
+# Deviation within a cell, share of the samples' median, below which a pattern is hardly more than noise; and what a
+# cell without any counts beside one with a pattern.
+_PLAIN, _PLAIN_COUNTS = 0.01, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells that two images show."""
+
+    pair: IntArray  # (M,): index of the overlap, ascending
+    images: IntArray  # (2, M)
+    points: FloatArray  # (2, M, 2): middle of the cell, measured pixels of either image
+    values: FloatArray  # (2, M, C): mean samples, share of the full range
+    clipped: BoolArray  # (2, M): where an image is burnt out, in all channels: its light is what they say, or more
+    evidence: FloatArray  # (M,): from 0 to 1, how surely both images show the same there
+    overlap: "sparse.csr_array"  # (N, N): what two images have in common, share of the smaller one
+
+    @property
+    def content(self) -> FloatArray:
+        """Weight (M,) of what is the same once gains are known: then plain cells count as much as others."""
+        return np.asarray((self.evidence / _PLAIN_COUNTS).clip(max=1.0))
+
+    def darkened(self, errors: FloatArray) -> BoolArray:
+        """Cells (M,) where what is burnt out is now darker than the same in the other image.
+
+        A burnt-out sky is as bright as its samples or brighter, and must not end in a step either.
+        """
+        first = errors.mean(axis=1)
+        return np.asarray((self.clipped & (np.stack([first, -first]) < 0.0)).any(axis=0))
+
+    def by_image(self) -> Iterator[tuple[int, int, IntArray]]:
+        """Side (0 or 1), image, and its cells."""
+        for side, images in enumerate(self.images):
+            order = np.argsort(images, kind="stable")
+            for cells in np.split(order, np.flatnonzero(np.diff(images[order])) + 1):
+                yield side, int(images[cells[0]]), cells
+
+
+class _Layers(NamedTuple):
+    """What is averaged over the cells of an overlap: of its pixels (h, w, K), then of the cells (M, K)."""
+
+    samples: NDArray[Any]  # K = 2 C: of the first image, then of the second
+    clipped: NDArray[Any]  # K = 4: in any channel of either image, then in all channels of either
+    moments: NDArray[Any]  # K = 5: p, q, p², q² and p q of the grey values p and q
+
+    @classmethod
+    def split(cls, stacked: FloatArray) -> Self:
+        """The layers of what was stacked along the last axis."""
+        return cls(*np.split(stacked, [-9, -5], axis=-1))
+
+
+class _Shown(NamedTuple):
+    """What is compared of an image."""
+
+    tile: SurveyTile
+    light: NDArray[np.uint8]  # (h, w): see _light
+    grey: Float32Array  # (h, w), share of the full range
+    area: int  # pixels
+
+    @classmethod
+    def of(cls, tile: SurveyTile) -> Self:
+        return cls(tile, _light(tile), _grey(tile.pixels), int(np.count_nonzero(tile.inside)))
+
+
+def compare_overlaps(survey: Survey) -> Cells | None:
+    """Compare all images that lie over each other; None where no two show the same."""
+    pairs, count = survey.pairs(), len(survey.tiles)
+    shown = {k: _Shown.of(tile) for k, tile in enumerate(survey.tiles) if tile is not None}
+    shares, found = np.zeros(len(pairs)), []
+    for index, (i, j) in enumerate(pairs.tolist()):
+        _, _, box, seen = survey.overlap(i, j)
+        shares[index] = np.count_nonzero(seen) / min(shown[i].area, shown[j].area)
+        for middles, means in _cells_of_overlap(shown[i], shown[j], box):
+            every = max(1, -(-len(means) * len(pairs) // _MAX_CELLS))
+            found.append((np.full(len(means[::every]), index), middles[::every], means[::every]))
+    if not any(len(of_pair) for of_pair, _, _ in found):
+        return None
+    pair, middles, means = (np.concatenate(each) for each in zip(*found, strict=True))
+    layers = _Layers.split(means)
+    full = full_scale(next(iter(shown.values())).tile.pixels.dtype)
+    values = np.moveaxis(layers.samples.reshape(len(means), 2, -1), 1, 0) / full
+    clipped, points = layers.clipped.T > 0.5, np.empty((2, len(pair), 2))
+    evidence = _evidence(layers.moments.T, np.asarray(clipped.any(axis=0)))
+    overlap = sparse.csr_array((shares, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    cells = Cells(pair, pairs[pair].T, points, values, clipped[2:], evidence, sparse.csr_array(overlap + overlap.T))
+    for end, image, chosen in cells.by_image():
+        points[end, chosen] = survey.warps[image].source_points(*middles[chosen].T)
+    known = np.isfinite(points).all(axis=(0, 2))
+    parts = (cells.images[:, known], points[:, known], values[:, known], cells.clipped[:, known], evidence[known])
+    return Cells(pair[known], *parts, cells.overlap)
+
+
+def _cells_of_overlap(a: _Shown, b: _Shown, box: Box) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Middles (M, 2), pixels of the survey, and means (M, K) of what no image clips, and then of what any clips."""
+    side = max(2, round(max(*a.tile.inside.shape, *b.tile.inside.shape) / _CELLS))
+    step = max(1, side // _SAMPLES)
+    compared: list[tuple[NDArray[Any], NDArray[Any]]] = [
+        (a.light, b.light),
+        (a.grey, b.grey),
+        (a.tile.pixels, b.tile.pixels),
+    ]
+    lit, (p, q), samples = (
+        [cut(values, image.tile.box, box)[::step, ::step] for values, image in zip(both, (a, b), strict=True)]
+        for both in compared
+    )
+    clipped = np.stack([each > 1 for each in lit] + [each > 2 for each in lit], axis=-1)
+    layers = _Layers(np.concatenate(samples, axis=-1), clipped, np.stack([p, q, p * p, q * q, p * q], axis=-1))
+    stacked = np.concatenate(layers, axis=-1, dtype=np.float32)
+    for which in filter(np.any, (lit[0] * lit[1] == 1, lit[0] * lit[1] > 1)):
+        middles, means = _cell_means(which, stacked, side // step)
+        yield step * middles + box[:2], means
+
+
+def _evidence(moments: FloatArray, clipped: BoolArray) -> FloatArray:
+    """How surely both images show the same in cells (M,), from the means of p, q, pp, qq and pq, shape (5, M).
+
+    By the squared correlation of their patterns; where both are plain, or a sample is ``clipped``, they are taken to be
+    alike, but count for less than any pattern.
+    """
+    p, q, pp, qq, pq = moments
+    plain = (_PLAIN * float(np.median(moments[:2]))) ** 2
+    first, second = (np.maximum(square - mean**2, 0.0) for square, mean in ((pp, p), (qq, q)))
+    alike = ((pq - p * q + plain) / np.sqrt((first + plain) * (second + plain))).clip(0.0, 1.0) ** 2
+    weaker = np.minimum(first, second)
+    patterned = np.where(clipped, 0.0, weaker / (weaker + plain))
+    return np.asarray(alike * (patterned + (1.0 - patterned) * _PLAIN_COUNTS))
+
+
+def _grey(pixels: NDArray[Any]) -> Float32Array:
+    """Mean of the channels (h, w), share of the full range."""
+    channels = pixels.shape[2]
+    weights = np.full(channels, 1.0 / (channels * full_scale(pixels.dtype)), np.float32)
+    return np.asarray(pixels @ weights, dtype=np.float32)
+
+
+def _light(tile: SurveyTile) -> NDArray[np.uint8]:
+    """Which pixels (h, w) say how bright the scene is: 1; 2 where a channel is clipped, 4 where all are, 0 for none."""
+    integer, full = tile.pixels.dtype.kind == "u", full_scale(tile.pixels.dtype)
+    darkest, brightest = (_DARKEST * full, BRIGHTEST * full) if integer else (0.0, np.inf)
+    low, high = (reduce(extreme, np.moveaxis(tile.pixels, -1, 0)) for extreme in (np.minimum, np.maximum))
+    clipped = (high > brightest).astype(np.uint8) + (low > brightest)
+    return np.asarray((tile.inside & (low > darkest)).astype(np.uint8) << clipped)
+
+
+def _cell_means(which: BoolArray, values: Float32Array, side: int) -> tuple[FloatArray, FloatArray]:
+    """Mean x, y (M, 2), pixels of the box, and values (h, w, K) of every cell of which more than half counts, (M, K).
+
+    As products with matrices of ones and zeros, which are many times faster than sums along short axes.
+    """
+    rows, columns = (
+        np.asarray(np.arange(n) // side == np.arange(-(-n // side))[:, None], np.float32) for n in which.shape
+    )
+    down, across = (cells * np.arange(cells.shape[1], dtype=np.float32) for cells in (rows, columns))
+    weight = which.astype(np.float32)
+    count, x, y = (a @ weight @ b.T for a, b in ((rows, columns), (rows, across), (down, columns)))
+    used = count > side**2 / 2
+    # OpenCV masks, and NumPy's product sums, all channels at once.
+    chosen = cv2.copyTo(values, which.view(np.uint8))
+    along = (rows @ chosen.reshape(len(chosen), -1)).reshape(len(rows), which.shape[1], -1)
+    divisor = count[used][:, None].astype(np.float64)
+    return np.column_stack([x[used], y[used]]) / divisor, (columns @ along)[used] / divisor

@@ -1,0 +1,106 @@
+"""What EXIF says of a camera and of when and where it was, as numbers; nonsense is taken for nothing."""
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import datetime
+from typing import Any
+
+from PIL import ExifTags
+
+from rdstitch.geometry.camera import is_focal_length
+from rdstitch.geometry.places import GpsPosition
+from rdstitch.io.attitude import finite, xmp_number
+
+ORIENTATION, PIXEL_WIDTH, PIXEL_HEIGHT = 0x0112, 0xA002, 0xA003
+_DIAGONAL_35MM = math.hypot(36.0, 24.0)
+_MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
+# How far, as a logarithm, twice the distance of a calibrated middle from the border may be from the width; and how many
+# times as long one tag's focal length may be as another's: crops for video, and what "35 mm equivalent" is taken for.
+_BESIDE, _CONTRADICTION = 0.05, 1.25
+
+
+def tag_text(value: Any) -> str:
+    """Printable text of a tag that may be bytes, padded with zeros, or absent."""
+    text = value.decode("latin-1") if isinstance(value, bytes) else str(value or "")
+    return text.split("\0")[0].strip()
+
+
+def orientation_of(value: Any) -> int:
+    """EXIF orientation, also where a program has stored it as text or as a float; 1 where it means nothing."""
+    if isinstance(value, tuple) and value:
+        value = value[0]
+    number = finite(tag_text(value) if isinstance(value, bytes) else value)
+    return 1 if number is None or number not in range(1, 9) else int(number)
+
+
+def exposure_of(photo: Mapping[int, Any]) -> float | None:
+    """Exposure time x sensitivity / f-number²; without a number or a sensitivity, these are taken to be constant."""
+    time, aperture, speed = (photo.get(tag) for tag in _EXPOSURE_TAGS)
+    speed = speed[0] if isinstance(speed, tuple) and speed else speed
+    seconds, number, sensitivity = finite(time), finite(aperture or 1.0), finite(speed or 100.0)
+    if not (seconds and number and sensitivity and min(seconds, number, sensitivity) > 0.0):
+        return None
+    return seconds * sensitivity / number**2
+
+
+def focal_length(photo: Mapping[int, Any], xmp: str, size: tuple[int, int]) -> float | None:
+    """Focal length in pixels, by the most direct tag that has one; None where tags contradict one another."""
+    calibrated, middle = (xmp_number(xmp, name) for name in ("CalibratedFocalLength", "CalibratedOpticalCenterX"))
+    focal = finite(photo.get(ExifTags.Base.FocalLength))
+    resolution = finite(photo.get(ExifTags.Base.FocalPlaneXResolution))
+    unit = _MM_PER_RESOLUTION_UNIT.get(photo.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    equivalent = finite(photo.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    # Pixels of the original, which a resized image keeps the tags of; it is not read of a middle that is beside it.
+    width = finite(photo.get(PIXEL_WIDTH)) or size[0]
+    calibrated_width = width if not middle or abs(math.log(2.0 * middle / width)) < _BESIDE else 2.0 * middle
+    found = [
+        calibrated * size[0] / calibrated_width if calibrated else None,
+        focal * resolution / unit * size[0] / width if focal and resolution and unit else None,
+        equivalent / _DIAGONAL_35MM * math.hypot(*size) if equivalent else None,
+    ]
+    known = [value for value in found if value and value > 0.0 and is_focal_length(value, size)]
+    return known[0] if known and max(known) <= _CONTRADICTION * min(known) else None
+
+
+def time_taken(photo: Mapping[int, Any]) -> float | None:
+    """Seconds since 1970 by the EXIF tags of when the image was taken."""
+    tags = ExifTags.Base.DateTimeOriginal, ExifTags.Base.OffsetTimeOriginal, ExifTags.Base.SubsecTimeOriginal
+    text, zone, fraction = (tag_text(photo.get(tag)) for tag in tags)
+    for zoned in (f"{text}{zone or '+00:00'}", f"{text}+00:00"):
+        with suppress(ValueError, OverflowError):
+            whole = datetime.strptime(zoned, "%Y:%m:%d %H:%M:%S%z").timestamp()
+            return whole + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
+    return None
+
+
+def gps_position(tags: dict[int, Any], xmp: str) -> tuple[GpsPosition | None, str]:
+    """Position from the GPS block with accuracies of XMP, or None where it is absent or impossible, and why."""
+    sides = [tag_text(tags.get(tag)).upper()[:1] for tag in (ExifTags.GPS.GPSLatitudeRef, ExifTags.GPS.GPSLongitudeRef)]
+    latitude = _degrees(tags.get(ExifTags.GPS.GPSLatitude), sides[0] == "S")
+    longitude = _degrees(tags.get(ExifTags.GPS.GPSLongitude), sides[1] == "W")
+    if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
+        return None, ""
+    if latitude == longitude == 0.0:  # what receivers write that have no fix
+        return None, ""
+    if sides[0] not in ("N", "S") or sides[1] not in ("E", "W"):
+        return None, "its GPS position does not say whether north or south, east or west"
+    altitude = finite(tags.get(ExifTags.GPS.GPSAltitude))
+    below_sea = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
+    accuracies = (("RtkStdLat", "RtkStdLon", "RtkStdHgt"), ("GPSXYAccuracy", "GPSXYAccuracy", "GPSZAccuracy"))
+    told = [[xmp_number(xmp, name) or 0.0 for name in names] for names in accuracies]
+    along, across, up = next((each for each in told if min(each) > 0.0), (0.0, 0.0, 0.0))
+    std = (math.hypot(along, across) / math.sqrt(2.0), up) if up else None
+    return GpsPosition(latitude, longitude, -altitude if altitude and below_sea else altitude, std), ""
+
+
+def _degrees(value: Any, negative: bool) -> float | None:
+    """Degrees, minutes, seconds to signed degrees."""
+    if not isinstance(value, tuple) or not 1 <= len(value) <= 3:
+        return None
+    parts = [finite(part) for part in value]
+    if any(part is None for part in parts):
+        return None
+    degrees = sum((part or 0.0) / 60.0**k for k, part in enumerate(parts))
+    return -degrees if negative else degrees

@@ -1,0 +1,73 @@
+"""OME-TIFF with a pyramid, as microscopes' programs read it."""
+
+import hashlib
+import tempfile
+import uuid
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.io.encoding import STRIP_ROWS, ImageSpec, Strip, pyramid, pyramid_sizes
+from rdstitch.io.tiff import MIN_OVERVIEW, ExtraTag, copied_tags
+from rdstitch.io.tiff_tiles import TILE, encoded_tile, has_predictor, tiles_of
+from rdstitch.system.late_imports import tifffile
+
+OME_SUFFIXES = (".ome.tif", ".ome.tiff")
+
+
+def write_ome_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
+    """Write an OME-TIFF file with a pyramid; what no image covers is 0.
+
+    Channels become pages; those of a colour image stay together.
+    """
+    sizes = pyramid_sizes(spec.size, MIN_OVERVIEW)
+    apart = spec.metadata.planes or spec.channels != 3
+    shown = (pixels if alpha is None else np.where(alpha[..., None] > 0, pixels, 0) for pixels, alpha in strips)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        levels: list[NDArray[Any]] = []
+        for number, ((width, height), passing) in enumerate(pyramid(sizes, shown, path.parent, transparent=False)):
+            level = np.memmap(Path(folder) / str(number), spec.dtype, "w+", shape=(height, width, spec.channels))
+            top = 0
+            for rows in passing:
+                level[top : top + len(rows)] = rows
+                top += len(rows)
+            levels.append(level)
+        total = sum(level.nbytes for level in levels)
+        with tifffile.TiffWriter(path, ome=True, bigtiff=total > 2**31) as tiff:
+            for number, pixels in enumerate(levels):
+                height, width, channels = pixels.shape
+                parts = [pixels[..., k : k + 1] for k in range(channels)] if apart else [pixels]
+                tops = range(0, height, STRIP_ROWS)
+                shown = (np.ascontiguousarray(part[top : top + STRIP_ROWS]) for part in parts for top in tops)
+                tiff.write(
+                    (encoded_tile(tile) for tile in tiles_of(shown)),
+                    shape=(channels, height, width) if apart else (height, width, channels),
+                    dtype=spec.dtype,
+                    photometric="minisblack" if apart else "rgb",
+                    planarconfig=None if apart else "contig",
+                    tile=(TILE, TILE),
+                    compression="zlib",
+                    predictor=has_predictor(spec.dtype),
+                    subifds=None if number else len(levels) - 1,
+                    subfiletype=1 if number else 0,
+                    metadata=None if number else _ome_metadata(spec, pixels, apart=apart),
+                    software="rdstitch",
+                    iccprofile=None if number else spec.metadata.icc_profile or None,
+                    extratags=[] if number else [*copied_tags(spec.metadata), *extra_tags],
+                )
+
+
+def _ome_metadata(spec: ImageSpec, pixels: NDArray[Any], *, apart: bool) -> dict[str, Any]:
+    """What OME-XML says of the image, whose channels are pages where they are ``apart``."""
+    samples = hashlib.sha256(pixels.data).hexdigest()
+    identity = uuid.uuid5(uuid.NAMESPACE_OID, f"rdstitch {spec.size} {spec.channels} {spec.dtype} {samples}")
+    content: dict[str, Any] = {"axes": "CYX" if apart else "YXS", "UUID": f"urn:uuid:{identity}"}
+    if spec.metadata.pixel_size is not None:
+        for axis in "XY":
+            content |= {f"PhysicalSize{axis}": spec.metadata.pixel_size, f"PhysicalSize{axis}Unit": "µm"}
+    if apart and len(spec.metadata.channel_names) == spec.channels:
+        content["Channel"] = {"Name": list(spec.metadata.channel_names)}
+    return content
