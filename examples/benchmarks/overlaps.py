@@ -7,9 +7,6 @@ used, the mean over all overlaps, and the worst pair; with ``--peer-python``, a 
 ``stitching``, its images beside them.
 """
 
-import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from itertools import combinations
@@ -18,7 +15,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
+
+import rdstitch
+from examples.benchmarks.driver import images_of, run
+from examples.benchmarks.peer_layers import layers_of_peer
 
 Layer = tuple[NDArray[np.uint8], NDArray[np.uint8], tuple[int, int]]
 """A warped image, BGR, its mask, and the place of its corner (x, y)."""
@@ -64,10 +66,6 @@ def _difference(one: tuple[Any, ...], other: tuple[Any, ...]) -> tuple[float, fl
 
 def our_layers(files: list[str]) -> list[Layer]:
     """Warp images as rdstitch does."""
-    import tifffile
-
-    import rdstitch
-
     layers = []
     with tempfile.TemporaryDirectory() as folder:
         result = rdstitch.mosaic(files, f"{folder}/mosaic.png")
@@ -80,30 +78,19 @@ def our_layers(files: list[str]) -> list[Layer]:
     return layers
 
 
-def their_layers(files: list[str]) -> list[Layer]:
-    """Warp images as the package stitching does; runs where that is installed."""
-    from stitching import Stitcher  # type: ignore[import-not-found, unused-ignore]
-
-    layers: list[Layer] = []
-
-    class Recording(Stitcher):  # type: ignore[misc, unused-ignore]
-        def compensate_exposure_errors(self, corners: Any, imgs: Any) -> Any:
-            for index, (corner, image) in enumerate(zip(corners, imgs, strict=True)):
-                mask = self.get_mask(index)
-                compensated = self.compensator.apply(index, corner, image, mask)
-                layers.append((np.asarray(compensated), np.asarray(mask), corner))
-                yield compensated
-
-    Recording(crop=False).stitch(files)
-    return layers
+def layers_of(files: list[str], peer_python: str | None) -> list[Layer]:
+    """Warped images of a set, of rdstitch or of the package ``stitching``; none where that fails."""
+    if peer_python is not None:
+        return [(layer.pixels, layer.mask, layer.corner) for layer in layers_of_peer(peer_python, files)[0]]
+    try:
+        return our_layers(files)
+    except rdstitch.RdstitchError:
+        return []
 
 
 def main(folders: tuple[Path, ...], *, peer_python: str | None = None) -> None:
     """Print a row a set."""
-    from examples.benchmarks.driver import images_of
-
-    programs = [[sys.executable, "-m", "examples.benchmarks.overlaps"]]
-    programs += [] if peer_python is None else [[peer_python, __file__]]
+    programs = [None] if peer_python is None else [None, peer_python]
     print(
         "set                      images   used  mean  worst" + "   used  mean  worst (stitching)" * (len(programs) - 1)
     )
@@ -111,17 +98,10 @@ def main(folders: tuple[Path, ...], *, peer_python: str | None = None) -> None:
         files = list(map(str, images_of(folder)))
         row = f"{folder.name:24s} {len(files):6d}"
         for program in programs:
-            done = subprocess.run([*program, "--layers", *files], capture_output=True, text=True, check=False)
-            found = json.loads(done.stdout.splitlines()[-1]) if done.returncode == 0 else {}
-            row += "   {:4d} {:.3f}  {:.3f}".format(*found.values()) if done.returncode == 0 else "      0     -      -"
+            layers = layers_of(files, program)
+            row += "   {:4d} {:.3f}  {:.3f}".format(*differences(layers).values()) if layers else "      0     -      -"
         print(row, flush=True)
 
 
 if __name__ == "__main__":
-    if "--layers" in sys.argv:
-        warp = our_layers if __package__ else their_layers
-        print(json.dumps(differences(warp(sys.argv[2:]))))
-    else:
-        from examples.benchmarks.driver import run
-
-        run(main)
+    run(main)

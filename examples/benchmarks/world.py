@@ -3,8 +3,8 @@
 Every subfolder that holds images is one set; each is stitched by ``rdstitch mosaic`` with no option. A row a set: exit
 status, images used, model, λ, the ratio of the areas that a pixel gets within the output (98 % over 2 %), the focal
 length, the share of the places along its seams that is broken and the longest break in pixels, lines of messages, and
-processor time; with ``--peer``, the ``stitch`` command of the package ``stitching``, its processor time beside it. The
-seams are those of the sidecar; ``stitching``'s picture stands beside ours, and nobody is told where its seams run.
+processor time. With ``--peer-python``, a Python that has the package ``stitching``, what that makes of the same images
+stands beside it: images used, its seams, measured as ours are where its own seam finder puts them, and processor time.
 
 A result is "good" where the status is 0, all images are used, |λ| ≤ 0.09, the ratio of areas at most 30, and no image
 folded: what a person sees at a glance. Look at the images in ``--output`` for the rest.
@@ -21,11 +21,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from PIL import Image
 
 from examples.benchmarks.driver import SUFFIXES, images_of, run
+from examples.benchmarks.peer_layers import PeerLayer, layers_of_peer
 from rdstitch.arrays import FloatArray
+from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, measure_seams
 
 _GRID = np.stack(np.meshgrid([0.1, 0.5, 0.9], [0.1, 0.5, 0.9]), axis=-1).reshape(-1, 2)
 _MAX_DISTORTION, _MAX_STRETCH = 0.09, 30.0
@@ -33,6 +36,21 @@ _MAX_SECONDS = 900
 
 _VARIANTS = ("as it is", "quality 92", "70 %", "other order")
 _FAMILIES = {"rotation": "turn", "homography": "homographies"}  # all others are planes under one camera
+
+
+@dataclass(frozen=True)
+class Peer:
+    """What the package ``stitching`` makes of a set."""
+
+    used: int
+    seams: SeamQuality
+    seconds: float
+
+    def __str__(self) -> str:
+        """The end of a line of the table."""
+        longest = max((one.length for one in self.seams.breaks), default=0.0)
+        share = self.seams.share if len(self.seams.places) else math.nan
+        return f" {self.used:5d} {100 * share:5.1f} {longest:5.0f} {self.seconds:7.1f}"
 
 
 @dataclass(frozen=True)
@@ -44,7 +62,7 @@ class Row:
     count: int
     seconds: float
     messages: tuple[str, ...]
-    peer_seconds: float
+    peer: "Peer | None"
     used: int = 0
     model: str = ""
     distortion: float = math.nan
@@ -74,7 +92,7 @@ class Row:
             f"{'good' if self.good else '-':4s} {self.name:24s} {self.status:3d} {self.used:3d}/{self.count:<3d} "
             f"{self.model:10s} {self.distortion:+7.3f} {self.stretch:8.1f}{'F' if self.folded else ' '} "
             f"{self.focal:6.2f} {100 * self.broken:5.1f} {self.longest:5.0f} {len(self.messages):3d} "
-            f"{self.seconds:7.1f} {self.peer_seconds:7.1f}"
+            f"{self.seconds:7.1f}{'' if self.peer is None else self.peer}"
         )
 
 
@@ -114,7 +132,39 @@ def execute(command: list[str]) -> tuple[int, str, float]:
         return os.waitstatus_to_exitcode(status), errors.read(), usage.ru_utime + usage.ru_stime
 
 
-def stitch(folder: Path, output: Path, options: list[str], peer: str | None) -> Row:
+def seams_of(layers: list[PeerLayer]) -> SeamQuality:
+    """Measure seams as those of our outputs are: where seen at a usual size of the images, exposure corrected."""
+    area = float(np.median([np.count_nonzero(layer.mask) for layer in layers]))
+    unit = max(1.0, 1.44 * math.sqrt(area) / DIAGONAL)  # the diagonal of an image of 4 to 3
+    corner = np.min([layer.corner for layer in layers], axis=0)
+    tiles, kept = [], []
+    for layer in layers:
+        (x, y), (height, width) = layer.corner - corner, layer.mask.shape
+        left, top, right, bottom = (math.floor(edge / unit) for edge in (x, y, x + width, y + height))
+        size = right + 1 - left, bottom + 1 - top
+        offset = (np.array([left, top]) + 0.5) * unit - 0.5 - (x, y)
+        to_layer = np.array([[unit, 0.0, offset[0]], [0.0, unit, offset[1]]])
+        smooth = cv2.GaussianBlur(layer.pixels.mean(axis=2, dtype=np.float32), (0, 0), math.hypot(unit, unit / 2.0))
+        linear = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        grey = cv2.warpAffine(smooth, to_layer, size, flags=linear, borderMode=cv2.BORDER_REPLICATE)
+        inside, owned = (cv2.warpAffine(mask, to_layer, size, flags=linear) for mask in (layer.mask, layer.kept))
+        tiles.append(SeamTile((left, top, right + 1, bottom + 1), grey, inside > 254))
+        kept.append(owned > 127)
+    columns, rows = np.max([tile.box[2:] for tile in tiles], axis=0)
+    labels = np.full((rows, columns), -1, dtype=np.int32)
+    for k, (tile, mask) in enumerate(zip(tiles, kept, strict=True)):
+        left, top, right, bottom = tile.box
+        labels[top:bottom, left:right][mask] = k
+    return measure_seams(tiles, labels, 1.0, unit)
+
+
+def peer_of(python: str, files: list[str], output: Path) -> Peer:
+    """Stitch one set by the package ``stitching``."""
+    layers, seconds = layers_of_peer(python, files, output)
+    return Peer(len(layers), seams_of(layers) if layers else SeamQuality(), seconds)
+
+
+def stitch(folder: Path, output: Path, options: list[str], peer_python: str | None) -> Row:
     """Stitch one set."""
     files = [str(file) for file in images_of(folder)]
     written = output / f"{folder.name}.jpg"
@@ -122,11 +172,8 @@ def stitch(folder: Path, output: Path, options: list[str], peer: str | None) -> 
     status, errors, seconds = execute([*program, "mosaic", *files, "-o", str(written), "--overwrite", *options])
     messages = tuple(line for line in errors.splitlines() if line.startswith("rdstitch:"))
     (output / f"{folder.name}.txt").write_text(errors)
-    peer_seconds = math.nan
-    if peer is not None:
-        theirs = str(output / f"{folder.name}.peer.jpg")
-        peer_seconds = execute(["timeout", str(_MAX_SECONDS), peer, *files, "--output", theirs])[2]
-    row = Row(folder.name, status, len(files), seconds, messages, peer_seconds)
+    peer = None if peer_python is None else peer_of(peer_python, files, output / f"{folder.name}.peer.jpg")
+    row = Row(folder.name, status, len(files), seconds, messages, peer)
     sidecar = Path(f"{written}.json")
     if status or not sidecar.exists():
         return row
@@ -188,7 +235,7 @@ def main(
     folders: tuple[Path, ...],
     *,
     output: Path | None = None,
-    peer: str | None = None,
+    peer_python: str | None = None,
     jobs: int = 1,
     options: str = "",
     resaved: bool = False,
@@ -201,14 +248,14 @@ def main(
         with ThreadPoolExecutor(jobs) as pool:
             compare_variants(sets, output, options.split(), pool)
         return
-    columns = "areas   f/half  torn break lines  cpu s  peer s"
+    columns = "areas   f/half  torn break lines  cpu s" + ("" if peer_python is None else "  peer  torn break   cpu s")
     print(f"     set                      status used  model           λ    {columns}")
     with ThreadPoolExecutor(jobs) as pool:
         rows = []
-        for row in pool.map(lambda folder: stitch(folder, output, options.split(), peer), sets):
+        for row in pool.map(lambda folder: stitch(folder, output, options.split(), peer_python), sets):
             print(row, flush=True)
             rows.append(row)
-    ratios = [row.seconds / row.peer_seconds for row in rows if math.isfinite(row.peer_seconds)]
+    ratios = [row.seconds / row.peer.seconds for row in rows if row.peer is not None and row.peer.used]
     print(
         f"{sum(row.good for row in rows)} of {len(rows)} good; {sum(len(row.messages) for row in rows)} messages"
         + (f"; time over the peer's, median {np.median(ratios):.2f}" if ratios else "")

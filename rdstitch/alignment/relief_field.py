@@ -169,18 +169,30 @@ class ReliefField:
         pairs = self._pairs
         if not pairs:
             return np.zeros(0), np.zeros(0)
-        o = self.response.adjuster.observations
-        errors = np.concatenate([part.errors for part in self.response.parts()])
+        o, errors = self.response.adjuster.observations, self._errors
         power = float((errors[np.unique(np.concatenate(pairs[0]))] ** 2).mean())
         independent = power * self._answers(_independent, _NOISE_FIELDS)[0]
         agreement, std = np.empty(len(pairs)), np.empty(len(pairs))
         for k, (first, second) in enumerate(pairs):
             products = np.einsum("mi,mi->m", errors[first], errors[second])
             mean = float(products.mean())
-            # Errors of a link depend on each other.
+            # Errors of a link depend on each other; of one link alone that does not show.
             by_link = np.bincount(o.link[first], products - mean, len(o))
-            agreement[k], std[k] = mean - independent[k], np.sqrt((by_link**2).sum()) / len(first)
+            scatter = max((by_link**2).sum(), ((products - mean) ** 2).sum())
+            agreement[k], std[k] = mean - independent[k], np.sqrt(scatter) / len(first)
         return agreement, std
+
+    @cached_property
+    def _errors(self) -> FloatArray:
+        """Errors (M, 2), pixels, that are left when all follows them that may be free, a lens that was held included.
+
+        As waves are answered: what that lens explains is no relief.
+        """
+        normal = self.response.normal
+        steps = normal.responses(normal.gradient_poses[..., None], normal.gradient_shared[:, None])
+        return np.concatenate(
+            [part.errors + self.response.changes(part, *steps)[..., 0] for part in self.response.parts()]
+        )
 
     def _answers(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Agreement (D,) at each distance, px², that fields leave in the mean, and the steps that answer each,
@@ -239,7 +251,9 @@ def _spectrum(left: FloatArray, agreement: FloatArray, std: FloatArray) -> Float
 
     By the agreement at each distance that each band leaves (D, B), what was found (D,), and its standard deviation.
     """
-    steep = agreement[0] / float(left[0].mean()) if left[0].mean() > 0.0 else 0.0
+    # Less what chance makes of it: the positive part of James and Stein's estimate.
+    certain = agreement[0] - std[0] ** 2 / agreement[0]
+    steep = certain / float(left[0].mean()) if left[0].mean() > 0.0 else 0.0
     if steep <= 0.0:
         return np.zeros(left.shape[1])
     bands = left.shape[1]

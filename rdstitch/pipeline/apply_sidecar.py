@@ -30,7 +30,7 @@ from rdstitch.pipeline.counterparts import MatchedBy, counterparts, registered_f
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.read_inputs import check_size, with_flat_field
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.straighten import turned_anew
+from rdstitch.pipeline.straighten import reoriented
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.messages import left_out as left_out_message
 from rdstitch.results.stitch_result import OutputImage
@@ -285,7 +285,7 @@ def _laid_out(
     lens, messages = (None, []) if tiles else _lens_of_band(saved, chosen.frames, used, progress)
     if lens is not None:
         used = {index: replace(source, camera=lens.camera(source.camera)) for index, source in used.items()}
-    placed, said = turned_anew(_placed(saved, used, lens), composite, saved.composite)
+    placed, said = reoriented(_placed(saved, used, lens), composite, saved.composite)
     if (grid := _same_grid(saved, used, composite)) is not None:
         placed, composite = replace(placed, grid=grid), replace(composite, crop="none")
     return Layout.of(placed, composite), composite, [*messages, *said]

@@ -2,11 +2,11 @@
 
 Where those of the most probable layout are seen to break, or it stretches what it shows as nobody would, other
 hypotheses that join the same images are laid out at the size that seams are found at, and the one of which a person
-sees the least is taken: without local alignment, a turn of the camera, a plane, free homographies, and, where something
-fills a good part of the images and moves of its own, what lies behind it.
+sees the least is taken: without local alignment, by another surface of the scene, a turn of the camera, a plane, free
+homographies, and, where something fills a good part of the images and moves of its own, what lies behind it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -16,18 +16,15 @@ import numpy as np
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
-from rdstitch.compositing.projection import PLANE
 from rdstitch.compositing.seam_quality import DIAGONAL
-from rdstitch.errors import ArgumentError, LimitError, RdstitchError
+from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
-from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.accept import plane_of_most, realigned
 from rdstitch.pipeline.aligner import Aligner
-from rdstitch.pipeline.compose import Layout
-from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally, straight_edges
+from rdstitch.pipeline.lay_out import IMAGE_GRID, LaidOut, is_stretched, lay_out
+from rdstitch.pipeline.placed_images import align_registration_locally, straight_edges
+from rdstitch.pipeline.realign import by_second_motions, plane_of_most, realigned
 from rdstitch.pipeline.register import with_frontal_reference
-from rdstitch.pipeline.straighten import turned
 from rdstitch.pipeline.whole_pixels import on_whole_pixels
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message
@@ -36,9 +33,6 @@ from rdstitch.verification.verdict import RefusedError
 
 _MODELS = ("rotation", "pose", "homography")
 """What a camera can have done: turned, moved over a plane, or anything that joins images of a plane."""
-
-_MAX_MAGNIFICATION, _MAX_ASPECT = 4.0, 2.0
-"""Of a place over the median one, and of its two directions: those of a plane seen 60 degrees off its normal."""
 
 _CLEARLY = 0.5
 """Share of the broken places up to which another layout is clearly better."""
@@ -55,45 +49,31 @@ _BY_CHANCE = Message(
     severity="failure",
 )
 
-_GRID = np.stack(np.meshgrid(*[[0.02, 0.25, 0.5, 0.75, 0.98]] * 2), axis=-1).reshape(-1, 2)
 
+@dataclass(frozen=True, eq=False)
+class _Trials:
+    """Lays out registrations of the same images as the output would have them, with exposure and seams."""
 
-@dataclass(frozen=True)
-class LaidOut:
-    """A registration in the frame of the output, with its layout."""
+    options: StitchOptions
+    pano: bool
+    edges_of: Callable[[int], FloatArray]  # straight edges in an image
 
-    registration: Registration
-    local: LocalAlignment
-    layout: Layout
-    messages: tuple[Message, ...] = ()
+    def lay_out(self, registration: Registration, local: LocalAlignment | None = None) -> LaidOut:
+        """Lay out a registration in pixels of the working size."""
+        options = self.options
+        whole = on_whole_pixels(with_frontal_reference(at_full_size(registration), options, always=self.pano))
+        if local is None:
+            local = align_registration_locally(whole, options.local_alignment, self.edges_of, options.threads)
+        laid_out = lay_out(whole, local, options.composite)
+        if options.dry_run:
+            return laid_out
+        return replace(laid_out, layout=laid_out.layout.decided(options.composite, options.threads))
 
-    @property
-    def faults(self) -> int:
-        """What speaks against it: broken seams, stretched places, overlaps that do not look alike, and local alignment
-        whose seams lie nowhere where they could be judged, 0 to 4.
-        """
-        seams = self.layout.seams
-        unjudged = bool(self.local.fields) and not len(seams.places)
-        return int(seams.seen) + int(_is_stretched(self.layout)) + int(seams.contradicted) + int(unjudged)
-
-    @property
-    def clipped(self) -> int:
-        """Number of images of which only the near part is drawn."""
-        return sum(part is not None for part in self.layout.canvas.near)
-
-    @property
-    def broken(self) -> int:
-        """Number of places at which its seams are broken; they are as far apart in every layout."""
-        return int(self.layout.seams.broken.sum())
-
-
-def lay_out(registration: Registration, local: LocalAlignment, options: CompositeOptions) -> LaidOut:
-    """Images of a registration on the canvas of the output."""
-    placed, said = turned(PlacedImages.of(registration, local.fields or None), options)
-    if placed.orientation is not None:
-        homographies = placed.orientation @ registration.alignment.homographies
-        registration = replace(registration, alignment=replace(registration.alignment, homographies=homographies))
-    return LaidOut(registration, local, Layout.of(placed, options), tuple(said))
+    def attempt(self, registration: Registration) -> LaidOut | None:
+        """The same of an alternative; None where it has no canvas, or none that the options can turn."""
+        with suppress(LimitError, ArgumentError):
+            return self.lay_out(registration)
+        return None
 
 
 def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner) -> LaidOut:
@@ -101,71 +81,92 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
 
     Pixels are those of the working size.
     """
-    pano = aligner.options.purpose is Purpose.PANO
-
-    @cache
-    def edges(image: int) -> FloatArray:
-        return straight_edges(registration.sources[image])
-
-    def laid(candidate: Registration, local: LocalAlignment | None = None) -> LaidOut:
-        whole = on_whole_pixels(with_frontal_reference(at_full_size(candidate), options, always=pano))
-        if local is None:
-            local = align_registration_locally(whole, options.local_alignment, edges, options.threads)
-        one = lay_out(whole, local, options.composite)
-        return one if options.dry_run else replace(one, layout=one.layout.decided(options.composite, options.threads))
-
-    failed: RdstitchError | None = None
-    tried: list[LaidOut] = []
+    edges_of = cache(lambda image: straight_edges(registration.sources[image]))
+    trials = _Trials(options, aligner.options.purpose is Purpose.PANO, edges_of)
+    first: LaidOut | LimitError
     try:
-        tried.append(laid(registration))
+        first = trials.lay_out(registration)
+        if options.dry_run:
+            return first
     except LimitError as error:
-        failed = error
-    if not options.dry_run and not (tried and not tried[0].layout.seams.contradicted):
-        plane = plane_of_most(registration, options, aligner)
-        if plane is not None and _joins(plane.alignment, registration.alignment, options.threshold):
-            with suppress(LimitError):
-                rival = laid(plane)
-                # What is put where it does not belong is unlike all over what the images show.
-                if not tried or rival.layout.seams.fills > tried[0].layout.seams.fills:
-                    registration, tried, failed = plane, [rival], None
-    if options.dry_run or (tried and not tried[0].faults):
-        return _first(tried, failed)
-    if tried and tried[0].local.fields and options.local_alignment == "auto":
-        tried.append(laid(registration, no_local_alignment("seams hold better without it")))
-    others = _others(registration, options, aligner, tried[0] if tried else None)
-    # Of those that nothing speaks against, the most probable is taken.
-    while not (tried and tried[-1].clipped <= tried[0].clipped and not tried[-1].faults):
-        if (other := next(others, None)) is None:
+        if options.dry_run:
+            raise
+        first = error
+    if isinstance(first, LimitError) or first.layout.seams.contradicted:
+        registration, first = _plane_behind(registration, first, trials, aligner)
+    tried = [first] if isinstance(first, LaidOut) else []
+    for other in _alternatives(registration, tried, trials, aligner):
+        tried.append(other)
+        # Of those that nothing speaks against, the most probable is taken.
+        if other.clipped <= tried[0].clipped and not other.faults:
             break
-        try:
-            tried.append(laid(other))
-        except (LimitError, ArgumentError):
-            continue
-    first = _first(tried, failed)
-    whole = [one for one in tried if one.clipped <= first.clipped]
-    best = min(whole, key=lambda one: (one.faults, one.broken))
-    broken = first.broken if first.layout.seams.seen else 0
-    if failed is None and best.faults == first.faults and best.broken > _CLEARLY * broken:
-        best = first
+    if isinstance(first, LimitError) and not tried:
+        raise first
+    best = _least_broken(tried, first)
     if best.layout.seams.by_chance and not options.force:
         raise RefusedError(best.registration.with_messages([_BY_CHANCE]))
     return best
 
 
-def _first(tried: list[LaidOut], failed: RdstitchError | None) -> LaidOut:
-    if tried:
-        return tried[0]
-    assert failed is not None
-    raise failed
+def _plane_behind(
+    registration: Registration, first: LaidOut | LimitError, trials: _Trials, aligner: Aligner
+) -> tuple[Registration, LaidOut | LimitError]:
+    """The plane behind what moves of its own, with its layout, where its images look more alike; else what is given."""
+    plane = plane_of_most(registration, aligner)
+    if plane is None or not _joins(plane.alignment, registration.alignment, aligner.threshold):
+        return registration, first
+    behind = trials.attempt(plane)
+    # What is put where it does not belong is unlike all over what the images show.
+    if behind is None or (isinstance(first, LaidOut) and behind.layout.seams.fills <= first.layout.seams.fills):
+        return registration, first
+    return plane, behind
 
 
-def _others(
-    registration: Registration, options: StitchOptions, aligner: Aligner, first: LaidOut | None
+def _alternatives(
+    registration: Registration, tried: Sequence[LaidOut], trials: _Trials, aligner: Aligner
+) -> Iterator[LaidOut]:
+    """Other layouts, the likeliest first, where something speaks against the first one, or it has no canvas."""
+    first = tried[0] if tried else None
+    if first is not None and not first.faults:
+        return
+    if first is not None and first.local.fields and trials.options.local_alignment == "auto":
+        yield trials.lay_out(registration, no_local_alignment("seams hold better without it"))
+    if first is not None and (other_surface := _other_surface(registration, first, trials, aligner)) is not None:
+        yield other_surface
+    for other in _other_models(registration, first, trials.options, aligner):
+        if (laid_out := trials.attempt(other)) is not None:
+            yield laid_out
+
+
+def _other_surface(registration: Registration, first: LaidOut, trials: _Trials, aligner: Aligner) -> LaidOut | None:
+    """By the second motion of the images whose seams break; None where no more of them looks alike then."""
+    used = np.flatnonzero(registration.alignment.used).tolist()
+    broken = [(used[one.images[0]], used[one.images[1]]) for one in first.layout.seams.breaks]
+    other = by_second_motions(registration, broken, aligner)
+    if other is None or not _joins(other.alignment, registration.alignment, _MISFIT * registration.alignment.rms):
+        return None
+    laid_out = trials.attempt(other)
+    if laid_out is None or laid_out.layout.seams.fills < first.layout.seams.fills:
+        return None
+    return laid_out
+
+
+def _least_broken(tried: Sequence[LaidOut], given: LaidOut | LimitError) -> LaidOut:
+    """The layout that the least speaks against; the one that was given unless another is clearly better."""
+    first = tried[0]
+    best = min((one for one in tried if one.clipped <= first.clipped), key=lambda one: (one.faults, one.broken))
+    broken = first.broken if first.layout.seams.seen else 0
+    clearly = best.faults < first.faults or best.broken <= _CLEARLY * broken
+    return best if clearly or isinstance(given, LimitError) else first
+
+
+def _other_models(
+    registration: Registration, first: LaidOut | None, options: StitchOptions, aligner: Aligner
 ) -> Iterator[Registration]:
-    """Other registrations that use every image that this one does."""
+    """The same images aligned by other models, where every one finds its place."""
     alignment = registration.alignment
     # What breaks along seams may have moved, and proves nothing against a layout that fits; one that is stretched does.
-    stretched = first is None or _is_stretched(first.layout)
+    stretched = first is None or is_stretched(first.layout)
     allowed = max(options.threshold * stretched, _MISFIT * alignment.rms)
     names = [name for name in _MODELS if name != alignment.model] if options.model == "auto" else []
     if first is not None and first.layout.placed.has_place:  # a map needs a plane with a metric
@@ -195,28 +196,8 @@ def _differs(registration: Registration, allowed: float, other: Alignment, *, st
         return True
     moved = [np.zeros(1)]
     for i, j in alignment.support:
-        points = _GRID * alignment.cameras[i].image_size
+        points = IMAGE_GRID * alignment.cameras[i].image_size
         before, after = (one.transfer(i, j, points) for one in (alignment, other))
         inside = ((before >= 0.0) & (before < alignment.cameras[j].image_size)).all(axis=1)
         moved.append(np.linalg.norm(after - before, axis=1)[inside] / (2.0 * alignment.cameras[j].scale))
     return not np.quantile(np.nan_to_num(np.concatenate(moved), nan=np.inf), _MOST) <= _ELSEWHERE
-
-
-def _is_stretched(layout: Layout) -> bool:
-    """Whether a plane shows some places much larger than most, or much longer than wide, lens apart."""
-    canvas = layout.canvas
-    if canvas.projection != PLANE:
-        return False
-    magnification = []
-    for image in layout.images:
-        size = np.array(image.camera.image_size)
-        at, step = _GRID * size, 1e-3 * size[1]
-        # A fisheye's border is stretched on any plane.
-        flat = replace(image.camera, distortion=0.0, distortion2=0.0, distortion3=0.0, image_circle=None)
-        middle, right, down = (canvas.place(flat, image.homography, at + d) for d in ((0, 0), (step, 0), (0, step)))
-        shown = np.isfinite(middle + right + down).all(axis=1)
-        jacobian = np.stack([right - middle, down - middle], axis=-1)[shown] / step
-        magnification.append(np.linalg.svd(jacobian, compute_uv=False))
-    every = np.concatenate(magnification)
-    largest = float(every[:, 0].max() / np.median(every[:, 0]))
-    return largest > _MAX_MAGNIFICATION or float(np.median(every[:, 0] / every[:, 1])) > _MAX_ASPECT

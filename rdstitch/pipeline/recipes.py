@@ -19,13 +19,15 @@ from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import timestamps_of, with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.accept import accept, aligner_of, scale_uncertainty
+from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.along_odometry import along_odometry, with_odometry_of_bag
-from rdstitch.pipeline.choose_layout import LaidOut, choose_layout
+from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import blocks_on, check_world_files, compose_images, viewed_images, write_page
+from rdstitch.pipeline.lay_out import LaidOut
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.output_plan import check_run, report_refused, stage_beside
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag
+from rdstitch.pipeline.realign import aligner_of
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_full_size

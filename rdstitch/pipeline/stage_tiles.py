@@ -24,8 +24,8 @@ from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
-from rdstitch.pipeline.choose_layout import lay_out
 from rdstitch.pipeline.compose import check_world_files
+from rdstitch.pipeline.lay_out import lay_out
 from rdstitch.pipeline.output_plan import check_run
 from rdstitch.pipeline.read_inputs import NO_FLAT_FIELD, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration

@@ -35,27 +35,45 @@ _MAX_CUT = 0.1  # share of what the images show that straightening may cut away
 _STEEP = math.cos(math.radians(30.0))  # a camera that looks nearer to straight up or down shows nothing upright
 
 
-def turned(placed: PlacedImages, options: CompositeOptions) -> tuple[PlacedImages, list[Message]]:
+def oriented(placed: PlacedImages, options: CompositeOptions) -> tuple[PlacedImages, list[Message]]:
     """The images as the options turn them, and what the user should know of it.
 
     :attr:`PlacedImages.orientation` says by what.
     """
-    matrix, said = _upright(placed, options) if options.upright else (None, [])
-    if matrix is not None and options.straighten == "auto":
-        before, after = (_cut_away(placed, options, turn) for turn in (np.eye(3), matrix))
+    upright, messages = _upright(placed, options) if options.upright else (None, [])
+    if upright is not None and options.straighten == "auto":
+        before, after = (_cut_away(placed, options, turn) for turn in (np.eye(3), upright))
         if after > before + _MAX_CUT:
             text = f"not straightened: {after:.0%} of what the images show would be cut away, and not {before:.0%}"
             text += "; choose another --projection, or raise --max-stretch"
-            matrix, said = None, [Message(text, code="not-straightened")]
-    if (view := view_rotation(options)) is not None:
-        if not placed.turned:
-            raise ArgumentError(
-                "yaw, pitch and roll are for images taken by turning on the spot; these were not, use --rotate"
-            )
-        matrix = view if matrix is None else view @ matrix
-    if matrix is None:
-        return placed, said
-    return replace(placed, homographies=matrix @ placed.homographies, orientation=matrix), said
+            upright, messages = None, [Message(text, code="not-straightened")]
+    view = view_rotation(options)
+    if view is not None and not placed.turned:
+        raise ArgumentError(
+            "yaw, pitch and roll are for images taken by turning on the spot; these were not, use --rotate"
+        )
+    if (matrix := _product(view, upright)) is None:
+        return placed, messages
+    return replace(placed, homographies=matrix @ placed.homographies, orientation=matrix), messages
+
+
+def _product(first: FloatArray | None, second: FloatArray | None) -> FloatArray | None:
+    """The product of those of two matrices (3, 3) that there are."""
+    if first is None or second is None:
+        return second if first is None else first
+    return np.asarray(first @ second)
+
+
+def reoriented(
+    placed: PlacedImages, options: CompositeOptions, former: UprightOptions
+) -> tuple[PlacedImages, list[Message]]:
+    """The same of images that other options have turned before."""
+    if options.same_turn(former):
+        return placed, []
+    if placed.orientation is not None:
+        homographies = np.linalg.inv(placed.orientation) @ placed.homographies
+        placed = replace(placed, homographies=homographies, orientation=None, place=None)
+    return oriented(placed, options)
 
 
 def view_rotation(options: UprightOptions) -> FloatArray | None:
@@ -74,53 +92,61 @@ def _cut_away(placed: PlacedImages, options: CompositeOptions, matrix: FloatArra
     return 1.0
 
 
-def turned_anew(
-    placed: PlacedImages, options: CompositeOptions, former: UprightOptions
-) -> tuple[PlacedImages, list[Message]]:
-    """The same of images that other options have turned before."""
-    if options.same_turn(former):
-        return placed, []
-    if placed.orientation is not None:
-        homographies = np.linalg.inv(placed.orientation) @ placed.homographies
-        placed = replace(placed, homographies=homographies, orientation=None, place=None)
-    return turned(placed, options)
-
-
 def _upright(placed: PlacedImages, options: CompositeOptions) -> tuple[FloatArray | None, list[Message]]:
     """What takes the images to where the scene is upright; None where nothing shows how."""
     if placed.reference is None:
         raise ArgumentError("the reference image is not among the images: nothing can be turned upright")
-    frame = placed.homographies[placed.reference]
-    focal = _focal(placed)
+    frame, focal = placed.homographies[placed.reference], _focal(placed)
     start = nearest_rotation(np.asarray(np.linalg.inv(to_axes(frame, focal.value))))
+    upright: Upright | None
+    message: Message | None
+    if options.rectangle is not None:
+        upright, message = _by_rectangle(placed, np.reshape(options.rectangle, (4, 2)), focal)
+    elif options.straighten == "auto":
+        upright, message = _by_edges(placed, start, focal)
+    elif not isinstance(options.straighten, str):
+        upright, message = _by_lines(placed, np.reshape(options.straighten, (-1, 2)), start, focal), None
+    else:
+        upright, message = _by_gravity(placed, start, focal)
+    messages = [] if message is None else [message]
+    return None if upright is None else upright.matrix(frame, turned=placed.turned), messages
+
+
+def _by_rectangle(placed: PlacedImages, corners: FloatArray, focal: Focal) -> tuple[Upright, Message]:
+    """By the corners (4, 2) of what is a rectangle in the scene, pixels of the reference image."""
+    assert placed.reference is not None
     camera = placed.cameras[placed.reference]
     pixel = 1.0 / camera.scale
-    said: list[Message] = []
-    if options.rectangle is not None:
-        corners = _in_reference(placed, np.reshape(options.rectangle, (4, 2)))
-        upright, aspect, error = of_rectangle(corners, focal, pixel)
-        text = f"rectangle: {aspect:.4g} times as wide as high ± {error:.1%}"
-        text += f", with a focal length of {upright.focal.value / pixel:.0f} pixels ({camera.focal_source or 'guess'})"
-        said = [Message(text, severity="warning" if error > _SURE else "note")]
-    elif options.straighten == "auto":
-        axes = of_scene(_edges(placed), start, focal, depth=placed.turned)
-        if axes is None:
-            text = "no straight edges were found: the output is not turned"
-            return None, [Message(text, code="not-straightened")]
-        upright, across, down = axes
-        said = [Message(f"straightened by {across} horizontal and {down} vertical edges", severity="note")]
-    elif not isinstance(options.straighten, str):
-        ends = _in_reference(placed, np.reshape(options.straighten, (-1, 2))).reshape(-1, 2, 2)
-        edges = _between(placed, np.concatenate([ends, np.ones((len(ends), 2, 1))], axis=2), _POINTING * pixel)
-        axis = nearest_axis(edges, start[:2], focal.value)
-        upright = of_edges(edges, axis, start, focal, focal.value)
-    elif placed.turned:
-        return None, [Message("the horizon of a panorama is level already", severity="note")]
-    elif (level := _level(placed, start, focal)) is None:
-        return None, [Message("the camera looks straight down: there is nothing to level")]
-    else:
-        upright = level
-    return upright.matrix(frame, turned=placed.turned), said
+    upright, aspect, error = of_rectangle(_in_reference(placed, corners), focal, pixel)
+    text = f"rectangle: {aspect:.4g} times as wide as high ± {error:.1%}"
+    text += f", with a focal length of {upright.focal.value / pixel:.0f} pixels ({camera.focal_source or 'guess'})"
+    return upright, Message(text, severity="warning" if error > _SURE else "note")
+
+
+def _by_edges(placed: PlacedImages, start: FloatArray, focal: Focal) -> tuple[Upright | None, Message]:
+    """By what seem to be horizontal and vertical edges of the scene."""
+    axes = of_scene(_edges(placed), start, focal, depth=placed.turned)
+    if axes is None:
+        return None, Message("no straight edges were found: the output is not turned", code="not-straightened")
+    upright, across, down = axes
+    return upright, Message(f"straightened by {across} horizontal and {down} vertical edges", severity="note")
+
+
+def _by_lines(placed: PlacedImages, ends: FloatArray, start: FloatArray, focal: Focal) -> Upright:
+    """By ends (2 L, 2) of lines that are upright or level in the scene, pixels of the reference image."""
+    assert placed.reference is not None
+    lines = _in_reference(placed, ends).reshape(-1, 2, 2)
+    error = _POINTING / placed.cameras[placed.reference].scale
+    edges = _between(placed, np.concatenate([lines, np.ones((len(lines), 2, 1))], axis=2), error)
+    return of_edges(edges, nearest_axis(edges, start[:2], focal.value), start, focal, focal.value)
+
+
+def _by_gravity(placed: PlacedImages, start: FloatArray, focal: Focal) -> tuple[Upright | None, Message | None]:
+    """By what was measured to be down, or is down in most images."""
+    if placed.turned:
+        return None, Message("the horizon of a panorama is level already", severity="note")
+    upright = _level(placed, start, focal)
+    return upright, Message("the camera looks straight down: there is nothing to level") if upright is None else None
 
 
 def _focal(placed: PlacedImages) -> Focal:

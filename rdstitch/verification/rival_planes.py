@@ -42,7 +42,7 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
     found = {pair.images: (fills(pair.images, pair.relation), pair.relation) for pair in pairs}
     if all(share >= half for share, _ in found.values()):
         return None
-    for pair, motion in _second_motions(registration.alignment.cameras, pairs, threshold).items():
+    for pair, motion in second_motions(registration.alignment.cameras, pairs, threshold).items():
         found[pair] = max(found[pair], (fills(pair, motion), motion), key=lambda each: each[0])
     needed = _least_needed({pair: share for pair, (share, _) in found.items() if share >= half})
     return [
@@ -67,7 +67,7 @@ def _least_needed(fills: Mapping[Pair, float]) -> float:
     return fills[surest[bisect_left(range(1, len(surest)), -parts(len(surest)), key=lambda count: -parts(count))]]
 
 
-def _second_motions(
+def second_motions(
     cameras: Sequence[Camera], pairs: Sequence[PairRegistration], threshold: float
 ) -> Mapping[Pair, RadialHomography]:
     """Of each pair the motion that most of the matches agree on that its own does not explain, with its own λ: that of

@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import aligned, grid, scene
+from examples.worlds.alignment_scenes import aligned, fitted, grid, scene
 from examples.worlds.lens_scenes import SIZE, lens_scene
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
+from rdstitch.alignment.least_squares.linear_response import LinearResponse
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.noise import shared_variance
+from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.uncertainty import sandwich_covariances
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import LENS_STD, Camera
@@ -96,6 +98,29 @@ def test_the_stated_deviation_covers_what_two_images_do_not_show() -> None:
     assert {own.lens for own in found} == {"division"}
     assert misses.max() < 3.0
     assert np.median(misses) > 0.33
+
+
+def _variance_by_relief(columns: int, rows: int, lens: Camera | None, matches: int, seed: int) -> float:
+    """Of λ, over its variance by independent errors, with all of the lens free over a plane fitted with λ alone."""
+    rng = np.random.default_rng(seed)
+    given = scene(grid(columns, rows, (0.5, 0.3), 0.2, rng), rng=rng, per_link=matches, lens=lens)
+    problem, fit = fitted(given)
+    adjuster = replace(problem, free_lens=np.ones_like(problem.free_lens)).adjuster_of(fit)
+    steps, of_lens = ReliefField(LinearResponse.of(adjuster, fit.adjusted)).steps()[1], len(fit.model.shared_names)
+    return float((steps[of_lens] ** 2).sum() / adjuster.covariance(fit.adjusted)[of_lens, of_lens])
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "lens", "matches", "most"),
+    [
+        (3, 2, Camera((640, 480), -0.25, distortion2=0.08), 200, 0.2),
+        (3, 2, Camera((640, 480), -0.25, center=(333.0, 233.0)), 200, 0.2),
+        (2, 1, None, 40, 0.04),
+    ],
+)
+def test_a_plane_has_no_hills(columns: int, rows: int, lens: Camera | None, matches: int, most: float) -> None:
+    """Neither where a lens is not quite what was fitted, nor by the chance agreement of the few errors of one pair."""
+    assert np.mean([_variance_by_relief(columns, rows, lens, matches, seed) for seed in range(6)]) < most
 
 
 def test_a_focal_length_that_no_lens_has_makes_the_lens_less_certain() -> None:

@@ -19,8 +19,9 @@ from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.accept import _without, accept
+from rdstitch.pipeline.accept import accept
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, reselect_inliers, select_by_whole_lens
+from rdstitch.pipeline.realign import realigned, without
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.pipeline.register import register
 from rdstitch.results.messages import Message, left_out
@@ -49,9 +50,19 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
         alignment=replace(found.alignment, links=links, used=found.alignment.used & [False, True, True]),
         messages=(left_out(frames[0], "contradicts"),),
     )
-    rest = _without(spoiled, {(2,): Message("shows something else")}, Aligner.of(sources, OPTIONS, NO_CACHE))
+    rest = without(spoiled, {(2,): Message("shows something else")}, Aligner.of(sources, OPTIONS, NO_CACHE))
     assert rest.alignment.used.tolist() == [True, True, False]
     assert [str(message) for message in rest.left_out] == [f"left out {frames[2]}: shows something else [left-out]"]
+
+
+def test_what_was_left_out_stays_out_of_other_hypotheses(tmp_path: Path) -> None:
+    sources = _read(flight(3, 3).write(tmp_path))
+    with open_executor(1, len(sources)) as executor:
+        found = register(sources, OPTIONS, executor)
+    accepted = replace(found, alignment=replace(found.alignment, used=np.array([True, True, False])))
+    other = realigned(accepted, Aligner.of(sources, replace(OPTIONS, model="rigid"), NO_CACHE), lambda _: True)
+    assert other is not None
+    assert other.alignment.used.tolist() == [True, True, False]
 
 
 def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:

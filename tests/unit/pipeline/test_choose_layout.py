@@ -7,30 +7,41 @@ import numpy as np
 import pytest
 
 from examples.worlds.trust_sets import judge_set, trust_set
+from rdstitch.choices import Purpose
 from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
+from rdstitch.executors import open_executor
+from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.choose_layout import _is_stretched
+from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import Layout, seam_messages
+from rdstitch.pipeline.lay_out import is_stretched
 from rdstitch.pipeline.placed_images import PlacedImages
+from rdstitch.pipeline.realign import aligner_of, by_second_motions
 from rdstitch.pipeline.recipes import mosaic, pano
+from rdstitch.pipeline.register import register
 from rdstitch.synthetic.textures import ground
 from tests.registrations import CAMERA, source
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.2])  # seams are judged by the images, whatever the size of the output
-def test_where_a_part_of_the_scene_is_nearer_one_line_says_where_its_lines_break(scale: float, tmp_path: Path) -> None:
+def _of_two_surfaces(folder: Path) -> list[Path]:
+    """Two images of ground whose lowest part, with kerbs, is nearer."""
     light = ground((760, 480), seed=5).region(0, 0, 760, 480)
     scene = np.rint(light * (255.0 / light.max())).astype(np.uint8)
     for top in range(340, 470, 30):  # kerbs
         scene[top : top + 8] = 255 * (top % 60 == 40)
     near = np.roll(scene, (13, 9), (0, 1))
     second = np.concatenate([scene[:330], near[330:]])[:, 240:]
-    paths = [tmp_path / name for name in ("a.png", "b.png")]
+    paths = [folder / name for name in ("a.png", "b.png")]
     for path, pixels in zip(paths, (scene[:, :520], second), strict=True):
         write_image(path, pixels)
+    return paths
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.2])  # seams are judged by the images, whatever the size of the output
+def test_where_a_part_of_the_scene_is_nearer_one_line_says_where_its_lines_break(scale: float, tmp_path: Path) -> None:
     composite = CompositeOptions(scale=scale)
-    result = pano(paths, options=StitchOptions(local_alignment="off", composite=composite))
+    result = pano(_of_two_surfaces(tmp_path), options=StitchOptions(local_alignment="off", composite=composite))
     assert result.ok
     (warning,) = [message for message in result.messages if message.severity == "warning"]
     assert warning.code == "seam-break"
@@ -41,6 +52,21 @@ def test_where_a_part_of_the_scene_is_nearer_one_line_says_where_its_lines_break
     )
     assert (result.seams.places[result.seams.broken, 1] > 300 * scale).all()
     assert len(result.seams.places) > 25
+
+
+def test_images_aligned_by_the_surface_whose_seams_break_are_aligned_by_the_other(tmp_path: Path) -> None:
+    options = StitchOptions(workers=1, local_alignment="off", model="rigid", distortion=0.0)
+    sources = read_sources(_of_two_surfaces(tmp_path), camera=None, focal=None, distortion=0.0, skip_bad=False)[0]
+    with open_executor(1, len(sources)) as executor:
+        far = register(sources, options, executor)
+    aligner = aligner_of(far, options, Purpose.MOSAIC)
+    near = by_second_motions(far, [(0, 1)], aligner)
+    assert near is not None
+    offsets = [one.alignment.transfer(0, 1, np.array([[380.0, 240.0]]))[0] for one in (far, near)]
+    np.testing.assert_allclose(offsets[1] - offsets[0], [9.0, 13.0], atol=0.5)
+    for given in (far, near):
+        chosen = choose_layout(given, options, aligner).registration.alignment
+        np.testing.assert_allclose(chosen.transfer(0, 1, np.array([[380.0, 240.0]]))[0], offsets[0], atol=0.1)
 
 
 def test_what_a_homography_stretches_is_laid_out_as_a_turn(shared_data: Callable[[str], Path]) -> None:
@@ -63,11 +89,11 @@ def test_a_passing_vehicle_makes_no_turn_of_a_plane(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("tilt", "stretched"), [(0.0, False), (0.4, False), (0.9, True)])
-def test_a_plane_seen_from_the_side_is_stretched(tilt: float, stretched: bool) -> None:
+def test_a_plane_seen_from_the_sideis_stretched(tilt: float, stretched: bool) -> None:
     oblique = np.eye(3)
     oblique[2, 0] = tilt
     placed = PlacedImages([source(), source()], [CAMERA] * 2, np.stack([np.eye(3), oblique]), 0)
-    assert _is_stretched(Layout.of(placed, CompositeOptions())) is stretched
+    assert is_stretched(Layout.of(placed, CompositeOptions())) is stretched
 
 
 def _quality(*breaks: SeamBreak, alike: float = 0.9) -> SeamQuality:

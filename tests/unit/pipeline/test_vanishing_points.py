@@ -110,7 +110,7 @@ def test_no_straightening_that_cuts_most_away(projection: Any, done: bool, monke
     upwards = straighten.view_rotation(CompositeOptions(pitch=-50.0))
     monkeypatch.setattr(straighten, "_upright", lambda placed, options: (upwards, []))
     options = CompositeOptions(straighten="auto", projection=projection)
-    found, said = straighten.turned(placed, options)
+    found, said = straighten.oriented(placed, options)
     assert (found.orientation is not None) == done
     assert [message.code for message in said] == ([] if done else ["not-straightened"])
     assert done or "% of what the images show would be cut away" in said[0].text

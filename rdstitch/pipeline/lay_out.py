@@ -1,0 +1,78 @@
+"""Stage: images of a registration on the canvas of the output, and what speaks against what is seen there."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rdstitch.compositing.projection import PLANE
+from rdstitch.local_alignment import LocalAlignment
+from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.pipeline.compose import Layout
+from rdstitch.pipeline.placed_images import PlacedImages
+from rdstitch.pipeline.straighten import oriented
+from rdstitch.results.messages import Message
+from rdstitch.results.registration import Registration
+
+_MAX_MAGNIFICATION, _MAX_ASPECT = 4.0, 2.0
+"""Of a place over the median one, and of its two directions: those of a plane seen 60 degrees off its normal."""
+
+IMAGE_GRID = np.stack(np.meshgrid(*[[0.02, 0.25, 0.5, 0.75, 0.98]] * 2), axis=-1).reshape(-1, 2)
+"""Places (25, 2) all over an image, in shares of its width and height."""
+
+
+@dataclass(frozen=True)
+class LaidOut:
+    """A registration in the frame of the output, with its layout."""
+
+    registration: Registration
+    local: LocalAlignment
+    layout: Layout
+    messages: tuple[Message, ...] = ()
+
+    @property
+    def faults(self) -> int:
+        """What speaks against it: broken seams, stretched places, overlaps that do not look alike, and local alignment
+        whose seams lie nowhere where they could be judged, 0 to 4.
+        """
+        seams = self.layout.seams
+        unjudged = bool(self.local.fields) and not len(seams.places)
+        return int(seams.seen) + int(is_stretched(self.layout)) + int(seams.contradicted) + int(unjudged)
+
+    @property
+    def clipped(self) -> int:
+        """Number of images of which only the near part is drawn."""
+        return sum(part is not None for part in self.layout.canvas.near)
+
+    @property
+    def broken(self) -> int:
+        """Number of places at which its seams are broken; they are as far apart in every layout."""
+        return int(self.layout.seams.broken.sum())
+
+
+def lay_out(registration: Registration, local: LocalAlignment, options: CompositeOptions) -> LaidOut:
+    """Images of a registration on the canvas of the output."""
+    placed, messages = oriented(PlacedImages.of(registration, local.fields or None), options)
+    if placed.orientation is not None:
+        homographies = placed.orientation @ registration.alignment.homographies
+        registration = replace(registration, alignment=replace(registration.alignment, homographies=homographies))
+    return LaidOut(registration, local, Layout.of(placed, options), tuple(messages))
+
+
+def is_stretched(layout: Layout) -> bool:
+    """Whether a plane shows some places much larger than most, or much longer than wide, lens apart."""
+    canvas = layout.canvas
+    if canvas.projection != PLANE:
+        return False
+    magnification = []
+    for image in layout.images:
+        size = np.array(image.camera.image_size)
+        at, step = IMAGE_GRID * size, 1e-3 * size[1]
+        # A fisheye's border is stretched on any plane.
+        flat = replace(image.camera, distortion=0.0, distortion2=0.0, distortion3=0.0, image_circle=None)
+        middle, right, down = (canvas.place(flat, image.homography, at + d) for d in ((0, 0), (step, 0), (0, step)))
+        shown = np.isfinite(middle + right + down).all(axis=1)
+        jacobian = np.stack([right - middle, down - middle], axis=-1)[shown] / step
+        magnification.append(np.linalg.svd(jacobian, compute_uv=False))
+    every = np.concatenate(magnification)
+    largest = float(every[:, 0].max() / np.median(every[:, 0]))
+    return largest > _MAX_MAGNIFICATION or float(np.median(every[:, 0] / every[:, 1])) > _MAX_ASPECT

@@ -1,0 +1,137 @@
+"""Pairs of a registration aligned anew: without images or pairs that failed, or as another motion."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+
+from rdstitch.alignment.result import Alignment
+from rdstitch.alignment.unaligned import explain_unaligned
+from rdstitch.choices import Purpose
+from rdstitch.errors import RegistrationError
+from rdstitch.matching.copies import copies_of
+from rdstitch.matching.two_view import Pair, PairRegistration
+from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.pipeline.aligner import AlignedPairs, Aligner
+from rdstitch.results.messages import Message, names_of
+from rdstitch.results.registration import Registration
+from rdstitch.system.cache import Cache
+from rdstitch.verification.limits import Limits
+from rdstitch.verification.rival_planes import planes_of_pairs, second_motions
+
+Offenders = Mapping[tuple[int, ...], Message]
+"""What is left out, with what is wrong: images (k,), and pairs (i, j) without which other images may fall off."""
+
+
+def aligner_of(registration: Registration, options: StitchOptions, purpose: Purpose) -> Aligner:
+    """What aligns the images of a registration anew."""
+    aligner = Aligner.of(registration.sources, options, Cache.at(options.cache), purpose)
+    return replace(aligner, needs_poses=purpose.poses)
+
+
+def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Alignment], bool]) -> Registration | None:
+    """The images that are used aligned by another aligner; None where a draft does not fit, or is not wanted."""
+    try:
+        draft = aligner.draft(_between_used(registration))
+        if draft.alignment.rms > Limits.rough_error.value * aligner.threshold or not wanted(draft.alignment):
+            return None
+        return _aligned_anew(registration, aligner.completed(draft), aligner, {})
+    except RegistrationError:
+        return None
+
+
+def plane_of_most(registration: Registration, aligner: Aligner) -> Registration | None:
+    """Of two motions in the images that which may fill most of them; None where that is not to be seen."""
+    if registration.static_background:
+        return None
+    pairs = planes_of_pairs(registration, aligner.threshold)
+    if pairs is None:
+        return None
+    plane = _with_pairs(registration, pairs, aligner)
+    return plane if plane and 2 * plane.alignment.used.sum() > len(registration.sources) else None
+
+
+def by_second_motions(registration: Registration, chosen: Iterable[Pair], aligner: Aligner) -> Registration | None:
+    """The images that are used; some pairs, and their copies, by a motion of the matches that their own leaves over.
+
+    Where a scene has two surfaces, matches may say as much for one as for the other. None without a second motion.
+    """
+    copies = copies_of(registration.pairs)
+
+    def originals(pair: Pair) -> frozenset[int]:
+        return frozenset(copies.get(k, k) for k in pair)
+
+    wanted = {originals(pair) for pair in chosen}
+    used = _between_used(registration)
+    pairs = [pair for pair in used if pair.relation and originals(pair.images) in wanted]
+    motions = second_motions(registration.alignment.cameras, pairs, aligner.threshold)
+    if not motions:
+        return None
+    changed = [replace(pair, relation=motions.get(pair.images, pair.relation)) for pair in used]
+    return _with_pairs(registration, changed, aligner)
+
+
+def _between_used(registration: Registration) -> list[PairRegistration]:
+    """The pairs of images that are used: what was left out stays out."""
+    used = registration.alignment.used
+    return [pair for pair in registration.pairs if used[pair.image1] and used[pair.image2]]
+
+
+def _with_pairs(registration: Registration, pairs: Sequence[PairRegistration], aligner: Aligner) -> Registration | None:
+    """The images aligned by other pairs; None where these do not fit together."""
+    try:
+        aligned = aligner.align(pairs)
+    except RegistrationError:
+        return None
+    return _aligned_anew(replace(registration, pairs=tuple(aligner.used(aligned))), aligned, aligner, {})
+
+
+def without(registration: Registration, offenders: Offenders, aligner: Aligner) -> Registration | None:
+    """The rest, aligned anew; None where nothing that fits together would be left.
+
+    Pairs that contradicted the offenders are judged again: it may have been the offenders that were wrong.
+    """
+    reasons = left_out_images(offenders)
+    pairs = [p for p in registration.pairs if not {*p.images} & reasons.keys() and p.images not in offenders]
+    try:
+        aligned = aligner.align(pairs)
+    except RegistrationError:
+        return None
+    used = aligned.alignment.used
+    neighbours = _neighbours_of(reasons, registration)
+    for images, message in offenders.items():
+        reasons |= {k: message for k in images if not used[k]}
+    for image, others in neighbours.items():
+        named_others = ", ".join(names_of(aligner.paths[k] for k in sorted(others)))
+        reasons.setdefault(
+            image, Message(f"connected only through {named_others}, which was left out; add images around it")
+        )
+    return _aligned_anew(registration, aligned, aligner, reasons)
+
+
+def left_out_images(offenders: Offenders) -> dict[int, Message]:
+    """The images among the offenders."""
+    return {images[0]: message for images, message in offenders.items() if len(images) == 1}
+
+
+def _neighbours_of(offenders: Mapping[int, Message], registration: Registration) -> dict[int, set[int]]:
+    """The offenders that each other image was linked with."""
+    linked: dict[int, set[int]] = {}
+    for fit in registration.alignment.links:
+        for image, other in (fit.images, fit.images[::-1]):
+            if fit.used and other in offenders and image not in offenders:
+                linked.setdefault(image, set()).add(other)
+    return linked
+
+
+def _aligned_anew(
+    registration: Registration, aligned: AlignedPairs, aligner: Aligner, reasons: Mapping[int, Message]
+) -> Registration:
+    """The registration with another alignment, and why images are not in it."""
+    known = {k: message.text for k, message in reasons.items()}
+    number = {path: k for k, path in enumerate(aligner.paths)}
+    again = [message for message in registration.left_out if message.images[0] in number]  # the others were not read
+    known |= {number[m.images[0]]: m.text for m in again}
+    unused = explain_unaligned(aligned.alignment, aligner.paths, registration.keypoints, known)
+    dropped = (*registration.alignment.messages, *again)
+    whole = [message for message in registration.messages if message not in dropped]
+    messages = (*aligned.alignment.messages, *whole, *unused)
+    return replace(registration, alignment=aligned.alignment, messages=messages)
