@@ -13,6 +13,7 @@ from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.choices import Purpose
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
+from rdstitch.io.mask import Mask
 from rdstitch.io.metadata import Metadata
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
@@ -21,7 +22,7 @@ from rdstitch.verification.evidence import ResultEvidence
 CAMERA = Camera((400, 300))
 
 
-def source(name: str = "a.jpg", *, mask: Path | None = None, **metadata: Any) -> Source:
+def source(name: str = "a.jpg", *, mask: Mask | None = None, **metadata: Any) -> Source:
     """An image in ``folder``, of which there is nothing but its name and what is said of it."""
     return Source(Path("folder") / name, Metadata(CAMERA.image_size, **metadata), CAMERA, mask)
 

@@ -68,7 +68,7 @@ def followed(
     printed: as the file that is written at the end has them.
     """
     from rdstitch.camera_files import format_of
-    from rdstitch.inputs.arrivals import Arrivals
+    from rdstitch.inputs.arrivals import open_arrivals
     from rdstitch.pipeline.compose import image_files
     from rdstitch.pipeline.follow import follow as follow_frames
     from rdstitch.pipeline.output_plan import files_beside
@@ -91,7 +91,7 @@ def followed(
     check_outputs([*planned, *files_beside(beside, [])], stitch.overwrite, [source])
     before = file_state(preview) if preview else None
     with TemporaryFolder() as folder:
-        arrivals = Arrivals(
+        arrivals = open_arrivals(
             str(inputs[0]),
             frames_folder=lambda: folder,
             names=sys.stdin,

@@ -84,7 +84,7 @@ def _size_of_images(file: Path) -> tuple[int, int]:
 
 def resolve(inputs: tuple[Path, ...]) -> list[Path]:
     """The inputs, with - replaced by the names on standard input, one a line or separated by NUL."""
-    from rdstitch.inputs.find import names_in
+    from rdstitch.inputs.arguments import names_in
 
     named: list[Path] = []
     for item in inputs:

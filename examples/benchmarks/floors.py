@@ -43,7 +43,7 @@ _FUNCTIONS = {
         "rdstitch.compositing.seam_finder:find_seams",
     ),
     "warp and blend": ("rdstitch.compositing.render:Renderer.tile",),
-    "encode": ("rdstitch.io.encoding:_jpeg",),
+    "encode": ("rdstitch.io.write_jpeg:_jpeg",),
 }
 """The functions of each stage; what one of another stage takes within them is that stage's."""
 

@@ -3,7 +3,6 @@
 What is read is known by its content, what is written by its name or by ``camera_format``: see docs/formats.md.
 """
 
-import re
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
@@ -37,9 +36,6 @@ Value = TypeVar("Value")
 
 CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt", ".xml")
 """How names of camera files end, lower case."""
-
-_STATED = re.compile(r"(?<!lambda_)fit_largest_px\"?: ([-+.\de]+)")
-"""The residual that files of others state."""
 
 
 def load_camera(path: str | Path, image_size: tuple[int, int] | None = None) -> Camera:
@@ -142,8 +138,7 @@ def save_camera(camera: Camera, path: str | Path, camera_format: CameraFormat = 
 
 def camera_file_text(camera: Camera, path: str | Path, camera_format: CameraFormat = "auto") -> str:
     """What :func:`save_camera` writes."""
-    wanted = format_of(path, camera_format)
-    return next(each.text(camera) for each in _FORMATS if each.name == wanted)
+    return _written(camera, path, camera_format)[0]
 
 
 def format_of(path: str | Path, camera_format: CameraFormat = "auto") -> CameraFormat:
@@ -165,8 +160,14 @@ def format_of(path: str | Path, camera_format: CameraFormat = "auto") -> CameraF
 
 def export_note(camera: Camera, path: str | Path, camera_format: CameraFormat = "auto") -> tuple[str, ...]:
     """Say what the model of a camera file of others costs, in one sentence; nothing for rdstitch's own."""
-    largest = _STATED.findall(camera_file_text(camera, path, camera_format))
-    return tuple(f"{path}: its lens model is at most {float(value):.3f} pixels from the lens" for value in largest[-1:])
+    _, fit = _written(camera, path, camera_format)
+    return () if fit is None else (f"{path}: its lens model is at most {fit.largest:.3f} pixels from the lens",)
+
+
+def _written(camera: Camera, path: str | Path, camera_format: CameraFormat) -> tuple[str, LensFit | None]:
+    """What is written, and how far the model of it is from the lens where it is not rdstitch's own."""
+    wanted = format_of(path, camera_format)
+    return next(each.write(camera) for each in _FORMATS if each.name == wanted)
 
 
 class _Format(NamedTuple):
@@ -174,14 +175,14 @@ class _Format(NamedTuple):
 
     name: CameraFormat
     names: tuple[str, ...]  # patterns of file names; ``.yml`` is ``.yaml``
-    text: Callable[[Camera], str]
+    write: Callable[[Camera], tuple[str, LensFit | None]]
 
 
 # The first whose pattern fits is what a name says.
 _FORMATS = (
     _Format("opendronemap", ("cameras.json",), formats.opendronemap_json),
     _Format("opencv-json", ("opencv.json", "*.opencv.json"), partial(formats.opencv_text, yaml=False)),
-    _Format("rdstitch", ("?*.json",), lambda camera: json_bytes(camera_json(camera)).decode()),
+    _Format("rdstitch", ("?*.json",), lambda camera: (json_bytes(camera_json(camera)).decode(), None)),
     _Format("ros", ("camera_info.yaml",), formats.camera_info_yaml),
     _Format("kalibr", ("camchain.yaml",), formats.camera_chain_yaml),
     _Format("fisheye", ("fisheye.yaml", "*.fisheye.yaml"), partial(formats.opencv_text, fisheye=True)),

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from rdstitch.camera_files.lens_models import CameraFile, LensFit, fitted_camera, nearest_model
+from rdstitch.camera_files.lens_models import CameraFile, LensFit, Written, fitted_camera, nearest_model
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.camera_record import camera_json
@@ -245,7 +245,7 @@ def read_colmap(camera: Sequence[str], file: str) -> CameraFile:
     return fitted_camera(lens, "COLMAP", size)
 
 
-def opencv_text(camera: Camera, *, yaml: bool = True, fisheye: bool = False) -> str:
+def opencv_text(camera: Camera, *, yaml: bool = True, fisheye: bool = False) -> Written:
     """Write a camera as FileStorage writes YAML or JSON, for the functions of ``cv2.fisheye`` or for the usual ones.
 
     Those have Brown's model, or the rational one where that is closer.
@@ -253,7 +253,7 @@ def opencv_text(camera: Camera, *, yaml: bool = True, fisheye: bool = False) -> 
     lens, fit = nearest_model(camera, *(("fisheye",) if fisheye else ("polynomial", "rational")))
     mark = {"fisheye_model": 1} if fisheye else {}
     content = {**_calibration(camera, lens, **mark), OWN: _own(camera, fit)}
-    return "%YAML:1.0\n---\n" + _as_yaml(content) if yaml else json.dumps(content, indent=4) + "\n"
+    return "%YAML:1.0\n---\n" + _as_yaml(content) if yaml else json.dumps(content, indent=4) + "\n", fit
 
 
 def _calibration(camera: Camera, lens: LensModel, **further: Any) -> dict[str, Any]:
@@ -278,7 +278,7 @@ def _named(lens: LensModel, fisheye: str, rational: str, other: str) -> str:
     return fisheye if lens.fisheye else rational if len(lens.coefficients) > 5 else other
 
 
-def camera_info_yaml(camera: Camera) -> str:
+def camera_info_yaml(camera: Camera) -> Written:
     """Write a camera as ``camera_info_manager`` reads it."""
     lens, fit = nearest_model(camera, "polynomial", "rational", "fisheye")
     model = _named(lens, "equidistant", "rational_polynomial", "plumb_bob")
@@ -286,10 +286,10 @@ def camera_info_yaml(camera: Camera) -> str:
     matrix = content["camera_matrix"]["data"]
     content["rectification_matrix"] = _matrix(3, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     content["projection_matrix"] = _matrix(3, *matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0)
-    return comments(camera, fit, model) + _as_yaml(content, opencv=False)
+    return comments(camera, fit, model) + _as_yaml(content, opencv=False), fit
 
 
-def camera_chain_yaml(camera: Camera) -> str:
+def camera_chain_yaml(camera: Camera) -> Written:
     """Write a camera as Kalibr does: "radtan", which has k1 and k2 only, or "equi" where that is closer."""
     lens, fit = nearest_model(camera, "two terms", "fisheye")
     model = _named(lens, "equi", "", "radtan")
@@ -301,22 +301,20 @@ def camera_chain_yaml(camera: Camera) -> str:
         "resolution": list(camera.image_size),
         "rostopic": "/camera/image_raw",
     }
-    return comments(camera, fit, model) + _as_yaml({"cam0": entry}, opencv=False)
+    return comments(camera, fit, model) + _as_yaml({"cam0": entry}, opencv=False), fit
 
 
-def colmap_text(camera: Camera) -> str:
+def colmap_text(camera: Camera) -> Written:
     """Write a camera as COLMAP reads it: FULL_OPENCV, or OPENCV_FISHEYE where that is closer to the lens."""
     lens, fit = nearest_model(camera, "rational", "fisheye", close=0.0)
     model = _named(lens, "OPENCV_FISHEYE", "FULL_OPENCV", "")
     # COLMAP's pixels have their centres at halves.
     numbers = (*camera.image_size, *lens.focal, *(value + 0.5 for value in camera.center), *lens.coefficients)
-    return (
-        f"{comments(camera, fit, model)}# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-        f"1 {model} {' '.join(map(repr, numbers))}\n"
-    )
+    heading = f"{comments(camera, fit, model)}# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+    return f"{heading}1 {model} {' '.join(map(repr, numbers))}\n", fit
 
 
-def opendronemap_json(camera: Camera) -> str:
+def opendronemap_json(camera: Camera) -> Written:
     """Write a camera as OpenDroneMap takes it with ``--cameras``."""
     lens, fit = nearest_model(camera, "polynomial", "fisheye")
     kind = _named(lens, "fisheye_opencv", "", "brown")
@@ -334,7 +332,7 @@ def opendronemap_json(camera: Camera) -> str:
         **dict(zip(names, lens.coefficients, strict=True)),
         OWN: _own(camera, fit),
     }
-    return json.dumps({f"v2 unknown unknown {width} {height} {kind} {focal:.4g}": entry}, indent=4) + "\n"
+    return json.dumps({f"v2 unknown unknown {width} {height} {kind} {focal:.4g}": entry}, indent=4) + "\n", fit
 
 
 def comments(camera: Camera, fit: LensFit, model: str) -> str:

@@ -38,6 +38,10 @@ class LensFit:
     largest: float
 
 
+Written = tuple[str, LensFit]
+"""A camera file, and how far its model is from the lens."""
+
+
 def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
     """Solve ``terms x = values`` by least squares, with columns of one size."""
     size = np.maximum(np.abs(terms).max(axis=0), 1e-300)

@@ -19,7 +19,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from rdstitch.camera_files.formats import comments
-from rdstitch.camera_files.lens_models import CLOSE, CameraFile, LensFit, LensSamples, fitted_camera
+from rdstitch.camera_files.lens_models import CLOSE, CameraFile, LensFit, LensSamples, Written, fitted_camera
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
@@ -113,13 +113,14 @@ def image_line(values: Mapping[str, float]) -> str:
     return " ".join(f"{name}{value!r}" for name, value in values.items())
 
 
-def hugin_project(camera: Camera) -> str:
+def hugin_project(camera: Camera) -> Written:
     """A project with one image of this lens, for "load lens" or as a template."""
     (width, height), (lens, fit) = camera.image_size, hugin_lens(camera)
-    return (
+    text = (
         f'{HEAD}{comments(camera, fit, "a, b, c")}p f0 w{width} h{height} v{lens["v"]:.6g} n"TIFF_m c:LZW"\nm i0\n'
         f'i {image_line(lens)} r0 p0 y0 TrX0 TrY0 TrZ0 n"image.jpg"\n'
     )
+    return text, fit
 
 
 @dataclass(frozen=True)
@@ -186,7 +187,7 @@ def read_lensfun(text: str, file: str, image_size: Callable[[], tuple[int, int]]
     return read_polynomial("lensfun", terms, linear, size, center, unit, focal, fisheye=kind == "fisheye")
 
 
-def lensfun_xml(camera: Camera) -> str:
+def lensfun_xml(camera: Camera) -> Written:
     """A database of one lens, by the simplest of the three models that is close to it, else the nearest.
 
     Maker, model, mount and crop factor are for the user to fill in: a camera file does not know them.
@@ -199,7 +200,7 @@ def lensfun_xml(camera: Camera) -> str:
     values = " ".join(f'{name}="{value:.9g}"' for name, value in zip(_TERMS[model], moved, strict=True))
     x, y = ((c - (n - 1) / 2) / unit for c, n in zip(camera.center, (width, height), strict=True))
     focal = lens.focal * scale / math.hypot(width, height) * _FILM
-    return f"""<!--
+    text = f"""<!--
 {comments(camera, lens.fit, model)}-->
 <lensdatabase version="1">
   <lens>
@@ -216,3 +217,4 @@ def lensfun_xml(camera: Camera) -> str:
   </lens>
 </lensdatabase>
 """
+    return text, lens.fit

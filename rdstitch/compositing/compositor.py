@@ -16,9 +16,9 @@ from rdstitch.compositing.preparation import Decisions, decide, prepare_composit
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.tiles import BlockRunner
-from rdstitch.io.encoding import ImageSpec
 from rdstitch.io.formats import check_format, check_memory
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.strips import ImageSpec
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import write_strips
 from rdstitch.options.composite_options import CompositeOptions

@@ -68,7 +68,7 @@ class Renderer:
         pixels = np.zeros((*covered.shape, self.channels), dtype=self.dtype)
         zone = self._contact_zone(layers, box) if blended else None
         for rest in without(box, zone):
-            self._lay(layers, rest, cut(pixels, box, rest))
+            self._paste(layers, rest, cut(pixels, box, rest))
         if zone is not None:
             cv2.copyTo(self._multiband(layers, zone), _as_mask(cut(covered, box, zone)), cut(pixels, box, zone))
         return pixels, covered
@@ -142,7 +142,7 @@ class Renderer:
         """The box from which weights reach a box through multi-band blending."""
         return aligned(grown(box, margin(self.bands)), 1 << self.bands)
 
-    def _lay(self, layers: Sequence[Layer], box: Box, pixels: NDArray[Any]) -> None:
+    def _paste(self, layers: Sequence[Layer], box: Box, pixels: NDArray[Any]) -> None:
         """Fill ``pixels``, which are those of ``box``, with the layers, or with their weighted mean."""
         parts = [part for layer in layers if (part := layer.weighted_part(box)) is not None]
         if self.options.blend != "feather":
@@ -228,17 +228,17 @@ class Renderer:
             return layers
         owner, best = np.full(shape, NO_OWNER, dtype=np.int32), np.zeros(shape, dtype=np.float32)
         for layer in layers:
-            _claim(owner, best, box, layer)
+            _assign(owner, best, box, layer)
         soft = layers if self.options.blend == "feather" else []
         missing = owner == NO_OWNER
         if (left_over := bounds(missing, box)) is not None:
             best[...] = 0.0
             for layer in self._bordered(left_over, cut(missing, box, left_over)):
-                _claim(owner, best, box, layer)
+                _assign(owner, best, box, layer)
                 layers.append(layer)
         if self.options.blend == "feather":
             owner[~missing] = NO_OWNER
-        return soft + [_won(owner, box, layer) for layer in layers]
+        return soft + [_only_owned(owner, box, layer) for layer in layers]
 
     def _shared(self, box: Box) -> Iterator[Layer]:
         """Images that own part of a box in the seam map, with their shares where they cover it."""
@@ -259,7 +259,7 @@ class Renderer:
                 yield layer
 
 
-def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer) -> None:
+def _assign(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer) -> None:
     """Give a layer's image the pixels where its weight is the largest so far."""
     previous = cut(best, box, layer.box)
     better = layer.weight > previous
@@ -267,7 +267,7 @@ def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer)
     np.copyto(cut(owner, box, layer.box), layer.index, where=better)
 
 
-def _won(owner: NDArray[np.int32], box: Box, layer: Layer) -> Layer:
+def _only_owned(owner: NDArray[np.int32], box: Box, layer: Layer) -> Layer:
     """The layer with weight 1 where its image owns the pixels, and 0 elsewhere."""
     owned = cut(owner, box, layer.box) == layer.index
     # An image may have a layer from the seam map and one for what the map left over: each gets its own pixels.

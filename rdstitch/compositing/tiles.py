@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.render import Renderer
-from rdstitch.io.encoding import STRIP_ROWS
+from rdstitch.io.strips import STRIP_ROWS
 from rdstitch.system.cache import Cache, Stored
 from rdstitch.system.progress import ShareProgress, unheard
 

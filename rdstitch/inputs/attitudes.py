@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +11,12 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import tilt_from_normal, turned_tilt
-from rdstitch.inputs.delays import DELAYS
+from rdstitch.inputs.delays import DELAYS, MeasuredTilt
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, by_image, csv_rows
 from rdstitch.inputs.times import timestamps_of
 from rdstitch.results.messages import shortened
-from rdstitch.system.file_access import file_state, read_text
+from rdstitch.system.file_access import cached_by_file_state, read_text
 
 XMP = "xmp"
 """The value of ``attitude`` that stands for the images' own XMP."""
@@ -55,7 +54,7 @@ def _of_images(sources: Sequence[Source]) -> list[Source]:
                 "give a CSV file if that is wrong"
             )
         psi, theta = tilt_from_normal(nadir).tolist()
-        measured.append(replace(source, attitude=(psi, theta)))
+        measured.append(replace(source, attitude=MeasuredTilt((psi, theta))))
     if lacking:
         raise InputError(
             f"{shortened(lacking)}: no attitude of the camera can be read from the XMP; give a CSV file instead"
@@ -65,11 +64,11 @@ def _of_images(sources: Sequence[Source]) -> list[Source]:
 
 def _of_table(source: Source, file: str | Path) -> Source:
     """A source with (ψ, θ), radians, of its line, or of its time, and then at delays too."""
-    table, turn = _read_attitudes(file, file_state(file)), turning_matrix(source.metadata.orientation)
+    table, turn = _read_attitudes(file), turning_matrix(source.metadata.orientation)
     if not len(table.times):
-        return replace(source, attitude=turned_tilt(table.of(source, file), turn))
+        return replace(source, attitude=MeasuredTilt(turned_tilt(table.of(source, file), turn)))
     tilts = [turned_tilt((psi, theta), turn) for psi, theta in table.at(table.time_of(source, file) + DELAYS).tolist()]
-    return replace(source, attitude=tilts[len(DELAYS) // 2], attitude_by_delay=np.array(tilts))
+    return replace(source, attitude=MeasuredTilt(tilts[len(DELAYS) // 2], np.array(tilts)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +103,9 @@ class _AttitudeTable:
         return np.stack([np.interp(times, self.times, values) for values in self.tilts.T], axis=1)
 
 
-@lru_cache(maxsize=1)  # frames that are followed ask one after the other
-def _read_attitudes(file: str | Path, state: tuple[int, int] | None) -> _AttitudeTable:
-    """The table of a file in a state."""
+@cached_by_file_state
+def _read_attitudes(file: str | Path) -> _AttitudeTable:
+    """The table of a file."""
     wanted = ("name,psi,theta", "timestamp,psi,theta", "timestamp,qx,qy,qz,qw")
     rows = csv_rows(read_text(file), str(file), _COLUMNS, wanted, ("deg", "degrees", "s"))
     by_name = any("name" in row.values for row in rows)

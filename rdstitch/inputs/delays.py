@@ -1,5 +1,7 @@
 """The clock of a sensor may be late against the camera's: its values are kept for a range of delays."""
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from rdstitch.arrays import FloatArray
@@ -12,6 +14,20 @@ DELAY_STD = 0.05
 
 _POLYNOMIALS = np.linalg.qr(np.vander(DELAYS / DELAYS[-1], 6))[0]
 _SLOW = _POLYNOMIALS @ _POLYNOMIALS.T
+
+
+@dataclass(frozen=True)
+class MeasuredTilt:
+    """(ψ, θ), radians, of an image as a gimbal or an IMU has measured it."""
+
+    tilt: tuple[float, float]
+    # (S, 2): the same at :data:`DELAYS`; None where it has no times
+    by_delay: FloatArray | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def at_delays(self) -> FloatArray:
+        """(S, 2): the same at :data:`DELAYS`, which changes nothing where it has no times."""
+        return np.tile(self.tilt, (len(DELAYS), 1)) if self.by_delay is None else self.by_delay
 
 
 def at_delay(values: FloatArray, delay: float) -> FloatArray:

@@ -4,7 +4,6 @@ import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.inputs.tables import TIME_NAMES, csv_rows, is_number
-from rdstitch.system.file_access import file_state, read_text
+from rdstitch.system.file_access import cached_by_file_state, read_text
 
 _COLUMNS = {"timestamp": TIME_NAMES} | {
     name: name.replace("_", "")
@@ -65,17 +64,13 @@ class Odometry:
         return BodyPose(*(float(np.interp(time, self.times, values)) for values in self.poses.T))
 
 
+@cached_by_file_state
 def read_odometry(file: str | Path) -> Odometry:
     """Wheel odometry of a file: TUM's lines, or a CSV table of ``timestamp,x,y,yaw_deg`` as ``trajectory`` writes it.
 
     Covariances ``cov_x_x``, ``cov_y_y`` and ``cov_yaw_deg_yaw_deg`` are used where the table has them; instead of the
     yaw it may have a quaternion.
     """
-    return _read_odometry(file, file_state(file))
-
-
-@lru_cache(maxsize=1)  # frames that are followed ask one after the other
-def _read_odometry(file: str | Path, state: tuple[int, int] | None) -> Odometry:
     text, where = read_text(file), str(file)
     first = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
     if len(first.split()) == 8 and all(is_number(part) for part in first.split()):

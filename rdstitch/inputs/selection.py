@@ -6,10 +6,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.inputs.find import READABLE_SUFFIXES
 from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.image_folders import READABLE_SUFFIXES
 from rdstitch.inputs.source import Source
-from rdstitch.io.mask import mask_frame
+from rdstitch.io.mask import Mask, mask_frame
 from rdstitch.system.file_access import canonical_name
 
 
@@ -55,13 +55,14 @@ def with_masks(sources: Sequence[Source], masks: str | Path | None) -> list[Sour
     for source in sources:
         stem = canonical_name(source.path.stem)
         # Of images of one name in several folders, each may have its own in a folder of that name.
-        mask, frame = by_stem.get(str(PurePosixPath(source.name).with_suffix("")), by_stem.get(stem)), None
-        if mask is not None:
-            if mask.resolve() == source.path.resolve():
-                raise InputError(f"{mask}: is the image itself, not its mask; masks lie in another folder")
+        file, mask = by_stem.get(str(PurePosixPath(source.name).with_suffix("")), by_stem.get(stem)), None
+        if file is not None:
+            if file.resolve() == source.path.resolve():
+                raise InputError(f"{file}: is the image itself, not its mask; masks lie in another folder")
             metadata = source.metadata
-            frame = mask_frame(mask, source.path, metadata.size, metadata.orientation, of_camera=not several)
-        masked.append(replace(source, mask=mask, mask_frame=frame))
+            frame = mask_frame(file, source.path, metadata.size, metadata.orientation, of_camera=not several)
+            mask = Mask(file, frame)
+        masked.append(replace(source, mask=mask))
     if sources and all(source.mask is None for source in masked):
         raise InputError(f"{path}: none of the masks has the name of an image, such as {sources[0].path.stem}.png")
     return masked

@@ -9,7 +9,6 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
 from rdstitch.features.prepared_image import View, halving
 from rdstitch.geometry.camera import Camera
@@ -17,11 +16,12 @@ from rdstitch.geometry.exif_orientation import inverse, turned_size
 from rdstitch.geometry.places import GroundControl
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
+from rdstitch.inputs.delays import MeasuredTilt
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.io.flat_field import FlatField
 from rdstitch.io.lens_correction import corrected
-from rdstitch.io.mask import read_mask
+from rdstitch.io.mask import Mask
 from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import DecodedImage, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
@@ -41,11 +41,8 @@ class Source:
     metadata: Metadata
     # what is known of the camera before registration: size, centre, focal length, and λ where it was given
     camera: Camera
-    mask: Path | None = None  # image that is dark where this one does not count
-    mask_frame: int | None = None  # how it is turned, see :func:`rdstitch.io.mask.mask_frame`
-    attitude: tuple[float, float] | None = None  # (ψ, θ), radians, as a gimbal or an IMU has measured it
-    # (S, 2): the same at :data:`rdstitch.inputs.delays.DELAYS`; None where it has no times
-    attitude_by_delay: FloatArray | None = field(default=None, compare=False, repr=False)
+    mask: Mask | None = None
+    attitude: MeasuredTilt | None = None
     # its number and time in the sequence; the pixels, where they are no file
     frame: Frame | None = field(default=None, compare=False, repr=False)
     # where it is kept between two stages that both look at it
@@ -68,7 +65,7 @@ class Source:
         """Unit vector straight down in the camera's axes (right, down, ahead), as measured or as its XMP says."""
         if self.attitude is None:
             return self.metadata.nadir
-        x, y, z = rotation_from_tilt(self.attitude)[:, 2].tolist()
+        x, y, z = rotation_from_tilt(self.attitude.tilt)[:, 2].tolist()
         return x, y, z
 
     def number(self, position: int) -> int:
@@ -77,7 +74,7 @@ class Source:
 
     def with_absolute_paths(self) -> Self:
         """The same by names that hold in workers elsewhere too, where relative ones begin at other folders."""
-        mask = None if self.mask is None else self.mask.absolute()
+        mask = None if self.mask is None else replace(self.mask, path=self.mask.path.absolute())
         named = is_url(self.path) or (self.frame is not None and self.frame.image is not None)
         return replace(self, path=self.path if named else self.path.absolute(), mask=mask)
 
@@ -91,7 +88,8 @@ class Source:
         """The same of its mask, of the image circle, and of the lens that it is resampled by."""
         circle = () if self.camera.image_circle is None else (*self.camera.center, self.camera.image_circle)
         resampled = (self.camera,) if self.camera.lens_model is not None else ()
-        return cache.file(self.mask), self.mask_frame, circle, *resampled
+        mask = (None, None) if self.mask is None else (cache.file(self.mask.path), self.mask.frame)
+        return *mask, circle, *resampled
 
     def reduction(self, megapixels: float | None) -> int:
         """By how much it can be read smaller and has no fewer pixels than an image halved to so many 10⁶ pixels."""
@@ -103,7 +101,7 @@ class Source:
         usual = self.reduction(WORK_MEGAPIXELS)
         if reduction % usual:
             return self._within_circle(self._load(reduction), reduction)
-        key = (self.path, self.mask, self.mask_frame, self.flat_field, self.camera.lens_model)
+        key = (self.path, self.mask, self.flat_field, self.camera.lens_model)
         image = self.decoded_images.take(key) or self._load(usual)
         if keep:
             self.decoded_images.put(key, image)
@@ -136,7 +134,7 @@ class Source:
         if self.flat_field is not None:
             image = replace(image, pixels=self.flat_field.corrected(image.pixels, reduction))
         if self.mask is not None:
-            image = _masked(image, block_minimum(read_mask(self.mask, expected, self.mask_frame), reduction))
+            image = _masked(image, block_minimum(self.mask.read(expected), reduction))
         return corrected(image, self.camera, reduction)
 
     def _within_circle(self, image: DecodedImage, reduction: int) -> DecodedImage:

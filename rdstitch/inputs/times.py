@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, by_image, csv_rows, is_number
-from rdstitch.system.file_access import canonical_name, file_state, read_text
+from rdstitch.system.file_access import cached_by_file_state, canonical_name, read_text
 
 _COLUMNS = {"name": IMAGE_NAMES, "timestamp": TIME_NAMES}
 
@@ -38,7 +37,7 @@ def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
     """
     if file is None or not frames:
         return list(frames)
-    named = _read_times(file, file_state(file))
+    named = _read_times(file)
     if not isinstance(named, list):
         return [replace(frame, timestamp=_time_of(frame, named, file)) for frame in frames]
     numbers = np.array([position if frame.number is None else frame.number for position, frame in enumerate(frames)])
@@ -56,7 +55,7 @@ def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
 def time_of(frame: Frame, file: str | Path) -> float | None:
     """The same of one frame, by its number or name; None where a file that grows as the frames do has no time yet."""
     try:
-        named = _read_times(file, file_state(file))
+        named = _read_times(file)
         if isinstance(named, list):
             return named[frame.number] if frame.number is not None and frame.number < len(named) else None
         return _time_of(frame, named, file)
@@ -71,9 +70,9 @@ def _time_of(frame: Frame, named: dict[str, float], file: str | Path) -> float:
     return named[name]
 
 
-@lru_cache(maxsize=1)  # frames that are followed ask one after the other
-def _read_times(file: str | Path, state: tuple[int, int] | None) -> list[float] | dict[str, float]:
-    """The times in order, or by the names of the images, of a file in a state."""
+@cached_by_file_state
+def _read_times(file: str | Path) -> list[float] | dict[str, float]:
+    """The times in order, or by the names of the images of a file."""
     text, where = read_text(file), str(file)
     lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1)]
     lines = [(n, line) for n, line in lines if line and not line.startswith("#")]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.io.encoding import with_alpha
+from rdstitch.io.strips import with_alpha
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.system.late_imports import tifffile
 

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.io.encoding import ImageSpec, Strip, as_eight_bit, jpeg_pieces, pyramid, pyramid_sizes, with_alpha
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.pyramid import pyramid, pyramid_sizes
 from rdstitch.io.read import read_image
+from rdstitch.io.strips import ImageSpec, Strip, as_eight_bit, with_alpha
+from rdstitch.io.write_jpeg import jpeg_pieces
 from rdstitch.system.outputs import tiles_folder
 
 MAX_TILE_PROFILE = 2**16

@@ -1,5 +1,6 @@
 """Masks: images that say which part of another image counts."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,18 @@ from rdstitch.geometry.exif_orientation import inverse, turned, turned_size
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.samples import OPAQUE
+
+
+@dataclass(frozen=True)
+class Mask:
+    """An image that is dark where another one does not count."""
+
+    path: Path
+    frame: int | None = None  # how it is turned, see :func:`mask_frame`
+
+    def read(self, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """Alpha of an image of a size, see :func:`read_mask`."""
+        return read_mask(self.path, size, self.frame)
 
 
 def mask_frame(

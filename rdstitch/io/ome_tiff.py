@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.io.encoding import STRIP_ROWS, ImageSpec, Strip, pyramid, pyramid_sizes
+from rdstitch.io.pyramid import pyramid, pyramid_sizes
+from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip
 from rdstitch.io.tiff import MIN_OVERVIEW, ExtraTag, copied_tags
 from rdstitch.io.tiff_tiles import TILE, encoded_tile, has_predictor, tiles_of
 from rdstitch.system.late_imports import tifffile

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from rdstitch.errors import OutputError
-from rdstitch.io.encoding import STRIP_ROWS, ImageSpec, Strip, pyramid, pyramid_sizes
+from rdstitch.io.pyramid import pyramid, pyramid_sizes
+from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip
 
 _SMALLEST = 512  # pixels of the longer side of the last level, at most
 _COLOURS = ("FFFFFF", "FF00FF", "00FF00", "00FFFF", "FFFF00", "FF8000")

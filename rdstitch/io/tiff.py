@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from rdstitch.io.encoding import ImageSpec, Strip, pyramid, pyramid_sizes, with_alpha
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.pyramid import pyramid, pyramid_sizes
+from rdstitch.io.strips import ImageSpec, Strip, with_alpha
 from rdstitch.io.tiff_order import put_in_order
 from rdstitch.io.tiff_tiles import BUFFER, TILE, deflated, encoded_tile, has_predictor, tiles_of
 from rdstitch.system.late_imports import tifffile

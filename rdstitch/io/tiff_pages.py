@@ -9,10 +9,11 @@ from rdstitch.system.late_imports import tifffile
 
 def image_pages(tiff: "tifffile.TiffFile") -> Iterator["tifffile.TiffPage"]:
     """The pages of a file that are images of their own; the first page always is."""
-    for number in range(len(tiff.pages)):
+    yield tiff.pages.first
+    for number in range(1, len(tiff.pages)):  # which goes through the whole file
         page = tiff.pages[number]
         page = page if isinstance(page, tifffile.TiffPage) else page.aspage()
-        if number == 0 or not (page.is_reduced or page.is_mask):
+        if not (page.is_reduced or page.is_mask):
             yield page
 
 

@@ -16,13 +16,15 @@ from PIL import Image
 
 from rdstitch.errors import ArgumentError
 from rdstitch.io.deepzoom import write_deep_zoom
-from rdstitch.io.encoding import STRIP_ROWS, ImageSpec, Strip, as_eight_bit, check_strips, jpeg_pieces, png_pieces
 from rdstitch.io.formats import check_format
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.ome_tiff import OME_SUFFIXES, write_ome_tiff
 from rdstitch.io.ome_zarr import write_ome_zarr
 from rdstitch.io.samples import OPAQUE
+from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip, as_eight_bit, check_strips
 from rdstitch.io.tiff import ExtraTag, write_tiff
+from rdstitch.io.write_jpeg import jpeg_pieces
+from rdstitch.io.write_png import png_pieces
 from rdstitch.system.outputs import (
     Fingerprint,
     Outputs,

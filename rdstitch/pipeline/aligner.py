@@ -267,8 +267,9 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
     Measured attitudes that are not exact leave the mount's tilt open.
     """
     quarters = QuarterTurns.of(sources)
-    attitudes = [source.attitude for source in sources if source.attitude is not None]
-    delayed = [source.attitude_by_delay for source in sources if source.attitude_by_delay is not None]
+    measured = [source.attitude for source in sources if source.attitude is not None]
+    attitudes = [attitude.tilt for attitude in measured]
+    delayed = [attitude.by_delay for attitude in measured if attitude.by_delay is not None]
     timed = delayed and len(delayed) == len(sources) and set(quarters.back) == {1}
     exact = bool(attitudes) and options.attitude_std == 0.0
     places = [source.metadata.gps for source in sources]

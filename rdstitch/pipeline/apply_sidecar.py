@@ -38,7 +38,7 @@ from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_s
 from rdstitch.sidecar.records import VERSION, Applied, ImageRecord
 from rdstitch.sidecar.write import displacement_record, output_record, seams_record, taken_fields, to_output, versions
 from rdstitch.stage.tile_frames import tile_frames, with_position_folders
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent
 from rdstitch.system.records import to_jsonable
@@ -147,7 +147,7 @@ def _resized_std(then: CameraRecord, focal: float | None) -> float | None:
     return std * (focal / former) if std and former and focal else None
 
 
-@one_opencv_thread()
+@one_native_thread()
 def apply(
     sidecar: str | Path,
     images: Images,

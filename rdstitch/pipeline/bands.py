@@ -15,8 +15,8 @@ from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import ImageSpec, write_strips
-from rdstitch.io.encoding import Strip
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.strips import Strip
 from rdstitch.io.tiff import written_strips
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions

@@ -17,14 +17,14 @@ from rdstitch.pipeline.recipes import stitch_found
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs
 from rdstitch.system.progress import Progress, StageTimer, silent
 from rdstitch.system.temporary_folder import TemporaryFolder
 from rdstitch.verification.verdict import RefusedError
 
 
-@one_opencv_thread()
+@one_native_thread()
 def mosaic_blocks(
     inputs: Images,
     output: str | Path,

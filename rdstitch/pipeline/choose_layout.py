@@ -6,6 +6,7 @@ sees the least is taken: without local alignment, by another surface of the scen
 homographies, and, where something fills a good part of the images and moves of its own, what lies behind it.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,11 +15,12 @@ from functools import cache, partial
 import numpy as np
 
 from rdstitch.alignment.result import Alignment
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.choices import Purpose
 from rdstitch.compositing.seam_quality import DIAGONAL
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
+from rdstitch.matching.copies import copies_of, distinct
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.lay_out import IMAGE_GRID, LaidOut, is_stretched, lay_out
@@ -39,6 +41,9 @@ _CLEARLY = 0.5
 
 _MISFIT = 2.0
 """Times the errors of the most probable layout that another one may have."""
+
+_COMPARED = 500
+"""Pairs whose matches say how large errors are."""
 
 _ELSEWHERE, _MOST = 3.0 / DIAGONAL, 0.95
 """Of an image's diagonal: by how much another layout must move more than a few places of the overlaps for its seams to
@@ -113,7 +118,7 @@ def _plane_behind(
 ) -> tuple[Registration, LaidOut | LimitError]:
     """The plane behind what moves of its own, with its layout, where its images look more alike; else what is given."""
     plane = plane_of_most(registration, aligner)
-    if plane is None or not _joins(plane.alignment, registration.alignment, aligner.threshold):
+    if plane is None or not _joins(plane, registration, aligner.threshold):
         return registration, first
     behind = trials.attempt(plane)
     # What is put where it does not belong is unlike all over what the images show.
@@ -143,7 +148,7 @@ def _other_surface(registration: Registration, first: LaidOut, trials: _Trials, 
     used = np.flatnonzero(registration.alignment.used).tolist()
     broken = [(used[one.images[0]], used[one.images[1]]) for one in first.layout.seams.breaks]
     other = by_second_motions(registration, broken, aligner)
-    if other is None or not _joins(other.alignment, registration.alignment, _MISFIT * registration.alignment.rms):
+    if other is None or not _joins(other, registration, _MISFIT * _error(registration)):
         return None
     laid_out = trials.attempt(other)
     if laid_out is None or laid_out.layout.seams.fills < first.layout.seams.fills:
@@ -167,30 +172,44 @@ def _other_models(
     alignment = registration.alignment
     # What breaks along seams may have moved, and proves nothing against a layout that fits; one that is stretched does.
     stretched = first is None or is_stretched(first.layout)
-    allowed = max(options.threshold * stretched, _MISFIT * alignment.rms)
+    allowed = max(options.threshold * stretched, _MISFIT * _error(registration))
     names = [name for name in _MODELS if name != alignment.model] if options.model == "auto" else []
     if first is not None and first.layout.placed.has_place:  # a map needs a plane with a metric
         names = [name for name in names if name == "pose"]
     for name in names:
         by_name = replace(aligner, options=replace(aligner.options, model=name))
         other = realigned(registration, by_name, partial(_differs, registration, allowed, stretched=stretched))
-        if other is not None and _joins(other.alignment, alignment, allowed):
+        if other is not None and _joins(other, registration, allowed):
             reason = f"{other.alignment.model_reason.removesuffix('; as requested')}; seams break less than with a "
             reason += f"{alignment.model} model"
             yield replace(other, alignment=replace(other.alignment, model_reason=reason))
 
 
-def _joins(other: Alignment, alignment: Alignment, allowed: float) -> bool:
-    """Whether another alignment uses all images of one, with errors that are allowed: local alignment makes seams hold
-    that nothing else does.
+def _joins(other: Registration, first: Registration, allowed: float) -> bool:
+    """Whether another registration uses all images of one, with errors that are allowed: local alignment makes seams
+    hold that nothing else does.
     """
-    return bool((other.used >= alignment.used).all()) and other.rms <= allowed
+    return bool((other.alignment.used >= first.alignment.used).all()) and _error(other) <= allowed
+
+
+def _error(registration: Registration) -> float:
+    """Median error of the inliers of the pairs, pixels.
+
+    All count, also those that do not fit the alignment: a turn that fits every other match well is no measure of a
+    homography that fits all of them.
+    """
+    used, transfer = registration.alignment.used, registration.alignment.transfer
+    distinct_pairs = distinct(registration.pairs, copies_of(registration.pairs)).values()
+    pairs = [pair for pair in distinct_pairs if used[pair.image1] and used[pair.image2]]
+    some = [pairs[k] for k in evenly_spaced(len(pairs), _COMPARED).tolist()]
+    errors = np.concatenate([np.zeros(0), *(pair.errors(transfer)[pair.relation.inliers] for pair in some)])
+    return float(np.median(np.nan_to_num(errors, nan=np.inf))) if len(errors) else math.inf
 
 
 def _differs(registration: Registration, allowed: float, other: Alignment, *, stretched: bool) -> bool:
     """Whether another alignment can have other seams: it joins the images, and puts them elsewhere on each other."""
     alignment = registration.alignment
-    if not _joins(other, alignment, allowed):
+    if not _joins(replace(registration, alignment=other), registration, allowed):
         return False
     if stretched:
         return True

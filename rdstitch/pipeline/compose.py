@@ -46,7 +46,7 @@ from rdstitch.results.stitch_result import OutputImage, StitchResult
 from rdstitch.system.cache import Cache, Stored
 from rdstitch.system.outputs import Outputs, check_outputs, text_bytes
 from rdstitch.system.process_memory import return_freed_memory
-from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
+from rdstitch.viewer.page import ViewedImage, viewer_page, viewer_path
 
 _VISIBLE_CUT = 0.02  # share of the images that is cut away, from which on it is said
 

@@ -12,7 +12,7 @@ from rdstitch.inputs.frame import to_channel_order
 from rdstitch.options.composite_options import Interpolation
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 
 if TYPE_CHECKING:
     from rdstitch.pipeline.apply_sidecar import Recomposition
@@ -53,7 +53,7 @@ class Composer:
     3
     """
 
-    @one_opencv_thread()
+    @one_native_thread()
     def __init__(self, result: "StitchResult | Recomposition", interpolation: Interpolation = "linear") -> None:
         placed, options = placed_by(result), replace(result.options.composite, interpolation=interpolation)
         images = placed.images(result.canvas.near)
@@ -61,7 +61,7 @@ class Composer:
         self._tables, self._order = CompositeTables.of(images, result.canvas, options), result.options.channel_order
         self.alpha = self._tables.alpha
 
-    @one_opencv_thread()
+    @one_native_thread()
     def compose(self, images: Iterable[NDArray[Any]]) -> NDArray[Any]:
         """Put one set of images together, (H, W) or (H, W, C).
 

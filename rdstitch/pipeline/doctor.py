@@ -21,7 +21,7 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.results.messages import Message, bytes_in_words, merge_by_reason, seconds_in_words, shortened
 from rdstitch.results.registration import Registration
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.verdict import RefusedError
 
@@ -107,7 +107,7 @@ class Examination:
         return "".join(f"{name + ':':<12}{text}\n" for name, text in lines)
 
 
-@one_opencv_thread()
+@one_native_thread()
 def examine(
     inputs: Images,
     *,

@@ -22,7 +22,7 @@ from rdstitch.export.trajectory_files import covariance_in_frame, in_frame, ros_
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.inputs.attitudes import XMP, with_attitudes
-from rdstitch.inputs.delays import DELAYS
+from rdstitch.inputs.delays import MeasuredTilt
 from rdstitch.inputs.frame import Frame, Image, as_inputs
 from rdstitch.inputs.odometry import BodyPose, Odometry, read_odometry
 from rdstitch.inputs.selection import is_selected, mask_of, with_masks
@@ -324,7 +324,7 @@ class Tracker:
         sources, unread = read_frames([frame], options, skip_bad=True)
         if not sources:
             return None, None, unread[0].text
-        source, megapixels = replace(sources[0], attitude=attitude), self._megapixels
+        source, megapixels = replace(sources[0], attitude=attitude and MeasuredTilt(attitude)), self._megapixels
         try:
             (source,) = self._measured(source)
             view = source.view(megapixels)
@@ -353,9 +353,7 @@ class Tracker:
             return [label]
         label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))
         camera = at_working_size(source.camera, self._megapixels)
-        attitude = source.attitude_by_delay
-        if attitude is None and source.attitude is not None:
-            attitude = np.tile(source.attitude, (len(DELAYS), 1))
+        attitude = None if source.attitude is None else source.attitude.at_delays
         if body is None and (given := self._options.odometry) is not None:
             odometry = given if isinstance(given, Odometry) else read_odometry(given)
             body = odometry.at(label.timestamp)

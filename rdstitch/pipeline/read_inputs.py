@@ -6,9 +6,9 @@ from pathlib import Path
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.attitudes import with_attitudes
-from rdstitch.inputs.find import natural_key
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.ground_control import with_ground_control
+from rdstitch.inputs.image_folders import natural_key
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.positions import with_positions
 from rdstitch.inputs.rosbag import camera_in_bag, is_bag

@@ -14,7 +14,6 @@ from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.results.messages import Message, names_of
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
-from rdstitch.verification.limits import Limits
 from rdstitch.verification.rival_planes import planes_of_pairs, second_motions
 
 Offenders = Mapping[tuple[int, ...], Message]
@@ -28,10 +27,10 @@ def aligner_of(registration: Registration, options: StitchOptions, purpose: Purp
 
 
 def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Alignment], bool]) -> Registration | None:
-    """The images that are used aligned by another aligner; None where a draft does not fit, or is not wanted."""
+    """The images that are used aligned by another aligner; None where a draft is not wanted."""
     try:
         draft = aligner.draft(_between_used(registration))
-        if draft.alignment.rms > Limits.rough_error.value * aligner.threshold or not wanted(draft.alignment):
+        if not wanted(draft.alignment):
             return None
         return _aligned_anew(registration, aligner.completed(draft), aligner, {})
     except RegistrationError:

@@ -34,7 +34,7 @@ from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_not_read, check_outputs, json_bytes, text_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent
 from rdstitch.verification.verdict import RefusedError
@@ -44,7 +44,7 @@ _NO_TIMES = Message(
 )
 
 
-@one_opencv_thread()
+@one_native_thread()
 def pano(
     inputs: Images,
     output: str | Path | None = None,
@@ -91,7 +91,7 @@ def pano(
     return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, StageTimer(progress), Purpose.PANO))
 
 
-@one_opencv_thread()
+@one_native_thread()
 def mosaic(
     inputs: Images,
     output: str | Path | None = None,
@@ -170,7 +170,7 @@ def stitch_found(listed: FoundImages, run: Run, outputs: Outputs, further: Seque
         return compose_registration(chosen, run, outputs, executor)
 
 
-@one_opencv_thread()
+@one_native_thread()
 def calibrate(
     inputs: Images,
     options: StitchOptions | None = None,
@@ -210,7 +210,7 @@ def calibrate(
         return result.with_messages(stage_beside(run, outputs, result))
 
 
-@one_opencv_thread()
+@one_native_thread()
 def trajectory(
     inputs: Images,
     output: str | Path | None = None,

@@ -21,7 +21,7 @@ from rdstitch.inputs.times import timestamps_of
 from rdstitch.io.cropped_tiff import write_cropped_tiff
 from rdstitch.pipeline.composer import placed_by
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_outputs, file_name
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def make_folder(folder: str | Path) -> None:
         raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
 
 
-@one_opencv_thread()
+@one_native_thread()
 def write_layers(
     result: "StitchResult | Recomposition",
     folder: str | Path,

@@ -43,14 +43,14 @@ from rdstitch.stage.positions import Scan, grid_from_arrays, grid_from_names, gr
 from rdstitch.stage.register_tiles import TileRegistration, register_tiles
 from rdstitch.stage.tile_frames import tile_frames
 from rdstitch.stage.tile_inputs import as_tiles
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent
 
 _COMPARED = 32  # overlaps by which a flat field is judged
 
 
-@one_opencv_thread()
+@one_native_thread()
 def tiles(
     inputs: Images | Iterable[Any],
     output: str | Path | None = None,
@@ -105,7 +105,7 @@ def _stitch_options(options: TileOptions) -> StitchOptions:
     )
 
 
-@one_opencv_thread()
+@one_native_thread()
 def place_tiles(
     inputs: Images | Iterable[Any],
     positions_file: str | Path | None = None,

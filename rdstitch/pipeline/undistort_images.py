@@ -22,7 +22,7 @@ from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
 from rdstitch.pipeline.result_files import make_folder
 from rdstitch.results.messages import Message, ignored
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import WRITABLE_SUFFIXES, check_outputs, file_name
 from rdstitch.system.progress import Progress, silent
 
@@ -45,7 +45,7 @@ class _Choices(TypedDict, total=False):
 def undistort(inputs: Images, folder: str | Path, **choices: Unpack[_Choices]) -> list[Path]: ...
 @overload
 def undistort(inputs: Images, folder: None = None, **choices: Unpack[_Choices]) -> list[NDArray[Any]]: ...
-@one_opencv_thread()
+@one_native_thread()
 def undistort(
     inputs: Images,
     folder: str | Path | None = None,

@@ -11,7 +11,7 @@ from rdstitch.io.preview import read_preview
 from rdstitch.report.svg import GREEN, RED, YELLOW, counted, data_address, drawing, element, label, section
 from rdstitch.report.svg import path as outline
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.viewer import viewer_path
+from rdstitch.viewer.page import viewer_path
 
 _MOSAIC_SIDE = 1200  # pixels of the longer side
 _MAX_NAMES, _MAX_BREAKS, _MAX_DOTS = 12, 20, 5000

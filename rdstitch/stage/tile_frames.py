@@ -6,8 +6,8 @@ from pathlib import Path
 
 from rdstitch.choices import ZPlane
 from rdstitch.errors import ArgumentError
-from rdstitch.inputs.find import READABLE_SUFFIXES, natural_key
 from rdstitch.inputs.frame import Frame, Named
+from rdstitch.inputs.image_folders import READABLE_SUFFIXES, natural_key
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage, as_image
 from rdstitch.io.stored_tiles import StoredTile, stored_tiles

@@ -9,13 +9,14 @@ import os
 import re
 import stat
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from functools import lru_cache, wraps
 from importlib import import_module
 from io import BufferedReader, BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rdstitch.errors import InputError
 
@@ -27,6 +28,7 @@ _READ_AT_ONCE = 2**22  # bytes
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 _LOCAL = ("file", "local")  # schemes of what is on this machine
 _SEVERAL = "::"  # between the parts of a chain, as in simplecache::s3://bucket/name
+_Content = TypeVar("_Content")
 _held: ContextVar[tuple[str, bytes] | None] = ContextVar("held", default=None)
 
 
@@ -146,6 +148,20 @@ def file_state(path: str | Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_size, status.st_mtime_ns
+
+
+def cached_by_file_state(read: Callable[[str | Path], _Content]) -> Callable[[str | Path], _Content]:
+    """A reader that reads a file again only if it has changed, or after another one: for one value after the other."""
+
+    @lru_cache(maxsize=1)
+    def of_state(path: str | Path, state: tuple[int, int] | None) -> _Content:
+        return read(path)
+
+    @wraps(read)
+    def cached(path: str | Path) -> _Content:
+        return of_state(path, file_state(path))
+
+    return cached
 
 
 def open_regular(path: str | Path) -> BufferedReader:

@@ -1,7 +1,10 @@
 """State that OpenCV keeps for the whole process, changed for a while and left as it was found, whatever threads do."""
 
+import selectors
+import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures.thread import _worker
 from contextlib import contextmanager
 from typing import Any
 
@@ -10,6 +13,12 @@ import cv2
 _SILENT = 0  # the log level of that name
 # OpenCV 4 has the same functions at its top level; its stubs know neither.
 _logging: Any = getattr(cv2.utils, "logging", cv2)
+# Functions that do nothing but wait: those of events, conditions and queues, of event loops, and of idle pools.
+_WAITING = {
+    threading.Condition.wait.__code__,
+    selectors.DefaultSelector.select.__code__,
+    _worker.__code__,
+}
 _lock = threading.Lock()
 _silenced: list[int] = []  # the log level before each of the blocks that hold it
 
@@ -19,22 +28,26 @@ def one_opencv_thread() -> Iterator[None]:
     """Keep OpenCV from starting threads of its own while a recipe runs several: they would wait for each other.
 
     It is switched only where no other thread is there, which may be inside OpenCV: many of its functions divide by the
-    number of its threads, and end the process if that changes meanwhile. So it is held around a whole recipe.
+    number of its threads, and end the process if that changes meanwhile. So it is held around a whole recipe. It is put
+    back where all other threads wait, such as a progress bar's or a client's that were started meanwhile.
     """
     # 0 rather than 1: a forked process would wait for ever for the end of threads that its parent alone has.
     before = cv2.getNumThreads()
-    switched = before > 1 and _is_alone()
+    switched = before > 1 and threading.active_count() == 1
     if switched:
         cv2.setNumThreads(0)
     try:
         yield
     finally:
-        if switched and _is_alone():
+        if switched and _others_wait():
             cv2.setNumThreads(before)
 
 
-def _is_alone() -> bool:
-    return threading.active_count() == 1
+def _others_wait() -> bool:
+    """Whether every other thread waits for something in Python, and so is not inside OpenCV."""
+    frames = sys._current_frames()
+    others = [thread for thread in threading.enumerate() if thread is not threading.current_thread()]
+    return all((frame := frames.get(thread.ident or 0)) and frame.f_code in _WAITING for thread in others)
 
 
 @contextmanager

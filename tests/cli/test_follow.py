@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rdstitch.inputs.arrivals import Arrivals
+from rdstitch.inputs.arrivals import open_arrivals
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
@@ -150,7 +150,7 @@ def test_files_whose_writers_pause_are_read_when_they_are_whole(drive: list[Path
     for name, image in zip(names, drive, strict=False):
         write_image(folder.parent / name, read_image(image).pixels)
     whole = {name: (folder.parent / name).read_bytes() for name in names}
-    arrivals = Arrivals(folder, frames_folder=Path, idle=2.0)
+    arrivals = open_arrivals(folder, frames_folder=Path, idle=2.0)
     frames = follow(arrivals, StitchOptions(workers=1), comes_again=arrivals.comes_again)
     (folder / "a.png").write_bytes(whole["a.png"])
     assert next(frames).name == "a.png"

@@ -19,7 +19,7 @@ from rdstitch.pipeline.compose import viewed_images
 from rdstitch.pipeline.recipes import pano
 from rdstitch.report.pairs import match_graph
 from rdstitch.synthetic.rendering import Photometry
-from rdstitch.viewer import viewer_page
+from rdstitch.viewer.page import viewer_page
 from tests.cli.running import CACHE, Run, sidecar_of
 
 LENS = Camera((320, 240), -0.2, focal=260.0, focal_source="option")

@@ -14,7 +14,7 @@ from PIL import Image
 
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.report import svg
-from rdstitch.viewer import ViewedImage, seam_image, viewer_page
+from rdstitch.viewer.page import ViewedImage, seam_image, viewer_page
 from tests.cli.running import CACHED, Run, sidecar_of
 
 _ROOT = Path(__file__).parents[2]

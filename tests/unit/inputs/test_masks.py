@@ -19,7 +19,7 @@ from rdstitch.inputs.find import find_images
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import DecodedImage, read_image
-from rdstitch.io.mask import mask_frame, read_mask
+from rdstitch.io.mask import Mask, mask_frame, read_mask
 from rdstitch.io.metadata import Metadata
 from rdstitch.pipeline.image_circle import find_circle, with_image_circle
 from rdstitch.synthetic import FisheyeLens, grid_poses, ground, sequence_over
@@ -97,11 +97,11 @@ def test_what_a_mask_excludes_is_transparent_with_what_was(tmp_path: Path) -> No
     alpha[:5] = 7
     image = save(tmp_path / "a.png", np.dstack([np.full((30, 40, 3), 90, np.uint8), alpha]))
     mask = save(tmp_path / "masks" / "a.png", leg().astype(np.uint8))
-    read = replace(source(image), mask=mask).read()
+    read = replace(source(image), mask=Mask(mask)).read()
     np.testing.assert_array_equal(read.alpha, np.where(leg(), alpha, 0))
     np.testing.assert_array_equal(read.pixels, np.full((30, 40, 3), 90))
     opaque = save(tmp_path / "b.png", np.full((30, 40), 90, np.uint8))
-    np.testing.assert_array_equal(replace(source(opaque), mask=mask).read().alpha, np.where(leg(), 255, 0))
+    np.testing.assert_array_equal(replace(source(opaque), mask=Mask(mask)).read().alpha, np.where(leg(), 255, 0))
 
 
 def test_masks_are_found_by_the_names_of_images(tmp_path: Path) -> None:
@@ -110,8 +110,8 @@ def test_masks_are_found_by_the_names_of_images(tmp_path: Path) -> None:
     of_a, of_c = save(tmp_path / "masks" / "a.png", white), save(tmp_path / "masks" / "c.TIF", white)
     save(tmp_path / "masks" / "z.png", np.zeros((3, 3), np.uint8))
     (tmp_path / "masks" / "b.txt").write_text("no image")
-    assert [found.mask for found in with_masks(sources, tmp_path / "masks")] == [of_a, None, of_c]
-    assert [found.mask for found in with_masks(sources, of_a)] == [of_a] * 3
+    assert [found.mask and found.mask.path for found in with_masks(sources, tmp_path / "masks")] == [of_a, None, of_c]
+    assert [found.mask and found.mask.path for found in with_masks(sources, of_a)] == [of_a] * 3
     assert with_masks(sources, None) == sources
 
 
@@ -121,7 +121,8 @@ def test_masks_of_images_of_one_name_are_in_folders_of_their_names(tmp_path: Pat
         save(tmp_path / name, np.full((30, 40), 255, np.uint8))
     frames = find_images([tmp_path / "left", tmp_path / "right"]).frames
     masked = with_masks(read_sources(frames, skip_bad=False)[0], tmp_path / "masks")
-    assert [source.mask for source in masked] == [tmp_path / "masks" / "left" / "a.png", tmp_path / "masks" / "a.png"]
+    found = [source.mask and source.mask.path for source in masked]
+    assert found == [tmp_path / "masks" / "left" / "a.png", tmp_path / "masks" / "a.png"]
 
 
 def test_masks_that_cannot_be_meant_are_refused(tmp_path: Path) -> None:

@@ -178,3 +178,9 @@ def test_bands_count_against_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv(MAX_IMAGE_GB, "much")
     with pytest.raises(InputError, match=f"{MAX_IMAGE_GB}=much: expected a number"):
         read_metadata(file)
+
+
+def test_the_header_of_the_first_page_is_read_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((3, 5, 7), np.uint8), photometric="minisblack")
+    monkeypatch.setattr(tifffile.TiffPages, "__len__", lambda _: pytest.fail("all pages were looked for"))
+    assert read_metadata(tmp_path / "a.tif").size == (7, 5)

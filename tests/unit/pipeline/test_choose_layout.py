@@ -1,6 +1,7 @@
 """Layouts that are chosen by their seams, and what is said of those that break."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from rdstitch.executors import open_executor
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.choose_layout import choose_layout
+from rdstitch.pipeline.choose_layout import _error, choose_layout
 from rdstitch.pipeline.compose import Layout, seam_messages
 from rdstitch.pipeline.lay_out import is_stretched
 from rdstitch.pipeline.placed_images import PlacedImages
@@ -64,6 +65,8 @@ def test_images_aligned_by_the_surface_whose_seams_break_are_aligned_by_the_othe
     assert near is not None
     offsets = [one.alignment.transfer(0, 1, np.array([[380.0, 240.0]]))[0] for one in (far, near)]
     np.testing.assert_allclose(offsets[1] - offsets[0], [9.0, 13.0], atol=0.5)
+    assert _error(near) < 1.0
+    assert _error(replace(far, alignment=near.alignment)) > 10.0  # the far matches count, though none of them fits
     for given in (far, near):
         chosen = choose_layout(given, options, aligner).registration.alignment
         np.testing.assert_allclose(chosen.transfer(0, 1, np.array([[380.0, 240.0]]))[0], offsets[0], atol=0.1)

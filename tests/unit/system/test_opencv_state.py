@@ -83,6 +83,33 @@ def test_threads_of_the_host_go_on_inside_opencv() -> None:
     assert done.returncode == 0
 
 
+_BESIDE_A_THREAD_STARTED_MEANWHILE = """
+import sys, threading, time
+from concurrent.futures import ThreadPoolExecutor
+import cv2
+from rdstitch.system.opencv_state import one_opencv_thread
+
+cv2.setNumThreads(4)
+done, pool = threading.Event(), ThreadPoolExecutor(1)
+with one_opencv_thread():
+    inside = cv2.getNumThreads()
+    work = {"waits": done.wait, "works": lambda: [time.sleep(0.001) for _ in iter(done.is_set, True)]}[sys.argv[1]]
+    threading.Thread(target=work).start()
+    pool.submit(int).result()
+    time.sleep(0.1)
+print(inside, cv2.getNumThreads())
+done.set()
+"""
+
+
+@pytest.mark.parametrize(("thread", "after"), [("waits", 4), ("works", 1)])
+def test_threads_come_back_where_those_started_meanwhile_only_wait(thread: str, after: int) -> None:
+    # A progress bar's monitor lives on for ever; one that works may be inside OpenCV.
+    script = [sys.executable, "-c", _BESIDE_A_THREAD_STARTED_MEANWHILE, thread]
+    done = subprocess.run(script, timeout=120, check=True, capture_output=True, text=True)
+    assert done.stdout.split() == ["1", str(after)]
+
+
 _IN_A_FORKED_CHILD = """
 import os, sys
 import cv2

@@ -11,6 +11,7 @@ from rdstitch.alignment.result import LinkFit
 from rdstitch.choices import Purpose
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
+from rdstitch.io.mask import Mask
 from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.results.messages import Message
 from rdstitch.verification import rules
@@ -198,7 +199,7 @@ def test_a_lens_that_was_zoomed_is_noticed(focal: float, zoomed: bool) -> None:
 
 
 def test_images_without_a_mask_among_others_are_named() -> None:
-    masked = [source(f"{k}.png", mask=Path("m")) for k in range(3)]
+    masked = [source(f"{k}.png", mask=Mask(Path("m"))) for k in range(3)]
     assert _texts(*masked) == []
     assert _texts(*masked, source("x.png")) == ["1 of 4 images have no mask: x.png"]
     assert _texts(masked[0], source("x.png"), source("y.png")) == ["2 of 3 images have no mask: x.png, y.png"]

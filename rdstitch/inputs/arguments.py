@@ -1,0 +1,173 @@
+"""What each argument of the user stands for: an image, a folder, a pattern, a list, a URL, a video or a bag."""
+
+import glob
+import hashlib
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from rdstitch.errors import InputError
+from rdstitch.inputs.frame import Frame, Named
+from rdstitch.inputs.image_folders import READABLE_SUFFIXES, images_in, natural_key, place_of
+from rdstitch.inputs.keyframes import wanted_frames
+from rdstitch.inputs.rosbag import extract_images, is_bag
+from rdstitch.io.opening import HEIF_SUFFIXES
+from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
+from rdstitch.results.messages import Message, shortened
+from rdstitch.system.file_access import is_url, read_text, remote_names
+
+_MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
+
+
+@dataclass(frozen=True)
+class NamedImage:
+    """An image among the arguments."""
+
+    frame: Frame
+    named: bool = True  # one by one, not by its folder or a pattern
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A video or bag among the arguments, whose frames are not extracted yet."""
+
+    path: Path
+
+    def extract(self, folder: Path, every: int | None, topic: str | None) -> tuple[list[Frame], list[Message]]:
+        """Write the frames that are wanted to a folder; and what was passed over."""
+        # Of its own: another one may have the same name, in another folder.
+        place = place_of(self.path)
+        folder = folder / hashlib.sha256(os.fsencode(place)).hexdigest()[:8] / place.parent.name
+        folder.mkdir(parents=True, exist_ok=True)
+        if is_bag(self.path):
+            images, wanted = extract_images(self.path, folder, every, topic)
+            return images, wanted.messages(self.path)
+        wanted = wanted_frames(every, partial(grey_frames, self.path))
+        written = extract_frames(self.path, folder, wanted.__contains__)
+        return [Frame(*frame) for frame in written], wanted.messages(self.path)
+
+    def unused_among(self, images: int) -> Message:
+        """Why it is not used beside images."""
+        remedy = "give it alone, or --every N to use every N-th of its frames too"
+        if images < 2:
+            raise InputError(f"{self.path}: is a video beside one image; {remedy}")
+        return Message(f"is a video among images, and was not used; {remedy}", (str(self.path),))
+
+
+@dataclass(frozen=True)
+class Expanded:
+    """What arguments stand for, as :class:`FoundImages` has it, before videos are looked into."""
+
+    items: Sequence[NamedImage | Clip]
+    containers: Sequence[Path] = ()
+    notes: Sequence[Message] = ()
+
+    @classmethod
+    def several(cls, frames: Iterable[Path], notes: Sequence[Message] = ()) -> "Expanded":
+        """Images that were not named one by one."""
+        return cls([NamedImage(Frame(path), named=False) for path in frames], (), notes)
+
+
+def expanded(arguments: Iterable[Named], lists: tuple[Path, ...] = ()) -> Expanded:
+    """All that arguments stand for; ``lists`` are those that they come from."""
+    parts = [_named_by(argument, lists) for argument in arguments]
+    return Expanded(
+        [item for part in parts for item in part.items],
+        [container for part in parts for container in part.containers],
+        [note for part in parts for note in part.notes],
+    )
+
+
+def _named_by(argument: Named, lists: tuple[Path, ...]) -> Expanded:
+    if isinstance(argument, Frame):
+        return Expanded([NamedImage(argument)])
+    path, text = Path(argument), str(argument)
+    if is_url(path):
+        return _at_url(text)
+    if not _exists(path):
+        if text.startswith("@"):
+            file = Path(text[1:])
+            if file in lists:
+                raise InputError(f"{file}: the list of images names itself")
+            # Another program may write the list while we read it: @<(find ...) in a shell.
+            inner = expanded(names_in(read_text(file, regular=False)), (*lists, file))
+            return replace(inner, containers=[file, *inner.containers])
+        return Expanded.several(_matching(text)) if glob.has_magic(text) else Expanded([NamedImage(Frame(path))])
+    if is_bag(path):
+        return Expanded([Clip(path)], [*path.iterdir()] if path.is_dir() else [path])
+    if path.is_dir():
+        return Expanded.several(*_in_folder(path))
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return Expanded([Clip(path)], [path])
+    return Expanded([NamedImage(Frame(path))])
+
+
+def _at_url(url: str) -> Expanded:
+    """The image, or the images of the folder or pattern, that a URL names."""
+    path = Path(url)
+    pattern = glob.has_magic(path.name)
+    if not pattern and path.suffix.lower() in READABLE_SUFFIXES:
+        return Expanded([NamedImage(Frame(path))])
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        raise InputError(f"{path}: only images are read from other machines; download the video first")
+    try:
+        found = sorted(map(Path, remote_names(url)), key=natural_key)
+    except OSError as error:
+        raise InputError(f"{path}: {error}") from error
+    found = [name for name in found if name.suffix.lower() in READABLE_SUFFIXES | HEIF_SUFFIXES]
+    if not found:
+        raise InputError(f"{path}: there are no images at this address")
+    return Expanded.several(found)
+
+
+def _exists(path: Path) -> bool:
+    """Whether there is a file; who reads it will say why one cannot be looked for."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
+
+
+def names_in(text: str) -> list[str]:
+    """The names in a list: separated by NUL, if there is one, else one a line."""
+    names = text.split("\0") if "\0" in text else re.split(r"\r?\n", text)
+    return [name for name in names if name]
+
+
+def _in_folder(folder: Path) -> tuple[list[Path], list[Message]]:
+    """The images of a folder, of which there must be one at least; and a note on what else is in it."""
+    images = images_in(folder)
+    others = sorted({path for path in folder.iterdir() if not path.name.startswith(".")} - set(images), key=natural_key)
+    if not images:
+        raise InputError(f"{folder}: there are no images in this folder{_elsewhere(others)}")
+    text = f"{folder}: not taken for images: {shortened([path.name for path in others])}"
+    return images, [Message(text, severity="detail")] if others else []
+
+
+def _has_images(folder: Path) -> bool:
+    try:
+        return bool(images_in(folder))
+    except InputError:
+        return False
+
+
+def _elsewhere(others: Sequence[Path]) -> str:
+    """Where the images may be, if a folder has none."""
+    within = [str(path) for path in others if path.is_dir() and _has_images(path)]
+    videos = [str(path) for path in others if path.suffix.lower() in VIDEO_SUFFIXES]
+    if within:
+        return f", but in the folders within it; name those: {shortened(within)}"
+    return f", but a video; name it: {shortened(videos)}" if videos else ""
+
+
+def _matching(pattern: str) -> list[Path]:
+    if len(pattern) > _MAX_PATTERN:
+        raise InputError(f"{pattern[:40]}…: a pattern of {len(pattern)} characters is too long")
+    matching = map(Path, glob.glob(pattern))  # noqa: PTH207 - a pattern may be absolute
+    found = [path for path in matching if path.is_file()]
+    if not found:
+        raise InputError(f"{pattern}: no file matches this pattern")
+    return sorted(found, key=natural_key)

@@ -1,0 +1,51 @@
+"""The images of a folder: which files count, in what order, and which of them rdstitch wrote."""
+
+import json
+import os
+import re
+from pathlib import Path
+
+from rdstitch.errors import InputError
+from rdstitch.io.opening import HEIF_SUFFIXES, RAW_SUFFIXES
+from rdstitch.system.file_access import MAX_FILE, canonical_name, canonical_text, read_limited
+
+READABLE_SUFFIXES = frozenset(
+    [".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".tga", ".jp2", ".ppm", ".pgm", ".pnm", ".gif"]
+)
+"""What counts as an image in a folder; a file that is named is tried whatever it is called."""
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The images of a folder in natural order, and those that nobody here can read: who reads them will say so."""
+    try:
+        entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    except OSError as error:
+        raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
+    images = [path for path in entries if path.suffix.lower() in READABLE_SUFFIXES]
+    # Many cameras write a raw file beside each image, and phones that export JPEG leave the HEIC there.
+    stems = {path.stem for path in images}
+    images += [
+        path for path in entries if path.suffix.lower() in HEIF_SUFFIXES | RAW_SUFFIXES and path.stem not in stems
+    ]
+    return sorted(images, key=natural_key)
+
+
+def natural_key(path: Path) -> list[tuple[int, str | int]]:
+    """Sorting key by which ``frame10`` comes after ``frame9``."""
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", str(path)) if part]
+
+
+def place_of(path: Path) -> Path:
+    """Where a name stands, links to folders followed but the last link not."""
+    # Path.resolve would stumble over links in a circle.
+    return Path(os.path.realpath(path.parent)) / path.name
+
+
+def is_rdstitch_output(path: Path) -> bool:
+    """Whether rdstitch wrote this image: the sidecar beside it says so, and means this one."""
+    try:
+        record = json.loads(read_limited(path.with_name(path.name + ".json"), MAX_FILE))
+        own = record["format"] == "rdstitch sidecar"
+        return own and canonical_text(str(record["output"]["file"])) == canonical_name(path.name)
+    except (OSError, ValueError, TypeError, LookupError, RecursionError):
+        return False
