@@ -88,7 +88,7 @@ def test_every_kind_has_a_sentence_that_its_rules_find_all_words_for() -> None:
     checked = [_checked(0.05, (0, 1), unique=False), _checked(0.9, (1, 2), unique=True)]
     sampled = [replace(_checked(0.9, (k, k + 1), unique=False), sampled=True) for k in range(30)]
     ahead = replace(checked[0], agreement=Agreement(80, 8, 100, 0.35))
-    cameras = [source("a.jpg", model="A"), source("b.jpg", model="B", mask=Path("m")), source("c.jpg", model="B")]
+    cameras = [source("a.jpg", model="A"), source("b.jpg", model="B", mask=Mask(Path("m"))), source("c.jpg", model="B")]
     zoomed = [
         source(f"{name}.jpg", model="A", focal_px=focal) for name, focal in zip("abc", (9.0, 9.0, 7.0), strict=True)
     ]
