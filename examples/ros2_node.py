@@ -88,7 +88,7 @@ def main() -> None:
     tracker: list[rdstitch.Tracker] = []
 
     def begin(camera: "Camera | Path") -> None:
-        options = rdstitch.StitchOptions(camera=camera, **known)  # type: ignore[arg-type]
+        options = rdstitch.StitchOptions(camera=camera, **known)
         tracker[:] = [rdstitch.Tracker(options, rdstitch.FollowedPoses(height, "ros"))]
 
     def on_camera_info(info: Any) -> None:

@@ -24,19 +24,19 @@ if TYPE_CHECKING:
     from rdstitch.options.files_beside import FilesBeside as FilesBeside
     from rdstitch.options.stitch_options import StitchOptions as StitchOptions
     from rdstitch.options.tile_options import TileOptions as TileOptions
-    from rdstitch.pipeline.apply_sidecar import Recomposition as Recomposition
     from rdstitch.pipeline.apply_sidecar import apply as apply
     from rdstitch.pipeline.blocks import mosaic_blocks as mosaic_blocks
     from rdstitch.pipeline.composer import Composer as Composer
     from rdstitch.pipeline.doctor import Examination as Examination
     from rdstitch.pipeline.doctor import examine as examine
-    from rdstitch.pipeline.follow import FollowedPoses as FollowedPoses
-    from rdstitch.pipeline.follow import Pose as Pose
     from rdstitch.pipeline.follow import Tracker as Tracker
+    from rdstitch.pipeline.pose import FollowedPoses as FollowedPoses
+    from rdstitch.pipeline.pose import Pose as Pose
     from rdstitch.pipeline.recipes import calibrate as calibrate
     from rdstitch.pipeline.recipes import mosaic as mosaic
     from rdstitch.pipeline.recipes import pano as pano
     from rdstitch.pipeline.recipes import trajectory as trajectory
+    from rdstitch.pipeline.recomposition import Recomposition as Recomposition
     from rdstitch.pipeline.result_files import write_layers as write_layers
     from rdstitch.pipeline.stage_tiles import place_tiles as place_tiles
     from rdstitch.pipeline.stage_tiles import tiles as tiles
@@ -63,9 +63,11 @@ _HOMES = {
         "rdstitch.options.feature_options": "FeatureOptions",
         "rdstitch.results.messages": "Message",
         "rdstitch.options.stitch_options": "StitchOptions",
-        "rdstitch.pipeline.apply_sidecar": "Recomposition apply",
+        "rdstitch.pipeline.apply_sidecar": "apply",
+        "rdstitch.pipeline.recomposition": "Recomposition",
         "rdstitch.pipeline.composer": "Composer",
-        "rdstitch.pipeline.follow": "FollowedPoses Pose Tracker",
+        "rdstitch.pipeline.follow": "Tracker",
+        "rdstitch.pipeline.pose": "FollowedPoses Pose",
         "rdstitch.options.files_beside": "FilesBeside",
         "rdstitch.pipeline.result_files": "write_layers",
         "rdstitch.pipeline.blocks": "mosaic_blocks",

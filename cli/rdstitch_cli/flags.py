@@ -14,12 +14,12 @@ import click
 from click.core import ParameterSource
 
 from rdstitch.options.option import Declared, Option, declaration, declared
-from rdstitch_cli.config import config
+from rdstitch_cli.config import CONFIG_FILE, config
 from rdstitch_cli.help_pages import EXIT_STATUSES, GroupedCommand
 from rdstitch_cli.terminal import Reporter
 
 Inputs = Annotated[tuple[Path, ...], "INPUT..."]  # an argument rather than an option
-ImageFile = Annotated[Path, Option("Image to write: .jpg, .png, .tif, .webp or .dzi.", flag="-o --output")]
+ImageFile = Annotated[Path, Option("Image to write: .jpg, .png, .tif, .webp or .dzi.", flag="-o --output", writes=True)]
 PrintSidecar = Annotated[bool, Option("Print the sidecar as JSON.", flag="--json")]
 
 
@@ -32,6 +32,7 @@ def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callab
     def make(function: Callable[..., Any]) -> click.Command:
         @wraps(function)
         def run(*, quiet: bool, verbose: bool, **given: Any) -> Any:
+            _check_not_read([given[name] for name in written if given[name] is not None], given.get("camera"))
             with Reporter(verbose - quiet) as reporter:
                 return function(reporter=reporter, **given)
 
@@ -49,6 +50,7 @@ def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callab
             click.Option(["-v", "--verbose"], is_flag=True, help="Print details."),
             config,
         ]
+        written = [option.name for option in parameters if isinstance(option, Flag) and option.writes]
         epilog = f"\b\nExamples:{examples}\n\n{EXIT_STATUSES}"
         return GroupedCommand(function.__name__, callback=run, params=parameters, help=function.__doc__, epilog=epilog)
 
@@ -107,7 +109,23 @@ def _flag(entry: Declared, default: Any) -> click.Option:
         how["type"] = EnteredValue(entry)
         shown = option.default or (how["type"].shown(default) if shown or option.none else "")
     text = option.text + f"  [default: {shown}]" * bool(shown)
-    return click.Option(names, metavar=option.metavar or None, help=text, **how)
+    return Flag(names, metavar=option.metavar or None, help=text, writes=option.writes, **how)
+
+
+class Flag(click.Option):
+    """An option that knows whether it names what is written."""
+
+    def __init__(self, *arguments: Any, writes: bool, **given: Any) -> None:
+        super().__init__(*arguments, **given)
+        self.writes = writes
+
+
+def _check_not_read(written: Iterable[Path], camera: Path | None) -> None:
+    """Refuse to write over the camera file that is read, or over the configuration."""
+    from rdstitch.system.outputs import check_not_read
+
+    read = (camera, click.get_current_context().meta.get(CONFIG_FILE))
+    check_not_read(written, [file for file in read if file is not None])
 
 
 class FilePath(click.Path):

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,8 +17,9 @@ from rdstitch_cli.stitching import warn_of
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
+    from rdstitch.inputs.arrivals import Arrivals
     from rdstitch.inputs.frame import Named
-    from rdstitch.pipeline.follow import FollowedPoses
+    from rdstitch.pipeline.pose import FollowedPoses
     from rdstitch.results.registration import Registration
 
 FOLLOWING = flags(
@@ -67,28 +68,15 @@ def followed(
     ``refresh`` is None where no image is made; ``plot`` will be written at the end too. ``poses`` says how poses are
     printed: as the file that is written at the end has them.
     """
-    from rdstitch.camera_files import format_of
     from rdstitch.inputs.arrivals import open_arrivals
-    from rdstitch.pipeline.compose import image_files
-    from rdstitch.pipeline.follow import follow as follow_frames
-    from rdstitch.pipeline.output_plan import files_beside
     from rdstitch.system.file_access import file_state
-    from rdstitch.system.outputs import check_outputs, check_suffix
     from rdstitch.system.temporary_folder import TemporaryFolder
 
     if len(inputs) != 1:
         raise click.UsageError("--follow takes one input: a folder, a video, the index of a camera, a stream or -")
     source = Path(inputs[0])
-    if source.is_dir() and output.resolve().parent == source.resolve():
-        raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
     preview = output.with_suffix(".preview.jpg") if refresh else None
-    # Before hours of frames, not after them.
-    planned = [output] if refresh is None else image_files(check_suffix(output))
-    if stitch.save_camera is not None:
-        format_of(stitch.save_camera, stitch.camera_format)
-        planned.append(stitch.save_camera)
-    planned += [file for file in (preview, plot) if file is not None]
-    check_outputs([*planned, *files_beside(beside, [])], stitch.overwrite, [source])
+    _check_files(source, stitch, output, [file for file in (preview, plot) if file is not None], beside, refresh)
     before = file_state(preview) if preview else None
     with TemporaryFolder() as folder:
         arrivals = open_arrivals(
@@ -100,18 +88,56 @@ def followed(
             topic=stitch.topic,
         )
         try:
-            again = arrivals.comes_again
-            frames = follow_frames(arrivals, stitch, poses, comes_again=again, preview=preview, refresh=refresh or 0.0)
-            for frame in frames:
-                print_line(frame.as_dict())
-                for message in frame.messages:
-                    reporter.warn(str(message))
+            _print_poses(arrivals, stitch, poses, preview, refresh or 0.0, reporter)
         except KeyboardInterrupt:
             reporter.note("interrupted: registering what has arrived; interrupt once more to give up")
         yield arrivals.inputs
-    # What it was a sketch of is there now; a file that was there before and was not replaced is none of ours.
+    # The image that it was a preview of is there now; a file that was not replaced is the user's.
     if preview is not None and file_state(preview) != before:
         preview.unlink(missing_ok=True)
+
+
+def _check_files(
+    source: Path,
+    stitch: StitchOptions,
+    output: Path,
+    others: Sequence[Path],
+    beside: FilesBeside,
+    refresh: float | None,
+) -> None:
+    """Find out before hours of frames, not after them, whether all can be written."""
+    from rdstitch.camera_files import format_of
+    from rdstitch.pipeline.compose import image_files
+    from rdstitch.pipeline.output_plan import files_beside
+    from rdstitch.system.outputs import check_outputs, check_suffix
+
+    if source.is_dir() and output.resolve().parent == source.resolve():
+        raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
+    planned = [*([output] if refresh is None else image_files(check_suffix(output)))]
+    if stitch.save_camera is not None:
+        format_of(stitch.save_camera, stitch.camera_format)
+        planned.append(stitch.save_camera)
+    check_outputs([*planned, *others, *files_beside(beside, output, [])], stitch.overwrite, [source])
+
+
+def _print_poses(
+    arrivals: "Arrivals",
+    stitch: StitchOptions,
+    poses: "FollowedPoses | None",
+    preview: Path | None,
+    refresh: float,
+    reporter: Reporter,
+) -> None:
+    """One line for each frame that arrives, until no more come."""
+    from rdstitch.pipeline.follow import follow
+
+    again = arrivals.comes_again
+    frames = follow(arrivals, stitch, poses, comes_again=again, preview=preview, refresh=refresh)
+    with closing(frames):
+        for frame in frames:
+            print_line(frame.as_dict())
+            for message in frame.messages:
+                reporter.warn(str(message))
 
 
 def print_line(record: dict[str, object]) -> None:

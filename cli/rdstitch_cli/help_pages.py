@@ -90,10 +90,7 @@ class GroupedCommand(click.Command):
             formatter.write_text(f"{left} more options: {context.command_path} --help-all")
 
 
-@click.command(
-    "help",
-    epilog="\b\nExamples:\n  rdstitch help\n  rdstitch help pano\n  rdstitch help no-overlap\n",
-)
+@click.command("help", epilog="\b\nExamples:\n  rdstitch help\n  rdstitch help pano\n  rdstitch help no-overlap\n")
 @click.argument("topics", nargs=-1, metavar="[COMMAND|CODE]")
 @click.pass_context
 def help_command(context: click.Context, topics: Sequence[str]) -> None:

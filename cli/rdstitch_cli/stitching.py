@@ -3,7 +3,7 @@
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,14 +16,13 @@ from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.option import Option
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import bytes_in_words, seconds_in_words
-from rdstitch_cli.config import CONFIG_FILE
 from rdstitch_cli.flags import flags, flags_of, is_given, values_of
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.compositing import CompositePlan
     from rdstitch.geometry.camera import Camera
-    from rdstitch.pipeline.apply_sidecar import Recomposition
+    from rdstitch.pipeline.recomposition import Recomposition
     from rdstitch.results.registration import Registration
     from rdstitch.results.stitch_result import StitchResult
 
@@ -95,7 +94,6 @@ def resolve(inputs: tuple[Path, ...]) -> list[Path]:
 
 def stitch_options(reporter: Reporter, given: Mapping[str, Any], **more: Any) -> StitchOptions:
     """The library's options from a command's flags."""
-    _check_written([given["camera"]])
     if given.get("preview"):
         quick = {"seam": "voronoi", "max_features": 1500, "work_megapixels": 0.5}
         if not (is_given("like") or is_given("extent")):
@@ -107,20 +105,6 @@ def stitch_options(reporter: Reporter, given: Mapping[str, Any], **more: Any) ->
         "composite": CompositeOptions(**values_of(CompositeOptions, given)),
     }
     return StitchOptions(**{**values_of(StitchOptions, given), **more})
-
-
-_WRITTEN = ("output", "save_camera", "plot", "report", "poses", "hugin_project", "layers", "map_server")
-"""Options that name what is written."""
-
-
-def _check_written(read: Iterable[Path | None]) -> None:
-    """Refuse to write over a file that an option names to be read, or over the configuration."""
-    from rdstitch.system.outputs import check_not_read
-
-    context = click.get_current_context()
-    files = [file for file in (*read, context.meta.get(CONFIG_FILE)) if file is not None]
-    written = [context.params[name] for name in _WRITTEN if context.params.get(name) is not None]
-    check_not_read(written, files)
 
 
 def files_beside(given: Mapping[str, Any]) -> FilesBeside:

@@ -25,6 +25,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import read_sources
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.register import register
+from rdstitch.pipeline.run import Run
 from rdstitch.synthetic import BrownLens, FisheyeLens, Sequence, grid_poses, ground, sequence_over
 from rdstitch.synthetic.lenses import Lens
 
@@ -86,7 +87,7 @@ def measure(name: str, seed: int, chosen: LensName, files: list[Path], sequence:
     sources, _ = read_sources(files, camera=None, focal=None, distortion=None, skip_bad=False)
     with open_executor(1, len(sources)) as executor:
         options = StitchOptions(lens=chosen, workers=1)
-        found = register(sources, options, executor).alignment
+        found = register(sources, Run(options), executor).alignment
     error = registration_error(found, sequence, "similarity")
     print(
         f"{name:20s} {seed:3d} {chosen:9s} {found.lens:16s} λ {found.distortion:+.4f} ± "

@@ -103,11 +103,11 @@ def compose_to_file(
             metadata=replace(metadata or Metadata(size), xmp=photo_sphere_xmp(prepared.canvas)),
             quality=renderer.options.quality,
             background=renderer.options.background,
-            workers=prepared.tiles.workers,
         )
         check_format(path, layout)
         check_memory(path, size, renderer.options.max_memory)
         # Nothing goes on behind a writer that fails.
         with closing(prepared.strips(progress)) as strips:
-            written = write_strips(path, layout, strips, extra_tags(prepared.canvas), outputs=outputs)
+            tags, workers = extra_tags(prepared.canvas), prepared.tiles.workers
+            written = write_strips(path, layout, strips, tags, outputs=outputs, workers=workers)
     return FileComposite(prepared.canvas, written, prepared.messages, renderer.seams, prepared.tiles.box[:2])

@@ -1,5 +1,6 @@
 """Which of the images that were named are used (the user's --exclude and --include-only), and which part of each."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
@@ -38,11 +39,12 @@ def _fits(frame: Frame, pattern: str) -> bool:
     return pattern in names or any(fnmatchcase(name, pattern) for name in names)
 
 
-def with_masks(sources: Sequence[Source], masks: str | Path | None) -> list[Source]:
+def with_masks(sources: Sequence[Source], masks: str | Path | None, *, all_known: bool = True) -> list[Source]:
     """The sources, each with its mask, if it has one.
 
     ``masks`` is an image: the mask of all images, such as of a camera that sees its own vehicle. Or a folder with a
-    mask for each image, or for some, of the image's name; the suffix may differ.
+    mask for each image, or for some, of the image's name; the suffix may differ. One of them at least must have one,
+    unless more images are to come.
     """
     if masks is None:
         return list(sources)
@@ -63,22 +65,19 @@ def with_masks(sources: Sequence[Source], masks: str | Path | None) -> list[Sour
             frame = mask_frame(file, source.path, metadata.size, metadata.orientation, of_camera=not several)
             mask = Mask(file, frame)
         masked.append(replace(source, mask=mask))
-    if sources and all(source.mask is None for source in masked):
+    if sources and all_known and all(source.mask is None for source in masked):
         raise InputError(f"{path}: none of the masks has the name of an image, such as {sources[0].path.stem}.png")
     return masked
 
 
-def mask_of(source: Source, folder: str | Path) -> Path | None:
-    """The mask of an image in a folder of them."""
-    return _by_stem(Path(folder)).get(canonical_name(source.path.stem))
-
-
 def _by_stem(folder: Path) -> Mapping[str, Path]:
     """The masks in a folder, by their names before the suffix."""
-    try:
-        files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in READABLE_SUFFIXES)
-    except OSError as error:
+
+    def refuse(error: OSError) -> None:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
+
+    named = (Path(parent, name) for parent, _, names in os.walk(folder, onerror=refuse) for name in names)
+    files = sorted(path for path in named if path.suffix.lower() in READABLE_SUFFIXES)
     masks: dict[str, Path] = {}
     for path in files:
         other = masks.setdefault(canonical_name(path.relative_to(folder).with_suffix("").as_posix()), path)

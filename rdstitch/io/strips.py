@@ -29,7 +29,6 @@ class ImageSpec:
     metadata: Metadata = field(default_factory=lambda: Metadata((1, 1)))  # colour profile, EXIF and resolution to keep
     quality: int = 95  # of JPEG and WebP, 1 to 100
     background: int = 0  # grey (0 to 255) of what is transparent, in a format without transparency
-    workers: int = 1  # threads that may encode
 
     def __post_init__(self) -> None:
         if min(self.size) < 1 or self.channels < 1:

@@ -78,8 +78,12 @@ def write_strips(
     extra_tags: Iterable[ExtraTag] = (),
     *,
     outputs: Outputs | None = None,
+    workers: int = 1,
 ) -> Fingerprint:
-    """Write an image that comes in strips; see :func:`write_image`. Gives size and digest of what was written."""
+    """Write an image that comes in strips; see :func:`write_image`. Gives size and digest of what was written.
+
+    ``workers``: threads that may encode, beside what makes the next strips.
+    """
     file = Path(path)
     check_format(file, spec)
     checked, tiles = check_strips(spec, strips), None
@@ -94,13 +98,13 @@ def write_strips(
                 write_ome_zarr(staged, spec, checked)
         else:
             with staging.writing(file) as staged:
-                _write_file(staged, file.name.lower(), spec, checked, extra_tags)
+                _write_file(staged, file.name.lower(), spec, checked, extra_tags, workers)
         with naming(file):
             return fingerprint(staged, tiles)
 
 
 def _write_file(
-    file: Path, name: str, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag]
+    file: Path, name: str, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag], workers: int
 ) -> None:
     """Write one file in the format that the end of a name stands for."""
     if name.endswith(OME_SUFFIXES):
@@ -112,7 +116,7 @@ def _write_file(
         return
     pieces: Iterable[bytes | memoryview]
     if suffix in _JPEG:
-        pieces = jpeg_pieces(spec, strips)
+        pieces = jpeg_pieces(spec, strips, workers)
     elif suffix == ".png":
         pieces = png_pieces(spec, strips)
     else:

@@ -26,10 +26,10 @@ _START_OF_FRAME, _START_OF_SCAN = 0xC0, 0xDA
 _BLOCK_GREY, _BLOCK_COLOUR = 8, 16
 
 
-def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes | memoryview]:
+def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip], workers: int = 1) -> Iterator[bytes | memoryview]:
     """The pieces of a JPEG file, three strips in memory at a time; transparency becomes the background."""
     first = True
-    for data in _encoded(spec, strips):
+    for data in _encoded(spec, strips, workers):
         head, scan = _header_and_scan(data)
         if first:
             yield from _embedded(_with_height(head, spec.size[1]), spec.metadata)
@@ -40,12 +40,12 @@ def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes | me
     yield _END_OF_IMAGE
 
 
-def _encoded(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[bytes]:
+def _encoded(spec: ImageSpec, strips: Iterable[Strip], workers: int) -> Iterator[bytes]:
     """Each strip as a JPEG file; with several workers, beside what makes the next strips."""
-    if spec.workers == 1:
+    if workers == 1:
         yield from (_jpeg(spec, *strip) for strip in strips)
         return
-    with ThreadPoolExecutor(min(spec.workers, _ENCODERS)) as pool:
+    with ThreadPoolExecutor(min(workers, _ENCODERS)) as pool:
         under_way: deque[Future[bytes]] = deque()
         for strip in strips:
             under_way.append(pool.submit(_jpeg, spec, *strip))

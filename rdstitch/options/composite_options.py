@@ -1,8 +1,8 @@
 """How images are put together."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Self
 
 from rdstitch.choices import ProjectionName
 from rdstitch.errors import ArgumentError
@@ -104,6 +104,13 @@ class CompositeOptions(UprightOptions):
         least=1,
         command_line=False,
     )
+
+    def overridden(self, **given: Any) -> Self:
+        """The same with other options; what is given takes the place of all that says the same in another way."""
+        for several in ({"scale": 1.0, "gsd": None}, {"rectangle": None, "straighten": "off", "level": False}):
+            if given.keys() & several.keys():
+                given = several | given
+        return replace(self, **given)
 
     def __post_init__(self) -> None:
         super().__post_init__()

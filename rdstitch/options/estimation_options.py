@@ -29,6 +29,11 @@ class RansacOptions:
     def __post_init__(self) -> None:
         check_options(self)
 
+    def refuse_solver(self) -> None:
+        """Refuse a solver where λ is known: which one is used depends on nothing else then."""
+        if self.solver != "auto":
+            raise ArgumentError(f"with a known λ no solver can be chosen; leave out solver={self.solver!r}")
+
 
 @dataclass(frozen=True)
 class EstimationOptions(RansacOptions):
@@ -41,7 +46,8 @@ class EstimationOptions(RansacOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.distortion is not None and self.solver != "auto":
-            raise ArgumentError(f"with known distortion there is nothing to choose; leave out solver={self.solver!r}")
-        if self.distortion is not None and not -math.inf < self.distortion < 1.0:
+        if self.distortion is None:
+            return
+        self.refuse_solver()
+        if not -math.inf < self.distortion < 1.0:
             raise ArgumentError(f"distortion must be a number below 1, not {self.distortion}")

@@ -16,22 +16,29 @@ _REPORT_SUFFIXES = (".html", ".htm")
 class FilesBeside:
     """What is written beside an image, published together with it; the report of a result that is refused too."""
 
-    report: Path | None = option(None, "Write a report to FILE (.html): graph, votes on λ, matches, residuals.", "FILE")
+    report: Path | None = option(
+        None, "Write a report to FILE (.html): graph, votes on λ, matches, residuals.", "FILE", writes=True
+    )
     layers: Path | None = option(
         None,
         "Write each image, warped, with alpha, and its mask into DIR: TIFF, cropped, with the offsets that "
         "enblend reads.",
         "DIR",
+        writes=True,
     )
     whole_layers: bool = option(False, "With --layers: on the whole canvas instead of cropped.")
     hugin_project: Path | None = option(
-        None, "Write a project for Hugin (.pto): all images with lens and pose, and control points.", "FILE"
+        None,
+        "Write a project for Hugin (.pto): all images with lens and pose, and control points.",
+        "FILE",
+        writes=True,
     )
     poses: Path | None = option(
         None,
         "Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does; "
         "images.txt: COLMAP's; geo.txt: OpenDroneMap's.",
         "FILE",
+        writes=True,
     )
     frame: PosesFrame = option(
         "enu",
@@ -40,6 +47,13 @@ class FilesBeside:
         "where the output is georeferenced.",
     )
     height: Height = None
+    map_server: Path | None = option(
+        None,
+        "Write map.yaml and map.png, which nav2_map_server loads, into DIR; in metres by --height, with the first "
+        "image at the origin and its top along x.",
+        "DIR",
+        writes=True,
+    )
     command: str = ""  # the command line, for the report
 
     def __post_init__(self) -> None:

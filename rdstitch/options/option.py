@@ -34,6 +34,7 @@ class Option:
     none: str = ""  # the word for None on the command line
     default: str = ""  # what help pages say of the default, where its value says too little
     entered: Any = None  # the type on the command line, where that of the field is another one
+    writes: bool = False  # whether it names a file or folder that is written
     command_line: bool = True
 
     def allows(self, number: float) -> bool:
@@ -92,7 +93,7 @@ def declaration(name: str, annotation: Any) -> Declared | None:
 def declared(kind: Any) -> dict[str, Declared]:
     """The options among the fields of a dataclass."""
     annotated = {each.name: (each.type, each.metadata.get("option")) for each in fields(kind)}
-    types = {name: kind if said is None else Annotated[kind, said] for name, (kind, said) in annotated.items()}
+    types = {name: kind if known is None else Annotated[kind, known] for name, (kind, known) in annotated.items()}
     return {name: found for name, kind in types.items() if (found := declaration(name, kind)) is not None}
 
 

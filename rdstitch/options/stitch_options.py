@@ -28,7 +28,7 @@ class StitchOptions(RansacOptions):
     """How images are registered and composited.
 
     Raises :class:`rdstitch.errors.ArgumentError` where a value is out of range, unknown, or contradicts another one.
-    A camera may also be given as the path of its file, or of a ROS bag with camera_info.
+    A camera may also be given as the path of its file, or of a ROS bag with camera_info; a recipe reads it then.
     """
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
@@ -43,7 +43,7 @@ class StitchOptions(RansacOptions):
         "auto", "Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient."
     )
     model: ModelName = option("auto", "Motion model of the camera.")
-    camera: "Camera | None" = option(
+    camera: "Camera | str | Path | None" = option(
         None,
         "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is not "
         "estimated.",
@@ -130,7 +130,7 @@ class StitchOptions(RansacOptions):
     overwrite: Overwrite = False
     strict: Strict = False
     force: bool = option(False, "Write the result even when it fails its own checks.")
-    save_camera: Path | None = option(None, "Write the estimated camera.", "FILE")
+    save_camera: Path | None = option(None, "Write the estimated camera.", "FILE", writes=True)
     camera_format: CameraFormat = option(
         "auto",
         "Format of the camera file written. auto: by its name, .json (rdstitch), .yml (OpenCV), .fisheye.yml, "
@@ -141,16 +141,13 @@ class StitchOptions(RansacOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(file := getattr(self, "camera"), str | Path):  # noqa: B009 - by its type it is a camera
-            from rdstitch.inputs.rosbag import camera_in
-
-            object.__setattr__(self, "camera", camera_in(file))
-        if self.lens != "auto" and self.known_distortion is not None:
+        lens_known = self.distortion is not None or self.camera is not None
+        if self.lens != "auto" and lens_known:
             raise ArgumentError("the lens is known: leave out lens, or the known lens")
         if self.solver == "two_point" and self.tilt is None and (self.attitude is None or self.attitude_std > 0.0):
             raise ArgumentError("the two_point solver needs the tilt, or exact attitudes")
-        if self.solver != "auto" and self.known_distortion is not None:
-            raise ArgumentError("with a known λ no solver can be chosen")
+        if lens_known:
+            self.refuse_solver()
         if self.scheduler not in (None, "local") and self.cache is None:
             raise ArgumentError("a cluster needs a folder for features that all its machines see: give --cache too")
         if self.composite.measured and self.reference is None:
@@ -161,11 +158,17 @@ class StitchOptions(RansacOptions):
         return replace(self, features=self.features.for_images(count))
 
     @property
+    def known_camera(self) -> "Camera | None":
+        """The camera that was given, which the recipe has read where it was a file."""
+        assert not isinstance(self.camera, str | Path)
+        return self.camera
+
+    @property
     def known_distortion(self) -> float | None:
         """λ where the user gave it, alone or with the camera; of a richer lens, the nearest one-parameter λ."""
-        if self.distortion is not None or self.camera is None:
+        if self.distortion is not None or self.known_camera is None:
             return self.distortion
-        return self.camera.nearest_distortion
+        return self.known_camera.nearest_distortion
 
     @property
     def files(self) -> list[Path]:
@@ -190,6 +193,11 @@ class StitchOptions(RansacOptions):
         """How pairs are estimated."""
         search = {each.name: getattr(self, each.name) for each in fields(RansacOptions)}
         return EstimationOptions(**search, distortion=self.known_distortion, select_below=_SELECT_MODEL_BELOW)
+
+    @property
+    def compositing(self) -> CompositeOptions:
+        """Options of the compositor, which works on as many tiles at a time."""
+        return replace(self.composite, workers=self.threads)
 
     @property
     def threads(self) -> int:

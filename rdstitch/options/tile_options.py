@@ -58,7 +58,9 @@ class TileOptions:
     )
     time: int | None = option(None, "Time of a series, from 0; otherwise the first.", least=0)
     flat_field: FlatField = "auto"
-    save_flat_field: str | Path | None = option(None, "Write flat field and dark field to this TIFF file.", "FILE")
+    save_flat_field: str | Path | None = option(
+        None, "Write flat field and dark field to this TIFF file.", "FILE", writes=True
+    )
     distortion: float | Literal["auto"] | None = option(
         None,
         "Known λ (half-diagonal frame), or auto: estimate it; otherwise 0 unless all overlaps show it.",

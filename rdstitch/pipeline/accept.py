@@ -8,11 +8,11 @@ import numpy as np
 
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment, LinkFit, links_by_image
-from rdstitch.choices import Purpose
 from rdstitch.errors import PartialResultError
-from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.pipeline.aligner import Aligner, impossible_estimates_fail
 from rdstitch.pipeline.realign import Offenders, aligner_of, left_out_images, plane_of_most, without
+from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
@@ -46,13 +46,14 @@ class _Checked:
 
 
 @impossible_estimates_fail()
-def accept(registration: Registration, options: StitchOptions, purpose: Purpose = Purpose.MOSAIC) -> Registration:
+def accept(registration: Registration, run: Run) -> Registration:
     """The registration of what passes all checks, with everything that the user should know of it.
 
     The registration comes and goes in pixels of the working size.
     """
+    options, purpose = run.options, run.purpose
     aligner = aligner_of(registration, options, purpose)
-    undamaged = None if options.force else _without_damage(registration, aligner)
+    undamaged = None if options.force else _without_damage(registration, aligner, run.guard)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None
 
@@ -75,10 +76,7 @@ def accept(registration: Registration, options: StitchOptions, purpose: Purpose 
 
 
 def _repairs(
-    first: _Checked,
-    check: Callable[[Registration], _Checked],
-    undamaged: Registration | None,
-    aligner: Aligner,
+    first: _Checked, check: Callable[[Registration], _Checked], undamaged: Registration | None, aligner: Aligner
 ) -> Iterator[_Checked]:
     """What may pass where ``first`` fails: without damaged files, the plane of most images, without what fails."""
     if undamaged is not None and not (checked := check(undamaged)).failures:
@@ -99,15 +97,14 @@ def _repairs(
         yield (current := check(rest))
 
 
-def _without_damage(registration: Registration, aligner: Aligner) -> Registration | None:
+def _without_damage(registration: Registration, aligner: Aligner, guard: InputGuard) -> Registration | None:
     """Without images of damaged files; None where none is used, or too few others are left.
 
     Flipped bits shift a part of an image: by a few pixels, that looks as if the camera had tilted, and all tilt then;
     by more, as if something moved.
     """
     used = registration.alignment.used
-    known = registration.sources[0].guard.damaged  # all have one guard
-    damaged = [k for k, source in enumerate(registration.sources) if source.path in known and used[k]]
+    damaged = [k for k, source in enumerate(registration.sources) if source.path in guard.damaged and used[k]]
     if not damaged:
         return None
     reason = Message("is damaged, and all others fit better without it; copy it again from its source")

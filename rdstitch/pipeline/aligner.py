@@ -90,11 +90,7 @@ class Aligner:
 
     @classmethod
     def of(
-        cls,
-        sources: Sequence[Source],
-        options: StitchOptions,
-        cache: Cache,
-        purpose: Purpose = Purpose.MOSAIC,
+        cls, sources: Sequence[Source], options: StitchOptions, cache: Cache, purpose: Purpose = Purpose.MOSAIC
     ) -> Self:
         """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`."""
         paths = tuple(str(source.path) for source in sources)

@@ -1,155 +1,60 @@
 """Recomposing from a saved registration: other bands of the same flight, other sizes, other compositing options."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from msgspec import UNSET
-from msgspec.structs import replace as replace_fields
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
-from rdstitch.errors import InputError, PartialResultError
+from rdstitch.errors import InputError
 from rdstitch.export.georeference import Georeference
-from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.camera_record import CameraRecord, camera_record, lens_fields
-from rdstitch.geometry.exif_orientation import inverse
-from rdstitch.inputs.find import found_images
+from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
-from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.band_lens import BandLens, band_lens
-from rdstitch.pipeline.compose import Layout, check_world_files, compose_images, image_files, plainly_viewed, write_page
-from rdstitch.pipeline.counterparts import MatchedBy, counterparts, registered_files
+from rdstitch.pipeline.compose import Layout, check_world_files, compose_images, image_files
+from rdstitch.pipeline.counterparts import registered_files
+from rdstitch.pipeline.deep_zoom_page import plainly_viewed, write_page
 from rdstitch.pipeline.placed_images import PlacedImages
-from rdstitch.pipeline.read_inputs import check_size, with_flat_field
+from rdstitch.pipeline.recomposition import Recomposition
+from rdstitch.pipeline.replacements import Replacements, read_replacements
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.straighten import reoriented
-from rdstitch.results.messages import Message, merge_by_reason
-from rdstitch.results.messages import left_out as left_out_message
-from rdstitch.results.stitch_result import OutputImage
+from rdstitch.results.messages import Message
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
-from rdstitch.sidecar.records import VERSION, Applied, ImageRecord
-from rdstitch.sidecar.write import displacement_record, output_record, seams_record, taken_fields, to_output, versions
-from rdstitch.stage.tile_frames import tile_frames, with_position_folders
+from rdstitch.sidecar.write_applied import applied_sidecar
+from rdstitch.stage.tile_frames import with_position_folders
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent
-from rdstitch.system.records import to_jsonable
 
-
-@dataclass(frozen=True, repr=False, kw_only=True)
-class Recomposition(OutputImage):
-    """An image made from a saved registration; also as :class:`rdstitch.results.stitch_result.OutputImage` has it.
-
-    Attributes
-    ----------
-    saved : SavedRegistration
-    sources : tuple of Source or None
-        For each image of the registration the one that took its place, with its camera; None where there is none.
-    matched : str
-        "name", "time", "position" or "order".
-    left_out : dict of int to Message
-        Images that the registration used and that are not in the output, by their number, with the reason.
-    placed : PlacedImages
-        Those that are in the output.
-    messages : tuple of Message
-        What the user should know of the compositing, and of the sidecar.
-    """
-
-    saved: SavedRegistration
-    sources: tuple[Source | None, ...]
-    matched: MatchedBy
-    left_out: Mapping[int, Message]
-    placed: PlacedImages
-    messages: tuple[Message, ...] = ()
-
-    @property
-    def summary(self) -> str:
-        """What was made, and of how many images, in one line."""
-        used = sum(source is not None for source in self.sources)
-        return f"{super().summary}, {used} of {used + len(self.left_out)} images"
-
-
-def applied_sidecar(result: Recomposition) -> dict[str, Any]:
-    """The sidecar of a recomposed image: what was estimated then, of the images that are in it now.
-
-    It can be applied like any other. Pairs are those of the sidecar that was applied, and stay there.
-    """
-    then, saved = result.saved.record, result.saved
-    images = [_image(result, index) for index in range(len(then.images))]
-    # An image without any image in it is never written.
-    reference = next(index for index in (saved.reference, *range(len(images))) if images[index].used)
-    source = result.sources[reference]
-    assert source is not None
-    # How far the camera was determined then.
-    determined = ("lens_covariance", "tilt_deg", "tilt_std_deg")
-    camera = replace_fields(
-        camera_record(source.camera.turned(inverse(source.metadata.orientation))),
-        lambda_std=then.lambda_std,
-        **{name: getattr(then.camera, name) for name in determined},
-        focal_std_px=_resized_std(then.camera, source.camera.focal),
-    )
-    now = replace_fields(
-        then,
-        version=VERSION,
-        lambda_=source.camera.distortion,
-        lambda_px=camera.lambda_px,
-        lambda_focal=camera.lambda_focal,
-        camera=camera,
-        focal_px=camera.focal_px,
-        reference=source.name,
-        output=output_record(result, turned=saved.turned),
-        seams=seams_record(result.seams, [source.name for source in result.placed.sources]),
-        images=images,
-        pairs=[],
-        options={**then.options, "composite": result.options.composite},
-        versions=versions(),
-        applied=Applied(str(saved.path), result.matched),
-    )
-    content: dict[str, Any] = to_jsonable(now)
-    return content
-
-
-def _image(result: Recomposition, index: int) -> ImageRecord:
-    """One image's record, brought up to date."""
-    source, image = result.sources[index], result.saved.images[index]
-    if source is None or image.to_plane is None:
-        reason = result.left_out[index].text if index in result.left_out else image.reason
-        lens = {} if image.camera is None else lens_fields(image.camera)
-        gone = {"used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
-        return replace_fields(image, **lens, **gone, lambda2=UNSET)
-    to_plane = result.placed.homographies[sum(earlier is not None for earlier in result.sources[:index])]
-    field, size = image.displacement_field(), source.camera.image_size
-    return replace_fields(
-        image,
-        name=source.name,
-        path=str(source.path),
-        size=size,
-        to_plane=to_plane.tolist(),
-        to_output=to_output(result.canvas, to_plane),
-        displacement=displacement_record(None if field is None else field.resized(size)),
-        lambda2=UNSET,
-        **taken_fields(source),
-        **lens_fields(source.camera),
-    )
-
-
-def _resized_std(then: CameraRecord, focal: float | None) -> float | None:
-    """The standard deviation that a focal length had, for the same lens on an image of another size."""
-    std, former = then.focal_std_px, then.focal_px
-    return std * (focal / former) if std and former and focal else None
+_GEOMETRY = (
+    "scale",
+    "max_size",
+    "crop",
+    "projection",
+    "max_stretch",
+    "rotate",
+    "north_up",
+    "gsd",
+    "epsg",
+    "like",
+    "extent",
+    "georeference",
+)
+"""Options of compositing that say which pixels the output has."""
 
 
 @one_native_thread()
 def apply(
-    sidecar: str | Path,
+    sidecar: str | Path | SavedRegistration,
     images: Images,
     output: str | Path | None = None,
     composite: CompositeOptions | None = None,
@@ -162,7 +67,7 @@ def apply(
 
     Parameters
     ----------
-    sidecar : path
+    sidecar : path or SavedRegistration
         What :func:`rdstitch.pano` or :func:`rdstitch.mosaic` wrote beside its image.
     images : path, ndarray, or iterable of them
         The same images, or others that were taken by the same lens from the same places: other bands, other sizes of
@@ -189,7 +94,7 @@ def apply(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = replace(options or ApplyOptions(), **fields)
-    saved = read_sidecar(sidecar)
+    saved = sidecar if isinstance(sidecar, SavedRegistration) else read_sidecar(sidecar)
     mismatch = mismatch_with_image(saved)
     if options.strict and mismatch:
         raise InputError(mismatch)
@@ -201,111 +106,68 @@ def apply(
         Outputs(options.overwrite) as outputs,
     ):
         if output is not None:
-            check_outputs(image_files(check_suffix(output)), options.overwrite, [*listed.files, sidecar])
-        composite = composite or saved.composite
-        chosen = _chosen(saved, listed.frames, options, composite.max_memory)
-        if output is not None:
-            check_world_files([output], list(chosen.used.values()), options.overwrite)
-        layout, composite, said = _laid_out(saved, chosen, composite, progress)
-        settings = StitchOptions(
-            composite=composite,
-            reference=saved.images[saved.reference].name,
-            channel_order=options.channel_order,
-            workers=options.workers,
-            dry_run=options.dry_run,
-        )
-        composed, notes = compose_images(layout, Run(settings, output, progress=StageTimer(progress)), outputs)
-        sources = dict(zip(chosen.used, layout.placed.sources, strict=True))
-        result = Recomposition(
-            saved=saved,
-            sources=tuple(map(sources.get, range(len(saved.images)))),
-            matched=chosen.matched,
-            left_out=chosen.left_out,
-            placed=layout.placed,
-            messages=(
-                *([Message(mismatch)] if mismatch else []),
-                *chosen.messages,
-                *said,
-                *listed.messages,
-                *chosen.guard.messages,
-                *notes,
-            ),
-            **composed.fields,
-        )
-        if options.dry_run or output is None:
-            return result
-        page = partial(plainly_viewed, result.canvas, [source.name for source in layout.placed.sources])
-        result = replace(result, messages=(*result.messages, *write_page(result, outputs, page)))
-        outputs.write(f"{output}.json", json_bytes(applied_sidecar(result)))
+            check_outputs(image_files(check_suffix(output)), options.overwrite, [*listed.files, saved.path])
+        result = apply_found(saved, listed, output, composite or saved.composite, options, outputs, progress)
+    return replace(result, messages=(*([Message(mismatch)] if mismatch else []), *result.messages))
+
+
+def apply_found(
+    saved: SavedRegistration,
+    listed: FoundImages,
+    output: str | Path | None,
+    composite: CompositeOptions,
+    options: ApplyOptions,
+    outputs: Outputs,
+    progress: Progress,
+) -> Recomposition:
+    """The same of images that were found, into memory or among the outputs."""
+    guard = InputGuard(options.strict)
+    given = read_replacements(saved, listed.frames, options, guard, composite.max_memory)
+    if output is not None:
+        check_world_files([output], list(given.sources.values()), options.overwrite)
+    layout, composite, of_layout = _laid_out(saved, given, composite, progress)
+    settings = StitchOptions(
+        composite=composite,
+        reference=saved.images[saved.reference].name,
+        channel_order=options.channel_order,
+        workers=options.workers,
+        dry_run=options.dry_run,
+    )
+    run = Run(settings, output, progress=StageTimer(progress), guard=guard)
+    composed, of_output = compose_images(layout, run, outputs)
+    sources = dict(zip(given.sources, layout.placed.sources, strict=True))
+    result = Recomposition(
+        saved=saved,
+        sources=tuple(map(sources.get, range(len(saved.images)))),
+        matched=given.matched,
+        left_out=given.left_out,
+        placed=layout.placed,
+        messages=(*given.messages, *of_layout, *listed.messages, *guard.messages, *of_output),
+        **composed.fields,
+    )
+    if options.dry_run or output is None:
         return result
-
-
-@dataclass(frozen=True)
-class _Chosen:
-    """The given images, by the numbers of those whose places they take."""
-
-    frames: Mapping[int, Frame]
-    used: Mapping[int, Source]  # with their cameras, masks and flat field
-    left_out: Mapping[int, Message]
-    matched: MatchedBy
-    guard: InputGuard
-    messages: Sequence[Message]
-
-
-def _chosen(
-    saved: SavedRegistration, frames: Sequence[Frame], options: ApplyOptions, max_memory: int | None
-) -> _Chosen:
-    """Which of the given images take whose places, read and corrected."""
-    messages: list[Message] = []
-    stage, guard = saved.record.stage, InputGuard(options.strict)
-    if stage is not None:
-        frames, _, messages = tile_frames(frames, stage.z, stage.time)
-    chosen, matched, said = counterparts(saved, frames, options.match)
-    messages += said
-    sources, left_out = _sources(saved, chosen, guard, max_memory)
-    used = _used(saved, sources, left_out, options.mask, strict=options.strict)
-    if stage is not None and stage.pixel_um is not None:
-        used = {k: replace(s, metadata=replace(s.metadata, pixel_size=stage.pixel_um)) for k, s in used.items()}
-    if options.flat_field != "off":
-        check_size(list(used.values()))
-        corrected, said = with_flat_field(list(used.values()), options.flat_field)
-        used = dict(zip(used, corrected, strict=True))
-        messages += said
-    of_used = {index: frame for index, frame in enumerate(chosen) if index in used and frame is not None}
-    return _Chosen(of_used, used, left_out, matched, guard, messages)
+    page = partial(plainly_viewed, result.canvas, [source.name for source in sources.values()])
+    result = replace(result, messages=(*result.messages, *write_page(result, outputs, page)))
+    record = applied_sidecar(saved, result, sources, list(layout.placed.homographies), given.left_out, given.matched)
+    outputs.write(f"{output}.json", json_bytes(record))
+    return result
 
 
 def _laid_out(
-    saved: SavedRegistration, chosen: _Chosen, composite: CompositeOptions, progress: Progress
+    saved: SavedRegistration, given: Replacements, composite: CompositeOptions, progress: Progress
 ) -> tuple[Layout, CompositeOptions, list[Message]]:
     """Where the images lie, by the sidecar and the lens of their band, and how they are composed there."""
-    used = chosen.used
+    sources = given.sources
     # Channels of a microscope have their places in common, not their content.
     tiles = saved.record.stage is not None
-    lens, messages = (None, []) if tiles else _lens_of_band(saved, chosen.frames, used, progress)
+    lens, messages = (None, []) if tiles else _lens_of_band(saved, given.frames, sources, progress)
     if lens is not None:
-        used = {index: replace(source, camera=lens.camera(source.camera)) for index, source in used.items()}
-    placed, said = reoriented(_placed(saved, used, lens), composite, saved.composite)
-    if (grid := _same_grid(saved, used, composite)) is not None:
+        sources = {index: replace(source, camera=lens.camera(source.camera)) for index, source in sources.items()}
+    placed, of_turn = reoriented(_placed(saved, sources, lens), composite, saved.composite)
+    if (grid := _same_grid(saved, sources, composite)) is not None:
         placed, composite = replace(placed, grid=grid), replace(composite, crop="none")
-    return Layout.of(placed, composite), composite, [*messages, *said]
-
-
-_GEOMETRY = (
-    "scale",
-    "max_size",
-    "crop",
-    "projection",
-    "max_stretch",
-    "rotate",
-    "north_up",
-    "gsd",
-    "epsg",
-    "like",
-    "extent",
-    "georeference",
-)
-"""Options of compositing that say which pixels the output has."""
+    return Layout.of(placed, composite), composite, [*messages, *of_turn]
 
 
 def _same_grid(
@@ -359,53 +221,3 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens
         whole=saved.record.stage is not None,
         orientation=saved.orientation,
     )
-
-
-def _used(
-    saved: SavedRegistration,
-    sources: Sequence[Source | None],
-    left_out: Mapping[int, Message],
-    mask: str | Path | None,
-    *,
-    strict: bool,
-) -> dict[int, Source]:
-    """The images of the output, with their masks, by their number in the registration; at least one, or all."""
-    if strict and left_out:
-        raise PartialResultError("; ".join(map(str, merge_by_reason(left_out.values()))))
-    used = {index: source for index, source in enumerate(sources) if source is not None}
-    if not used:
-        first = next(iter(left_out.values()))
-        raise InputError(f"{saved.path}: none of its images can be used; {first.images[0]}: {first.text}")
-    return dict(zip(used, with_masks(list(used.values()), mask), strict=True))
-
-
-def _sources(
-    saved: SavedRegistration, chosen: Sequence[Frame | None], guard: InputGuard, max_memory: int | None
-) -> tuple[list[Source | None], dict[int, Message]]:
-    """The images with their cameras, and why which of those used then is not among them."""
-    sources: list[Source | None] = []
-    left_out: dict[int, Message] = {}
-    for index, (image, frame) in enumerate(zip(saved.images, chosen, strict=True)):
-        sources.append(None)
-        if image.camera is None or image.to_plane is None:
-            continue
-        if frame is None:
-            left_out[index] = left_out_message(image.path, "is not among the given images")
-            continue
-        read, unread = read_sources([frame], skip_bad=True, guard=guard, max_memory=max_memory)
-        if unread:
-            left_out[index] = unread[0]
-        else:
-            sources[-1] = replace(read[0], camera=_resized(image.camera, read[0]))
-    return sources, left_out
-
-
-def _resized(camera: Camera, source: Source) -> Camera:
-    """The registered camera for an image that shows the same at perhaps another size."""
-    (w1, h1), (w2, h2) = camera.image_size, source.metadata.size
-    # Sizes are whole pixels, so that the shape may differ by one pixel of the image.
-    if abs(w1 * h2 - h1 * w2) > max(w1, h1):
-        raise InputError(
-            f"{source.path}: has {w2} x {h2} pixels, which is not the shape of the {w1} x {h1} that were registered"
-        )
-    return camera.resized((w2, h2))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.errors import ArgumentError
-from rdstitch.inputs.find import found_images
+from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
@@ -18,16 +18,33 @@ from rdstitch.io import ImageSpec, write_strips
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.strips import Strip
 from rdstitch.io.tiff import written_strips
+from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.apply_sidecar import Recomposition, apply
-from rdstitch.pipeline.recipes import mosaic
+from rdstitch.pipeline.apply_sidecar import apply_found
+from rdstitch.pipeline.read_inputs import with_camera_read
+from rdstitch.pipeline.recipes import stitch_found
+from rdstitch.pipeline.recomposition import Recomposition
+from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
+from rdstitch.sidecar.read import read_sidecar
+from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_outputs
-from rdstitch.system.progress import Progress, silent
+from rdstitch.system.progress import Progress, StageTimer, silent
 
 
+def parse_bands(text: str) -> dict[str, str]:
+    """Patterns of images by the names of bands, of ``NIR=*_NIR.TIF,RED=*_RED.TIF``."""
+    pairs = [part.partition("=") for part in text.split(",")]
+    bands = {name.strip(): pattern.strip() for name, _, pattern in pairs}
+    complete = len(bands) == len(pairs) > 1 and all(bands) and all(bands.values())
+    if not complete or {"/", "\\"} & set("".join(bands)):
+        raise ArgumentError(f"--bands: {text!r} is not a list like NIR=*_NIR.TIF,RED=*_RED.TIF")
+    return bands
+
+
+@one_native_thread()
 def mosaic_bands(
     inputs: Images,
     output: str | Path,
@@ -44,33 +61,38 @@ def mosaic_bands(
     it alone. ``field.tif`` has all bands, with their names; ``field-NIR.tif`` and so on one each. Formats that hold
     no number of bands have only the latter. Given are the first band, and the others, each by its own lens.
     """
-    options, file = options or StitchOptions(), Path(output)
+    options, file = with_camera_read(options or StitchOptions()), Path(output)
     if options.dry_run:
         raise ArgumentError("bands have no plan before the first of them is registered: leave out dry_run")
     files = [file.with_name(f"{file.stem}-{name}{file.suffix}") for name in bands]
-    with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
+    with (
+        found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed,
+        Outputs(options.overwrite) as outputs,  # all are published together
+    ):
         stack = [file] if file.suffix.lower() in (".tif", ".tiff") else []
         check_outputs([*files, *stack], options.overwrite, listed.files)
         frames = selected(listed.frames, options.exclude, options.include_only)
         chosen = [_of_band(frames, pattern) for pattern in bands.values()]
         options = replace(options, exclude=(), include_only=())
         _check_alike(dict(zip(bands, chosen, strict=True)), in_one_file=bool(stack))
-        first = mosaic(chosen[0], files[0], options, progress=progress, beside=beside)
+        run = Run(options, files[0], beside, StageTimer(progress))
+        first = stitch_found(replace(listed, frames=chosen[0]), run, outputs, files[1:])
+        registered = outputs.staged(f"{files[0]}.json")
+        assert registered is not None
+        saved = replace(read_sidecar(registered), path=Path(f"{files[0]}.json"))
+        same = ApplyOptions(
+            mask=options.mask,
+            overwrite=options.overwrite,
+            workers=options.workers,
+            strict=options.strict,
+            channel_order=options.channel_order,
+        )
         others = tuple(
-            apply(
-                f"{files[0]}.json",
-                band,
-                name,
-                mask=options.mask,
-                overwrite=options.overwrite,
-                workers=options.workers,
-                strict=options.strict,
-                progress=progress,
-            )
+            apply_found(saved, FoundImages(band, []), name, saved.composite, same, outputs, progress)
             for band, name in zip(chosen[1:], files[1:], strict=True)
         )
         if stack:
-            _write_stack(file, dict(zip(bands, files, strict=True)), first, overwrite=options.overwrite)
+            _stage_stack(file, dict(zip(bands, files, strict=True)), first, outputs)
             first = first.with_messages([Message(f"{file} has all bands: {', '.join(bands)}", severity="note")])
     return first, others
 
@@ -95,14 +117,14 @@ def _check_alike(bands: Mapping[str, list[Frame]], *, in_one_file: bool) -> None
         raise ArgumentError(f"{text}; convert the images of one of them, or stitch them separately")
 
 
-def _write_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, *, overwrite: bool) -> None:
-    """One file of all bands; what one of them does not show is transparent."""
+def _stage_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, outputs: Outputs) -> None:
+    """One file of all bands, which are staged; what one of them does not show is transparent."""
 
     def joined(parts: Sequence[Strip]) -> Strip:
         alphas = [alpha for _, alpha in parts if alpha is not None]
         return np.concatenate([samples for samples, _ in parts], axis=2), reduce(np.minimum, alphas) if alphas else None
 
-    streams = [written_strips(path) for path in bands.values()]
+    streams = [written_strips(outputs.staged(path) or path) for path in bands.values()]
     heads = [next(stream) for stream in streams]
     names: list[str] = []
     for name, (samples, _) in zip(bands, heads, strict=True):
@@ -112,8 +134,7 @@ def _write_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, *, 
     layout = ImageSpec(first.canvas.size, len(names), heads[0][0].dtype, transparent=True, metadata=metadata)
     tags = [] if first.georeference is None else first.georeference.tiff_tags()
     strips = map(joined, chain([heads], zip(*streams, strict=True)))
-    with Outputs(overwrite) as outputs:
-        write_strips(file, layout, strips, tags, outputs=outputs)
+    write_strips(file, layout, strips, tags, outputs=outputs)
 
 
 def _of_band(frames: Sequence[Frame], pattern: str) -> list[Frame]:

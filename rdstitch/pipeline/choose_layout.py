@@ -72,7 +72,7 @@ class _Trials:
         laid_out = lay_out(whole, local, options.composite)
         if options.dry_run:
             return laid_out
-        return replace(laid_out, layout=laid_out.layout.decided(options.composite, options.threads))
+        return replace(laid_out, layout=laid_out.layout.decided(options.compositing))
 
     def attempt(self, registration: Registration) -> LaidOut | None:
         """The same of an alternative; None where it has no canvas, or none that the options can turn."""
@@ -150,7 +150,8 @@ def _other_surface(registration: Registration, first: LaidOut, trials: _Trials, 
     other = by_second_motions(registration, broken, aligner)
     if other is None or not _joins(other, registration, _MISFIT * _error(registration)):
         return None
-    laid_out = trials.attempt(other)
+    reason = f"{other.alignment.model_reason}; by another surface of the scene, where seams break less"
+    laid_out = trials.attempt(replace(other, alignment=replace(other.alignment, model_reason=reason)))
     if laid_out is None or laid_out.layout.seams.fills < first.layout.seams.fills:
         return None
     return laid_out

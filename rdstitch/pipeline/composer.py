@@ -15,7 +15,7 @@ from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.native_threads import one_native_thread
 
 if TYPE_CHECKING:
-    from rdstitch.pipeline.apply_sidecar import Recomposition
+    from rdstitch.pipeline.recomposition import Recomposition
 
 
 class Composer:

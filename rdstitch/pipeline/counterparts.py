@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -19,10 +18,9 @@ from rdstitch.io.metadata import read_metadata
 from rdstitch.io.opening import check_readable
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.sidecar.read import SavedRegistration
-from rdstitch.sidecar.records import ImageRecord
+from rdstitch.sidecar.records import ImageRecord, MatchedBy
 from rdstitch.system.file_access import canonical_name, canonical_text
 
-MatchedBy = Literal["name", "time", "position", "order"]
 _TOKEN = re.compile(r"\d+|[^\W\d_]+|[\W_]+")
 
 Chosen = list[Frame | None]

@@ -14,13 +14,14 @@ import numpy as np
 
 from rdstitch.arrays import IntArray
 from rdstitch.errors import InputError
-from rdstitch.executors import batches, in_order
+from rdstitch.executors import batches
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, detect, detect_view
 from rdstitch.features.prepared_image import Stretch, common_stretch, halving, usual_stretch
-from rdstitch.inputs.input_guard import GuardState
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
 from rdstitch.options.feature_options import CLOSER
+from rdstitch.pipeline.run_on_sources import run_on_sources
 from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import reuse_freed_memory
 from rdstitch.system.progress import Progress
@@ -48,6 +49,7 @@ def detect_features(
     options: FeatureOptions,
     executor: Executor,
     store: Cache,
+    guard: InputGuard,
     *,
     skip_bad: bool,
     progress: Progress,
@@ -57,15 +59,15 @@ def detect_features(
     They lie in ``store``; with ``skip_bad`` damaged images are reported instead of raised.
     """
     results: list[StoredFeatures | InputError] = []
-    run = partial(detect_batch, options=options, store=store)
-    for batch, notes in in_order(executor, run, batches(sources, _IMAGES_AT_ONCE, _MIN_BATCHES)):
-        sources[0].guard.merge(notes)
+    of_batch = partial(detect_batch, options=options, store=store)
+    tasks = ((of_batch, batch) for batch in batches(sources, _IMAGES_AT_ONCE, _MIN_BATCHES))
+    for batch in run_on_sources(executor, tasks, guard):
         errors = [result for result in batch if isinstance(result, InputError)]
         if errors and not skip_bad:
             raise errors[0]
         for result in batch:
             if isinstance(result, InputError):
-                sources[0].guard.unreadable[sources[len(results)].path] = str(result)
+                guard.unreadable[sources[len(results)].path] = str(result)
             results.append(result)
         progress("detecting features", len(results), len(sources))
     return DetectedFeatures(
@@ -82,15 +84,15 @@ def detect_features(
 
 def detect_batch(
     sources: Sequence[Source], *, options: FeatureOptions, store: Cache
-) -> tuple[list[StoredFeatures | InputError], GuardState]:
-    """The features of each image, or why it cannot be read; and what was noticed of the files."""
+) -> list[StoredFeatures | InputError]:
+    """The features of each image, or why it cannot be read."""
     detected: list[StoredFeatures | InputError] = []
     for source in sources:
         try:
             detected.append(_detected(source, options, store))
         except InputError as error:
             detected.append(error)
-    return detected, sources[0].guard.state_of([source.path for source in sources])
+    return detected
 
 
 def _detected(source: Source, options: FeatureOptions, store: Cache) -> StoredFeatures:
@@ -120,15 +122,17 @@ def detect_by_contrast(
     options: FeatureOptions,
     executor: Executor,
     store: Cache,
+    guard: InputGuard,
     *,
     skip_bad: bool,
     progress: Progress,
 ) -> DetectedFeatures:
     """Detect the features of all images, if necessary once more; see :func:`detect_features`."""
     reuse_freed_memory()
-    detect = partial(detect_features, executor=executor, store=store, skip_bad=skip_bad, progress=progress)
+    detect = partial(detect_features, executor=executor, store=store, guard=guard, skip_bad=skip_bad, progress=progress)
+    stretch_of = partial(_stretch_of, options=options, executor=executor, store=store, guard=guard)
     depths = {source.metadata.bit_depth > 8 for source in sources}
-    stretch = options.stretch or (_stretch_of(sources, options, executor, store) if depths == {True} else None)
+    stretch = options.stretch or (stretch_of(sources) if depths == {True} else None)
     options = replace(options, stretch=stretch)
     detected = detect(sources, options)
     # Samples of two kinds have no grey levels in common: each image is stretched on its own.
@@ -139,7 +143,7 @@ def detect_by_contrast(
     most = 2 * len(poor) >= len(sources) - len(detected.damaged)
     chosen = all_of_them if most else tuple(poor)
     wanted = [sources[k] for k in chosen]
-    common = options.stretch or _stretch_of(wanted, options, executor, store)
+    common = options.stretch or stretch_of(wanted)
     again = detect(wanted, replace(options, stretch=common, equalize=True))
     if np.median(_shown(again.features.items)) <= np.median(_shown(detected.features.items)[list(chosen)]):
         return detected
@@ -170,19 +174,17 @@ def _shown(features: Sequence[StoredFeatures]) -> IntArray:
     return np.array([item.shown for item in features], dtype=np.intp)
 
 
-def _stretch_of(sources: Sequence[Source], options: FeatureOptions, executor: Executor, store: Cache) -> Stretch | None:
+def _stretch_of(
+    sources: Sequence[Source], *, options: FeatureOptions, executor: Executor, store: Cache, guard: InputGuard
+) -> Stretch | None:
     """The stretch that suits all images together."""
-    stretches = []
-    for stretch, notes in in_order(
-        executor, partial(_stretch_of_one, megapixels=options.limits[1], store=store), sources
-    ):
-        sources[0].guard.merge(notes)
-        stretches.append(stretch)
-    return common_stretch(stretches)
+    of_one = partial(_stretch_of_one, megapixels=options.limits[1], store=store)
+    return common_stretch(list(run_on_sources(executor, ((of_one, [source]) for source in sources), guard)))
 
 
-def _stretch_of_one(source: Source, *, megapixels: float | None, store: Cache) -> tuple[Stretch | None, GuardState]:
-    """The stretch of an image, None for one that cannot be read; and what was noticed of its file."""
+def _stretch_of_one(sources: Sequence[Source], *, megapixels: float | None, store: Cache) -> Stretch | None:
+    """The stretch of an image, None for one that cannot be read."""
+    (source,) = sources
 
     def compute() -> Stretch | None:
         try:
@@ -190,5 +192,4 @@ def _stretch_of_one(source: Source, *, megapixels: float | None, store: Cache) -
         except InputError:  # left out, or reported, by the detection
             return None
 
-    inputs = (source.content(store), source.mask_content(store), megapixels)
-    return store.recall("stretches", inputs, compute), source.guard.state_of([source.path])
+    return store.recall("stretches", (source.content(store), source.mask_content(store), megapixels), compute)

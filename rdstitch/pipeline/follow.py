@@ -2,180 +2,38 @@
 
 import math
 import sys
-import time
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from rdstitch.arrays import FloatArray
-from rdstitch.choices import TrajectoryFrame
 from rdstitch.errors import InputError
 from rdstitch.executors import ProcessExecutor
-from rdstitch.export.trajectory_files import covariance_in_frame, in_frame, ros_covariance
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.inputs.attitudes import XMP, with_attitudes
 from rdstitch.inputs.delays import MeasuredTilt
 from rdstitch.inputs.frame import Frame, Image, as_inputs
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.odometry import BodyPose, Odometry, read_odometry
-from rdstitch.inputs.selection import is_selected, mask_of, with_masks
+from rdstitch.inputs.selection import is_selected, with_masks
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import time_of, timestamps_of
 from rdstitch.io.opening import check_readable
-from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import alignment_options
-from rdstitch.pipeline.read_inputs import read_frames
+from rdstitch.pipeline.live_preview import LivePreview
+from rdstitch.pipeline.pose import FollowedPoses, Pose
+from rdstitch.pipeline.read_inputs import read_frames, with_camera_read
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message
-from rdstitch.tracking import Preview, Tracked, TrackingOptions
-from rdstitch.tracking import Tracker as FrameTracker
+from rdstitch.tracking import FrameTracker, Tracked, TrackingOptions
 
 _FEATURES = 600  # of a frame, that suffice to follow it
 _MEGAPIXELS = 0.1  # 10⁶ pixels in which they are detected: a frame of 640 x 480 pixels is halved once
-_PREVIEW_MEGAPIXELS = 0.08
-
-
-@dataclass(frozen=True)
-class FollowedPoses:
-    """How poses are printed: as :func:`rdstitch.trajectory` writes them.
-
-    Attributes
-    ----------
-    height : float, optional
-        Of the first keyframe above the plane, in the unit that positions shall have; else as odometry says, or 1.
-    frame : str
-        "enu", "ros" or "camera", see :mod:`rdstitch.export.trajectory_files`.
-    """
-
-    height: float | None = None
-    frame: TrajectoryFrame = "enu"
-
-
-@dataclass(frozen=True)
-class Pose:
-    """What is known of one frame when it has arrived; false where that is no place.
-
-    Attributes
-    ----------
-    name : str
-    number : int
-        In the video, camera or stream that it comes from, else in the order of arrival.
-    timestamp : float
-        s; NaN where not known.
-    tracked : Tracked
-        Its place and λ, as far as they are known.
-    reason : str
-        Why there is no place; empty where there is one.
-    poses : FollowedPoses
-        How the pose is printed.
-    messages : tuple of Message
-        What the user should know, and what this frame has shown.
-    """
-
-    name: str
-    number: int
-    timestamp: float
-    tracked: Tracked = field(default_factory=Tracked)
-    reason: str = ""
-    poses: FollowedPoses = FollowedPoses()
-    messages: tuple[Message, ...] = ()
-
-    def __bool__(self) -> bool:
-        return self.tracked.pose is not None
-
-    @property
-    def unit(self) -> float:
-        """How long the height of the first keyframe is: as given, else as odometry says, else one."""
-        return self.poses.height or (self.tracked.unit if math.isfinite(self.tracked.unit) else 1.0)
-
-    @property
-    def length_std(self) -> float:
-        """Relative standard deviation that all lengths share, by the focal length; NaN where it is not known."""
-        by_odometry = not self.poses.height and math.isfinite(self.tracked.unit)
-        return self.tracked.unit_std if by_odometry else self.tracked.length_std
-
-    @property
-    def position(self) -> tuple[float, float, float] | None:
-        """X, y and height above the plane, in the frame and unit of the tracker; None where there is no place."""
-        if (pose := self.tracked.pose) is None:
-            return None
-        return *in_frame(pose.x * self.unit, pose.y * self.unit, self.poses.frame), pose.height * self.unit
-
-    @property
-    def yaw(self) -> float | None:
-        """Heading, radians, counterclockwise as seen from above; None where there is no place."""
-        return None if self.tracked.pose is None else self.tracked.pose.yaw
-
-    @property
-    def covariance(self) -> FloatArray | None:
-        """Of x, y, height and yaw, (4, 4), in the frame and unit of the tracker and radians; None where not known.
-
-        Relative to the first keyframe, with the growth of the errors from keyframe to keyframe and the scale that all
-        share.
-        """
-        known = self._covariance
-        return None if known is None else covariance_in_frame(known, self.poses.frame)
-
-    @property
-    def ros_covariance(self) -> FloatArray | None:
-        """The same as messages of ROS have it, (6, 6); see :func:`rdstitch.export.trajectory_files.ros_covariance`."""
-        known = self._covariance
-        return None if known is None else ros_covariance(known, self.poses.frame)
-
-    @property
-    def _covariance(self) -> FloatArray | None:
-        """In the axes of the first image."""
-        if (pose := self.tracked.pose) is None or self.tracked.covariance is None:
-            return None
-        place, unit = np.array([pose.x, pose.y, 0.0, 0.0]), np.array([self.unit] * 3 + [1.0])
-        shared = 0.0 if math.isnan(self.length_std) else self.length_std
-        return np.asarray((self.tracked.covariance + shared**2 * np.outer(place, place)) * np.outer(unit, unit))
-
-    @property
-    def map(self) -> int | None:
-        """Number of the map that the pose belongs to: those of different maps have nothing in common."""
-        return self.tracked.map_number
-
-    @property
-    def quality(self) -> float:
-        """Share of the matches that agree, 0 to 1."""
-        return self.tracked.quality if self else 0.0
-
-    def as_dict(self) -> dict[str, Any]:
-        """As a line of JSON takes it; null for what is not known."""
-        tracked, covariance = self.tracked, self.ros_covariance
-        x, y, height = self.position or (None, None, None)
-        return {
-            "name": self.name,
-            "frame": self.number,
-            "timestamp": _known(self.timestamp),
-            "x": x,
-            "y": y,
-            "yaw_deg": None if self.yaw is None else math.degrees(self.yaw),
-            "yaw": self.yaw,
-            "height": height,
-            "covariance": None if covariance is None else covariance.ravel().tolist(),
-            "length_std": _known(self.length_std),
-            "quality": self.quality,
-            "homography": None if tracked.placement is None else tracked.placement.homography.tolist(),
-            "lambda": _known(tracked.distortion),
-            "lambda_std": _known(tracked.distortion_std),
-            "lambda_known": tracked.distortion_known,
-            "map": tracked.map_number,
-            "keyframe": tracked.keyframe,
-            "inliers": tracked.inliers,
-            "revised": tracked.revised,
-            "reason": self.reason,
-            "messages": [str(message) for message in self.messages],
-        }
 
 
 def follow(
@@ -186,7 +44,7 @@ def follow(
     comes_again: Callable[[Frame], bool] = lambda frame: False,
     preview: Path | None = None,
     refresh: float = 5.0,
-) -> Iterator[Pose]:
+) -> Generator[Pose]:
     """Register frames as they arrive, against the last keyframes.
 
     Poses are for watching: loops are closed, and every pair is used, only when all frames are registered together
@@ -197,7 +55,7 @@ def follow(
     place, or another one, only later.
     """
     tracker = Tracker(options, poses, patient=True)
-    sketch = None if preview is None else _Sketch(preview, refresh)
+    live_preview = None if preview is None else LivePreview(preview, refresh)
     numbers = count()
     unread: dict[Path, int] = {}  # numbers of frames that come again
     for arrived in frames:
@@ -213,12 +71,12 @@ def follow(
         poses_of_frame = tracker.register(frame, source, image, reason)
         yield from poses_of_frame
         if source is not None:
-            if sketch is not None:
-                sketch.add(source, poses_of_frame[-1].tracked)
+            if live_preview is not None:
+                live_preview.add(source, poses_of_frame[-1].tracked)
             source.decoded_images.clear()
     yield from tracker.finish()
-    if sketch is not None:
-        sketch.write()
+    if live_preview is not None:
+        live_preview.write()
 
 
 class Tracker:
@@ -248,7 +106,7 @@ class Tracker:
     def __init__(
         self, options: StitchOptions | None = None, poses: FollowedPoses | None = None, *, patient: bool = False
     ) -> None:
-        self._options, self._poses = options or StitchOptions(), poses or FollowedPoses()
+        self._options, self._poses = with_camera_read(options or StitchOptions()), poses or FollowedPoses()
         self._detection = _live_features(self._options.features)
         self._megapixels = self._detection.limits[1]
         given = self._options.odometry
@@ -270,7 +128,7 @@ class Tracker:
         self._labels: dict[int, Pose] = {}  # of the frames that may still find their place
         self._numbers = count()
         self.revised: tuple[Pose, ...] = ()
-        self._told = 0  # messages that poses had
+        self._reported = 0  # messages that poses had
 
     @property
     def messages(self) -> tuple[Message, ...]:
@@ -321,7 +179,7 @@ class Tracker:
         options, features = self._options, self._detection
         if options.timestamps is not None and (time := time_of(frame, options.timestamps)) is not None:
             frame = replace(frame, timestamp=time)
-        sources, unread = read_frames([frame], options, skip_bad=True)
+        sources, unread = read_frames([frame], options, InputGuard(options.strict), skip_bad=True)
         if not sources:
             return None, None, unread[0].text
         source, megapixels = replace(sources[0], attitude=attitude and MeasuredTilt(attitude)), self._megapixels
@@ -333,10 +191,9 @@ class Tracker:
             return source, None, str(error)
 
     def _measured(self, source: Source) -> list[Source]:
-        """The frame with its mask and attitude; of a folder of masks not every frame needs one."""
+        """The frame with its mask and attitude."""
         options = self._options
-        if options.mask is None or not Path(options.mask).is_dir() or mask_of(source, options.mask) is not None:
-            source = with_masks([source], options.mask)[0]
+        (source,) = with_masks([source], options.mask, all_known=False)
         return [source] if source.attitude is not None else with_attitudes([source], options.attitude)
 
     def register(
@@ -367,35 +224,12 @@ class Tracker:
 
     def _poses_of(self, results: Sequence[Tracked]) -> list[Pose]:
         poses = [replace(self._labels[result.number], tracked=result, reason=result.reason) for result in results]
-        told, self._told = self._frames.messages[self._told :], len(self._frames.messages)
+        new, self._reported = self._frames.messages[self._reported :], len(self._frames.messages)
         if poses:
-            poses[-1] = replace(poses[-1], messages=tuple(told))
+            poses[-1] = replace(poses[-1], messages=tuple(new))
         revisable = self._frames.revisable
         self._labels = {number: known for number, known in self._labels.items() if number in revisable}
         return poses
-
-
-class _Sketch:
-    """The preview and its file."""
-
-    def __init__(self, file: Path, refresh: float) -> None:
-        self._file, self._refresh, self._preview = file, refresh, Preview()
-        self._written, self._changed = -math.inf, False
-
-    def add(self, source: Source, result: Tracked) -> None:
-        """Paint a keyframe; write the file when that is due."""
-        if result.keyframe and result.placement is not None:
-            image = source.read(source.reduction(_PREVIEW_MEGAPIXELS))
-            self._preview.paint(image.pixels, result.placement)
-            self._changed = True
-        if time.monotonic() - self._written >= self._refresh:
-            self.write()
-
-    def write(self) -> None:
-        """Replace the file, if there is anything new."""
-        if self._changed:
-            write_image(self._file, self._preview.pixels, overwrite=True)
-            self._written, self._changed = time.monotonic(), False
 
 
 def _live_features(options: FeatureOptions) -> FeatureOptions:
@@ -412,7 +246,3 @@ def _features(options: FeatureOptions, image: PreparedImage) -> Features:
     """Of a frame, in its pixels."""
     mask = None if image.clearance is None else image.clearance > 0.0
     return detect_view(lambda _: View(image.grey, mask), options)
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,10 +12,10 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
-from rdstitch.executors import in_order
-from rdstitch.inputs.input_guard import GuardState
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import mean_of_channels
+from rdstitch.pipeline.run_on_sources import run_on_sources
 from rdstitch.system.cache import Cache
 
 _IMAGES = 5  # looked at, from all parts of the sequence: what is dark in their mean is dark in each
@@ -33,7 +34,7 @@ class Circle:
 
 
 def with_image_circle(
-    sources: Sequence[Source], executor: Executor, store: Cache, megapixels: float | None
+    sources: Sequence[Source], executor: Executor, store: Cache, guard: InputGuard, megapixels: float | None
 ) -> list[Source]:
     """Give the cameras their image circle where the images show one; given lenses stay."""
     given = any(any(source.camera.coefficients) or source.camera.image_circle for source in sources)
@@ -44,10 +45,9 @@ def with_image_circle(
         return list(sources)
 
     def compute() -> Circle | None:
-        seen = []
-        for grey, notes in in_order(executor, _grey_of, [(source, megapixels) for source in chosen]):
-            sources[0].guard.merge(notes)
-            seen += [] if grey is None else [grey]
+        grey_of = partial(_grey_of, megapixels=megapixels)
+        read = run_on_sources(executor, ((grey_of, [source]) for source in chosen), guard)
+        seen = [grey for grey in read if grey is not None]
         circle = find_circle(np.mean(seen, axis=0)) if seen else None
         if circle is None:
             return None
@@ -66,15 +66,13 @@ def with_image_circle(
     ]
 
 
-def _grey_of(task: tuple[Source, float | None]) -> tuple[NDArray[np.float32] | None, GuardState]:
-    """Grey levels of a small version of an image, None where it cannot be read; and what was noticed of its file."""
-    source, megapixels = task
-    notes = source.guard.state_of
+def _grey_of(sources: Sequence[Source], *, megapixels: float | None) -> NDArray[np.float32] | None:
+    """Grey levels of a small version of an image, None where it cannot be read."""
     try:
-        pixels = source.view(megapixels).image
+        pixels = sources[0].view(megapixels).image
     except InputError:  # left out, or reported, by the detection
-        return None, notes([source.path])
-    return mean_of_channels(pixels.astype(np.float32)), notes([source.path])
+        return None
+    return mean_of_channels(pixels.astype(np.float32))
 
 
 def find_circle(grey: NDArray[np.float32]) -> Circle | None:

@@ -15,22 +15,22 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.export.trajectory_files import AXES
+from rdstitch.io import ImageSpec, write_strips
+from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image
-from rdstitch.io.write import write_image
-from rdstitch.pipeline.result_files import make_folder
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.system.outputs import check_outputs, text_bytes, write_bytes_atomic
+from rdstitch.system.outputs import Outputs, text_bytes
 
 
-def write_map(result: StitchResult, folder: str | Path, height: float, *, overwrite: bool = False) -> list[Path]:
-    """Write ``map.yaml`` and ``map.png`` of a mosaic that was written, in metres by the height of the first image.
+def write_map(result: StitchResult, folder: Path, height: float, outputs: Outputs) -> None:
+    """Stage ``map.yaml`` and ``map.png`` of a mosaic that was written, in metres by the height of the first image.
 
     Raises ArgumentError where the images have no metric poses.
     """
-    files = map_files(Path(folder), overwrite=overwrite)
+    description, map_image = map_files(folder)
     to_metres = _pixel_to_metres(result, height)
     assert result.output is not None
-    image = read_image(result.output)
+    image = read_image(outputs.staged(result.output) or result.output)
     grey = image.pixels if image.pixels.ndim == 2 else cv2.cvtColor(image.pixels[..., :3], cv2.COLOR_RGB2GRAY)
     if grey.dtype != np.uint8:
         low, high = float(grey.min()), float(grey.max())
@@ -46,9 +46,11 @@ def write_map(result: StitchResult, folder: str | Path, height: float, *, overwr
     to_map = np.array([[1.0, 0.0], [0.0, -1.0]]) @ np.column_stack([to_metres[:, :2], to_metres[:, 2] - origin])
     to_map = to_map / resolution + np.array([[0.0, 0.0, -0.5], [0.0, 0.0, length - 0.5]])
     shown = [cv2.warpAffine(layer, to_map, (width, length), flags=cv2.INTER_LINEAR) for layer in (grey, alpha)]
-    write_image(files[1], np.asarray(shown[0], np.uint8), np.asarray(shown[1], np.uint8), overwrite=overwrite)
+    grey, alpha = (np.asarray(layer, np.uint8) for layer in shown)
+    spec = ImageSpec((width, length), 1, grey.dtype, transparent=True, metadata=Metadata((width, length)))
+    write_strips(map_image, spec, [(grey[..., None], alpha)], outputs=outputs)
     fields = {
-        "image": files[1].name,
+        "image": map_image.name,
         "mode": "scale",
         "resolution": resolution,
         "origin": [*origin.tolist(), 0.0],
@@ -57,16 +59,20 @@ def write_map(result: StitchResult, folder: str | Path, height: float, *, overwr
         "free_thresh": 0.196,
     }
     lines = "".join(f"{name}: {json.dumps(value)}\n" for name, value in fields.items())
-    write_bytes_atomic(files[0], text_bytes(lines))
-    return files
+    outputs.write(description, text_bytes(lines))
 
 
-def map_files(folder: Path, *, overwrite: bool) -> list[Path]:
-    """The two files of a map, once it is clear that they can be written; makes their folder."""
-    files = [folder / "map.yaml", folder / "map.png"]
-    make_folder(folder)
-    check_outputs(files, overwrite)
-    return files
+def map_files(folder: Path) -> list[Path]:
+    """The description and the image of a map."""
+    return [folder / "map.yaml", folder / "map.png"]
+
+
+def check_map_server(output: Path, height: float | None) -> None:
+    """Refuse an output of which no map can be made."""
+    if (suffix := output.suffix.lower()) in (".dzi", ".zarr"):
+        raise ArgumentError(f"--map-server is made from the output: write .png, .jpg or .tif instead of {suffix}")
+    if height is None:
+        raise ArgumentError("--map-server is in metres: give the height of the first image's camera with --height")
 
 
 def _pixel_to_metres(result: StitchResult, height: float) -> FloatArray:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.pipeline.compose import image_files
+from rdstitch.pipeline.map_server import check_map_server, map_files, write_map
 from rdstitch.pipeline.result_files import layer_files, make_folder, poses_file, write_layers
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
@@ -14,9 +15,13 @@ from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, text_bytes
 
 
-def files_beside(beside: FilesBeside, names: Iterable[str]) -> list[Path]:
-    """All files beside the result of images of these names; makes the folder of the layers."""
+def files_beside(beside: FilesBeside, output: Path | None, names: Iterable[str]) -> list[Path]:
+    """All files beside the output of images of these names; makes the folders of the layers and of the map."""
     files = [file for file in (beside.report, beside.hugin_project, beside.poses) if file is not None]
+    if beside.map_server is not None and output is not None:
+        check_map_server(output, beside.height)
+        make_folder(beside.map_server)
+        files += map_files(beside.map_server)
     if beside.layers is not None:
         make_folder(beside.layers)
         files += layer_files(list(names), beside.layers)
@@ -38,6 +43,7 @@ def stage_beside(run: Run, outputs: Outputs, result: StitchResult | Registration
         attempt(beside.hugin_project, lambda file: _hugin_project(file, outputs, result))
         table = partial(poses_file, result, frame=beside.frame, height=beside.height or 1.0)
         attempt(beside.poses, lambda file: outputs.write(file, text_bytes(table(file))))
+        attempt(beside.map_server, lambda folder: write_map(result, folder, beside.height or 1.0, outputs))
         attempt(beside.layers, lambda folder: write_layers(result, folder, **how, outputs=outputs))
     return failed
 
@@ -82,5 +88,5 @@ def check_run(
 
         format_of(options.save_camera, options.camera_format)
         files.append(options.save_camera)
-    files += [*others, *files_beside(run.beside, names)]
+    files += [*others, *files_beside(run.beside, None if run.output is None else Path(run.output), names)]
     check_outputs(files, options.overwrite, [*inputs, *options.files])

@@ -11,7 +11,7 @@ from rdstitch.inputs.ground_control import with_ground_control
 from rdstitch.inputs.image_folders import natural_key
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.positions import with_positions
-from rdstitch.inputs.rosbag import camera_in_bag, is_bag
+from rdstitch.inputs.rosbag import camera_in, camera_in_bag, is_bag
 from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.flat_field import read_flat_field
@@ -37,8 +37,15 @@ def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
     return sorted(frames, key=lambda frame: (natural_key(frame.path), frame.number or 0))
 
 
+def with_camera_read(options: StitchOptions) -> StitchOptions:
+    """Options with the camera itself, where they name its file."""
+    file = options.camera
+    return replace(options, camera=camera_in(file)) if isinstance(file, str | Path) else options
+
+
 def with_camera_in_bag(inputs: Iterable[Named], options: StitchOptions) -> tuple[StitchOptions, list[Message]]:
-    """Options with the calibration that a ROS bag has of its camera, where no lens is given; and that it is used."""
+    """Options with the camera that they name; without one, with that of a ROS bag, and the message that it is used."""
+    options = with_camera_read(options)
     named = [Path(item) for item in inputs if not isinstance(item, Frame)]
     if options.known_distortion is not None or len(named) != 1 or not is_bag(named[0]):
         return options, []
@@ -51,28 +58,28 @@ def with_camera_in_bag(inputs: Iterable[Named], options: StitchOptions) -> tuple
 
 
 def read_frames(
-    frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool
+    frames: Sequence[Frame], options: StitchOptions, guard: InputGuard, *, skip_bad: bool
 ) -> tuple[list[Source], list[Message]]:
     """The images of frames, with what options say of their camera; and why others cannot be read."""
     return read_sources(
         frames,
-        camera=options.camera,
+        camera=options.known_camera,
         focal=options.focal,
         distortion=options.distortion,
         skip_bad=skip_bad,
-        guard=InputGuard(options.strict),
+        guard=guard,
         max_memory=options.composite.max_memory,
     )
 
 
 def read_inputs(
-    frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool
+    frames: Sequence[Frame], options: StitchOptions, guard: InputGuard, *, skip_bad: bool
 ) -> tuple[list[Source], list[Message]]:
     """The images that options leave, with what was measured of them; and why others cannot be read."""
     # Before the first large image is freed.
     return_freed_memory()
     chosen = selected(frames, options.exclude, options.include_only)
-    sources, unread = read_frames(chosen, options, skip_bad=skip_bad)
+    sources, unread = read_frames(chosen, options, guard, skip_bad=skip_bad)
     if len(sources) < 2:
         if unread:
             few = "" if len(chosen) == 1 else "fewer than two images can be read; "

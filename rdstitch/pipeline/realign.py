@@ -26,6 +26,11 @@ def aligner_of(registration: Registration, options: StitchOptions, purpose: Purp
     return replace(aligner, needs_poses=purpose.poses)
 
 
+def with_reference_of(registration: Registration, aligner: Aligner) -> Registration:
+    """The pairs of a registration aligned anew, in the frame of the reference image of the aligner."""
+    return _aligned_anew(registration, aligner.align(registration.pairs), aligner, {})
+
+
 def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Alignment], bool]) -> Registration | None:
     """The images that are used aligned by another aligner; None where a draft is not wanted."""
     try:

@@ -6,29 +6,33 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.errors import RegistrationError
-from rdstitch.export.odometry_bag import check_bag, write_bag, write_bag_folder
-from rdstitch.export.trajectory_files import WRITERS, frame_of, has_times, path_as_svg
+from rdstitch.export.odometry_bag import check_bag
+from rdstitch.export.trajectory_files import has_times, path_as_svg
+from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.times import timestamps_of, with_times
+from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept, scale_uncertainty
-from rdstitch.pipeline.along_odometry import along_odometry, with_odometry_of_bag
+from rdstitch.pipeline.along_odometry import with_odometry_of_bag
+from rdstitch.pipeline.camera_path import camera_path
 from rdstitch.pipeline.choose_layout import choose_layout
-from rdstitch.pipeline.compose import blocks_on, check_world_files, compose_images, viewed_images, write_page
+from rdstitch.pipeline.compose import check_world_files, compose_images
+from rdstitch.pipeline.deep_zoom_page import viewed_images, write_page
 from rdstitch.pipeline.lay_out import LaidOut
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.output_plan import check_run, report_refused, stage_beside
-from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag
-from rdstitch.pipeline.realign import aligner_of
+from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag, with_camera_read
+from rdstitch.pipeline.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.register import register
+from rdstitch.pipeline.remote_blocks import blocks_on
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
@@ -150,21 +154,17 @@ def _stitch(inputs: Images, every: int | None, run: Run) -> StitchResult:
 def stitch_found(listed: FoundImages, run: Run, outputs: Outputs, further: Sequence[Path] = ()) -> StitchResult:
     """The same of images that were found; ``further`` are images that may follow."""
     options = run.options
+    run = replace(run, guard=InputGuard(options.strict))
     frames = in_lasting_order(with_times(listed.frames, options.timestamps))
     names = [frame.name for frame in selected(frames, options.exclude, options.include_only)]
     check_run(run, listed.files, names, further)
-    sources, unread = read_inputs(frames, options, skip_bad=run.purpose is not Purpose.PANO)
+    sources, unread = read_inputs(frames, options, run.guard, skip_bad=run.purpose is not Purpose.PANO)
     check_world_files([*([] if run.output is None else [run.output]), *further], sources, options.overwrite)
     check_map(sources, options.composite)
     if run.beside.frame == "first":
         run = replace(run, options=replace(options, reference=sources[0].name))
     with run.executor(len(sources)) as executor:
-        known = [*unread, *listed.messages]
-        accepted = _accepted(sources, known, run, executor)
-        first = accepted.alignment.used.tolist().index(True)
-        if run.beside.frame == "first" and accepted.alignment.reference != first:  # those before it were left out
-            run = replace(run, options=replace(options, reference=accepted.sources[first].name))
-            accepted = _accepted(sources, known, run, executor)
+        accepted, run = _accepted(sources, [*unread, *listed.messages], run, executor)
         run.progress("laying out", 0, 1)
         chosen = choose_layout(accepted, run.options, aligner_of(accepted, run.options, run.purpose))
         return compose_registration(chosen, run, outputs, executor)
@@ -198,13 +198,15 @@ def calibrate(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    options = options or StitchOptions()
-    run = Run(options, None, beside, StageTimer(progress), Purpose.CALIBRATE)
+    options = with_camera_read(options or StitchOptions())
+    run = Run(options, None, beside, StageTimer(progress), Purpose.CALIBRATE, InputGuard(options.strict))
     with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
         check_run(run, listed.files, ())
-        sources, unread = read_inputs(with_times(listed.frames, options.timestamps), options, skip_bad=True)
+        frames = with_times(listed.frames, options.timestamps)
+        sources, unread = read_inputs(frames, options, run.guard, skip_bad=True)
         with run.executor(len(sources)) as executor:
-            result = _finished(at_full_size(_accepted(sources, [*unread, *listed.messages], run, executor)))
+            accepted, _ = _accepted(sources, [*unread, *listed.messages], run, executor)
+        result = _finished(at_full_size(accepted), run)
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
         return result.with_messages(stage_beside(run, outputs, result))
@@ -248,44 +250,32 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = replace(options or StitchOptions(), pose_covariance=True)
-    replaced: list[Path] = []  # a bag that is a folder
     if layout == "bag" and output is not None:
         check_bag(Path(output), overwrite=options.overwrite)
-        replaced = [Path(output)] if Path(output).is_dir() and options.overwrite else []
     given = as_inputs(inputs, options.channel_order)
     options, notes = with_camera_in_bag(given, options)
     options = with_odometry_of_bag(given, options)
     with found_images(given, every=every, topic=options.topic) as listed:
         files = [Path(file) for file in (output, plot) if file is not None]
-        check_outputs([f for f in files if f not in replaced], options.overwrite, [*listed.files, *options.files])
-        check_not_read(replaced, [Path(name) for name in given if not isinstance(name, Frame)])
+        # The bag of ROS 2 is a folder, which another one takes the place of.
+        bags = [file for file in files[:1] if layout == "bag" and file.is_dir() and options.overwrite]
+        check_outputs([f for f in files if f not in bags], options.overwrite, [*listed.files, *options.files])
+        check_not_read(bags, [Path(name) for name in given if not isinstance(name, Frame)])
         # Numbered as they were named: what is left out leaves a gap.
         frames = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
-        sources, unread = read_inputs(with_times(frames, options.timestamps), options, skip_bad=True)
-        run = Run(options, progress=StageTimer(progress), purpose=Purpose.TRAJECTORY)
+        guard = InputGuard(options.strict)
+        sources, unread = read_inputs(with_times(frames, options.timestamps), options, guard, skip_bad=True)
+        run = Run(options, progress=StageTimer(progress), purpose=Purpose.TRAJECTORY, guard=guard)
         with run.executor(len(sources)) as executor:
-            registration = at_full_size(_accepted(sources, [*unread, *listed.messages, *notes], run, executor))
-    registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
-    # Of the camera itself, whatever EXIF says of how its images are looked at.
-    stored = QuarterTurns.of(registration.sources).stored_alignment(registration.alignment)
-    path = Trajectory.from_alignment(stored, height or 1.0)
-    if options.odometry is not None:
-        path, notes = along_odometry(path, sources, options.odometry, keep_unit=height is not None)
-        registration = registration.with_messages(notes)
-    path = path.labelled(
-        [s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], timestamps_of(sources)
-    )
+            accepted, _ = _accepted(sources, [*unread, *listed.messages, *notes], run, executor)
+    registration = _finished(at_full_size(accepted), run)
+    path, messages = camera_path(registration, options.odometry, height)
+    registration = registration.with_messages([*scale_uncertainty(registration.alignment), *messages])
     if layout in ("tum", "bag") and not has_times(path):
         registration = registration.with_messages([_NO_TIMES])
     with Outputs(options.overwrite) as outputs:
         if output is not None:
-            if layout == "bag" and Path(output).suffix.lower() == ".bag":
-                with outputs.writing(output) as staged:
-                    write_bag(path, staged, frame or frame_of(layout))
-            elif layout == "bag":
-                write_bag_folder(path, Path(output), frame or frame_of(layout))
-            else:
-                outputs.write(output, text_bytes(WRITERS[layout](path, frame or frame_of(layout))))
+            write_trajectory(path, Path(output), layout, frame, outputs)
         if plot is not None:
             file, drawn = plot, path_as_svg(path, "heights" if height is None else "m")
             failed = outputs.attempt(file, lambda: outputs.write(file, text_bytes(drawn)))
@@ -293,19 +283,28 @@ def trajectory(
     return path, registration
 
 
-def _accepted(sources: Sequence[Source], known: Sequence[Message], run: Run, executor: Executor) -> Registration:
+def _accepted(
+    sources: Sequence[Source], known: Sequence[Message], run: Run, executor: Executor
+) -> tuple[Registration, Run]:
     """Register and check, with what is known of the inputs already; a failure names what could not be read well.
 
-    In pixels of the working size.
+    In pixels of the working size. Where the first image shall be the reference, but was left out, the first that is
+    used becomes it: the run says so then.
     """
     try:
-        registration = register(sources, run.options, executor, purpose=run.purpose, progress=run.progress)
+        registration = register(sources, run, executor).with_messages(known)
         run.progress("checking", 0, 1)
-        return accept(registration.with_messages(known), run.options, run.purpose)
+        accepted = accept(registration, run)
+        first = accepted.alignment.used.tolist().index(True)
+        if run.beside.frame == "first" and accepted.alignment.reference != first:
+            run = replace(run, options=replace(run.options, reference=accepted.sources[first].name))
+            again = with_reference_of(registration, aligner_of(registration, run.options, run.purpose))
+            accepted = accept(again, run)
+        return accepted, run
     except RegistrationError as error:
         unread = [message for message in known if message.severity == "left out"]
-        told = [str(replace(message, code="")) for message in merge_by_reason([*unread, *sources[0].guard.warnings])]
-        error.args = ("; ".join([str(error), *told]),)
+        reasons = [str(replace(message, code="")) for message in merge_by_reason([*unread, *run.guard.warnings])]
+        error.args = ("; ".join([str(error), *reasons]),)
         if isinstance(error, RefusedError):
             report_refused(run, error.registration)
         raise
@@ -314,10 +313,10 @@ def _accepted(sources: Sequence[Source], known: Sequence[Message], run: Run, exe
 def compose_registration(chosen: LaidOut, run: Run, outputs: Outputs, executor: Executor) -> StitchResult:
     """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
     registration, options = chosen.registration, run.options
-    elsewhere = blocks_on(executor, chosen.layout.placed.sources, options.cache)
+    elsewhere = blocks_on(executor, chosen.layout.placed.sources, run.guard, options.cache)
     composed, messages = compose_images(chosen.layout, run, outputs, elsewhere)
     result = StitchResult(
-        registration=_finished(registration).with_messages((*chosen.messages, *messages)),
+        registration=_finished(registration, run).with_messages((*chosen.messages, *messages)),
         local_alignment=chosen.local,
         **composed.fields | {"options": options.for_images(len(registration.sources))},
     )
@@ -335,11 +334,11 @@ def compose_registration(chosen: LaidOut, run: Run, outputs: Outputs, executor: 
     return result
 
 
-def _finished(registration: Registration) -> Registration:
+def _finished(registration: Registration, run: Run) -> Registration:
     """Images kept for stages that will not come are let go; what the decoders found wrong, in any stage, is added."""
     for source in registration.sources:
         source.decoded_images.clear()
-    return registration.with_messages(registration.sources[0].guard.messages)  # all have one guard
+    return registration.with_messages(run.guard.messages)
 
 
 def _save_camera(registration: Registration, options: StitchOptions, outputs: Outputs) -> None:

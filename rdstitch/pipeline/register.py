@@ -22,13 +22,14 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, draft_with_loops, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.image_circle import with_image_circle
-from rdstitch.pipeline.settle_repeated_pattern import match_crossings, settle_repeated_pattern
+from rdstitch.pipeline.match_crossings import match_crossings
+from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.settle_repeated_pattern import settle_repeated_pattern
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import return_freed_memory
-from rdstitch.system.progress import Progress, silent
 
 _STATIC_BACKGROUND = Message(
     "a part of what the images show stays where it is in them (a vehicle's body, a background, dirt, a date); "
@@ -38,42 +39,29 @@ _STATIC_BACKGROUND = Message(
 
 
 @impossible_estimates_fail()
-def register(
-    sources: Sequence[Source],
-    options: StitchOptions,
-    executor: Executor,
-    *,
-    purpose: Purpose = Purpose.MOSAIC,
-    progress: Progress = silent,
-) -> Registration:
+def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registration:
     """Detect features, register pairs, and align all images as one.
 
     Once there are poses, images that these put beside each other are tried too (loop closures), and every pair of an
     image that found no place. Where the images come from two lenses, those of one are aligned. All pixels in the
     result are those of the size that features are detected at, see :mod:`rdstitch.pipeline.working_size`.
     """
-    options = options.for_images(len(sources))
+    options, purpose, progress = run.options.for_images(len(sources)), run.purpose, run.progress
     cache = Cache.at(options.cache)
     if options.known_distortion is None:
-        sources = with_image_circle(sources, executor, cache, options.features.limits[1])
+        sources = with_image_circle(sources, executor, cache, run.guard, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, purpose)
     store = cache if options.cache is not None else Cache.for_this_run()
     skip_bad = purpose is not Purpose.PANO
-    detected = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)
+    detected = detect_by_contrast(
+        sources, options.features, executor, store, run.guard, skip_bad=skip_bad, progress=progress
+    )
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))
     return_freed_memory()
     estimator = PairEstimator(
-        features,
-        cameras,
-        _matching(options),
-        options.estimation,
-        progress,
-        executor,
-        cache,
-        store,
-        aligner.exact_tilts,
+        features, cameras, _matching(options), options.estimation, progress, executor, cache, store, aligner.exact_tilts
     )
     pairs = estimate_candidates(estimator, candidates)
     moving = without_static_background(estimator, pairs, candidates)

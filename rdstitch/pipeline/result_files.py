@@ -25,7 +25,7 @@ from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_outputs, file_name
 
 if TYPE_CHECKING:
-    from rdstitch.pipeline.apply_sidecar import Recomposition
+    from rdstitch.pipeline.recomposition import Recomposition
 
 
 def layer_files(names: list[str], folder: str | Path) -> list[Path]:

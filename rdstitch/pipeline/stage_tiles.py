@@ -84,7 +84,8 @@ def tiles(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = replace(options or TileOptions(), **fields)
-    run = Run(_stitch_options(options), output, beside, StageTimer(progress))
+    guard = InputGuard(options.strict)
+    run = Run(_stitch_options(options), output, beside, StageTimer(progress), guard=guard)
     with found_images(as_tiles(inputs), output=output, topic=options.topic) as listed:
         registration, tiled = _registered(listed, run, options, positions_file)
         with Outputs(options.overwrite) as outputs, run.executor(len(registration.sources)) as executor:
@@ -125,7 +126,7 @@ def place_tiles(
     """
     options = replace(options or TileOptions(), **fields)
     with found_images(as_tiles(inputs), topic=options.topic) as listed:
-        run = Run(_stitch_options(options), progress=StageTimer(progress))
+        run = Run(_stitch_options(options), progress=StageTimer(progress), guard=InputGuard(options.strict))
         registration, tiled = _registered(listed, run, options, positions_file)
     with Outputs(options.overwrite) as outputs:
         _write_beside(outputs, positions_file, options, registration, tiled)
@@ -144,10 +145,9 @@ def _registered(
         [frame.name for frame in listed.frames],
         others=[Path(file) for file in (positions_file, options.save_flat_field) if file is not None],
     )
-    guard = InputGuard(options.strict)
     frames, stored, notes = tile_frames(listed.frames, options.z, options.time)
     limit = options.composite.max_memory
-    sources, unread = read_sources(frames, skip_bad=not options.strict, guard=guard, max_memory=limit)
+    sources, unread = read_sources(frames, skip_bad=not options.strict, guard=run.guard, max_memory=limit)
     check_world_files([] if run.output is None else [run.output], sources, options.overwrite)
     sources, odd = _of_one_kind(sources, options.strict)
     unread += odd
@@ -156,7 +156,7 @@ def _registered(
             raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
         nominal = _grid(sources, stored, options)
         try:
-            sources, tiled, said = _placed(sources, nominal, options, run.progress)
+            sources, tiled, messages = _placed(sources, nominal, options, run.progress)
             break
         except InputError:
             sources, damaged = _readable(sources)
@@ -164,7 +164,7 @@ def _registered(
                 raise
             unread += damaged
     tiled = replace(tiled, z=options.z, time=options.time)
-    return tiles_as_registration(sources, tiled).with_messages([*unread, *listed.messages, *notes, *said]), tiled
+    return tiles_as_registration(sources, tiled).with_messages([*unread, *listed.messages, *notes, *messages]), tiled
 
 
 def _of_one_kind(sources: list[Source], strict: bool) -> tuple[list[Source], list[Message]]:
@@ -203,25 +203,25 @@ def _placed(
 ) -> tuple[list[Source], TileRegistration, list[Message]]:
     """The tiles with their illumination taken out, where they are, and what there is to say of that."""
     if len({source.camera.image_size for source in sources}) > 1:
-        said = [Message("tiles of several sizes have no flat field in common", severity="note", code="flat-field")]
+        messages = [Message("tiles of several sizes have no flat field in common", severity="note", code="flat-field")]
         if options.flat_field not in ("auto", "off") or isinstance(options.distortion, float):
             raise ArgumentError("tiles of several sizes have neither a flat field nor a lens in common")
     else:
-        sources, said = with_flat_field(sources, options.flat_field)
+        sources, messages = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
     plan = SearchPlan.of(nominal, options.search)
     factor = plan.factor
     grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
     if shown:
-        said.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
+        messages.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
     tiled = register_tiles(replace(plan, grid=grid), read, distortion=options.distortion, progress=progress)
     for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
         read(index)
     if options.flat_field == "auto" and sources[0].flat_field is not None and not _overlaps_show(sources, tiled):
-        sources, said = [replace(source, flat_field=None) for source in sources], [*said[1:], NO_FLAT_FIELD]
-    return sources, tiled, said
+        sources, messages = [replace(source, flat_field=None) for source in sources], [*messages[1:], NO_FLAT_FIELD]
+    return sources, tiled, messages
 
 
 def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
@@ -237,11 +237,7 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
 
 
 def _write_beside(
-    outputs: Outputs,
-    file: str | Path | None,
-    options: TileOptions,
-    registration: Registration,
-    tiled: TileRegistration,
+    outputs: Outputs, file: str | Path | None, options: TileOptions, registration: Registration, tiled: TileRegistration
 ) -> None:
     """The table of places, and the flat field, where they are wanted."""
     if file is not None:
@@ -289,6 +285,6 @@ def _grid(sources: Sequence[Source], stored: Mapping[Path, StoredTile], options:
         numbers = [source.number(k) for k, source in enumerate(sources)]
         grid = grid_from_arrays(options.positions, numbers, size, pixel_size)
     else:
-        told = [stored.get(source.path) or StoredTile(source.path, {}) for source in sources]
-        grid = grid_from_tiles(told, size, options.pixel_size)
+        known = [stored.get(source.path) or StoredTile(source.path, {}) for source in sources]
+        grid = grid_from_tiles(known, size, options.pixel_size)
     return grid if (sizes == sizes[0]).all() else replace(grid, own_sizes=sizes)

@@ -248,11 +248,15 @@ class StageRecord(Struct, kw_only=True):
     tiles: list[TileRecord]
 
 
+MatchedBy = Literal["name", "time", "position", "order"]
+"""How given images found the registered ones whose places they take."""
+
+
 class Applied(Struct):
     """Only in the sidecar of ``apply``: what was applied, and how images found their places."""
 
     sidecar: str
-    matched: Literal["name", "time", "position", "order"]
+    matched: MatchedBy
 
 
 class SidecarRecord(Struct, kw_only=True):

@@ -44,7 +44,7 @@ class TrackingOptions:
     patient: bool = True
 
 
-class Tracker:
+class FrameTracker:
     """Registers frames of one camera one after the other.
 
     Features (``detect``, in a frame's pixels; ``match``) are asked for only where the corners of the last keyframe,

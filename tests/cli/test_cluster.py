@@ -15,6 +15,7 @@ import pytest
 import rdstitch
 from rdstitch.compositing.tiles import TiledOutput
 from rdstitch.executors import ProcessExecutor
+from rdstitch.pipeline.run_on_sources import _result_and_state
 from tests.cli.running import FAST, Run, flight, sidecar_of
 
 pytest.importorskip("distributed")
@@ -93,7 +94,8 @@ def test_same_bytes_of_one_and_four_workers(
 
     class Recording(ProcessExecutor):
         def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
-            handed.add(getattr(fn, "func", fn).__name__)
+            work = args[0][0] if fn is _result_and_state else fn
+            handed.add(getattr(work, "func", work).__name__)
             return super().submit(fn, *args, **kwargs)
 
     monkeypatch.setattr("rdstitch.pipeline.run.open_executor", lambda workers, *_, **__: Recording(workers))

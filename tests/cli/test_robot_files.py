@@ -4,12 +4,16 @@ import math
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 import yaml
 from PIL import Image
 
+from rdstitch.pipeline import recipes
+from rdstitch.pipeline.register import register
 from tests.cli.running import CACHED, Run, rows_of, sidecar_of
 
 
@@ -63,6 +67,24 @@ def test_the_first_image_is_the_frame_of_all_that_is_written(rdstitch: Run, fram
     of_sidecar = np.array([[0.42 * pose["x"], 0.42 * pose["y"], pose["yaw_deg"]] for pose in poses])
     np.testing.assert_allclose(of_sidecar, path, atol=1e-3)
     assert (of_sidecar[0] == 0.0).all()
+
+
+def test_the_first_image_that_has_a_place_is_the_frame(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another alignment of the same pairs: features and pairs are found once."""
+    registered = Mock(side_effect=register)
+    monkeypatch.setattr(recipes, "register", registered)
+    elsewhere = tmp_path / "0_elsewhere.png"
+    cv2.imwrite(str(elsewhere), np.random.default_rng(3).integers(0, 255, (240, 320), dtype=np.uint8))
+    beside = ("--poses", tmp_path / "poses.csv", "--focal", "380", "--frame", "first")
+    done = rdstitch("mosaic", elsewhere, *frames, "-o", tmp_path / "f.png", *beside, *CACHED, status=None)
+    assert "0_elsewhere.png" in done.err
+    record = sidecar_of(tmp_path / "f.png")
+    first = next(image for image in record["images"] if image["used"])
+    assert record["reference"] == first["name"] == frames[0].name
+    assert (first["pose"]["x"], first["pose"]["y"], first["pose"]["height"]) == (0.0, 0.0, 1.0)
+    registered.assert_called_once()
 
 
 def test_of_several_bands_the_first_one_is_the_map(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

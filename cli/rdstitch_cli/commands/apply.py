@@ -1,6 +1,5 @@
 """``rdstitch apply``: compose again by a registration that was saved."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,11 +42,7 @@ def apply(
 
     compositing = values_of(CompositeOptions, given)
     chosen = {name: value for name, value in compositing.items() if is_given(name)}
-    # What is given takes the place of what the sidecar has for the same purpose.
-    if "scale" in chosen or "gsd" in chosen:
-        chosen = {"scale": 1.0, "gsd": None, **chosen}
-    if chosen.keys() & {"rectangle", "straighten", "level"}:
-        chosen = {"rectangle": None, "straighten": "off", "level": False, **chosen}
-    composite = replace(read_sidecar(sidecar).composite, **chosen)
-    result = recipe(sidecar, resolve(images), output, composite, progress=reporter, **values_of(ApplyOptions, given))
+    saved, options = read_sidecar(sidecar), ApplyOptions(**values_of(ApplyOptions, given))
+    composite = saved.composite.overridden(**chosen)
+    result = recipe(saved, resolve(images), output, composite, options=options, progress=reporter)
     report_applied(result, reporter)

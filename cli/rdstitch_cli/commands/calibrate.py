@@ -27,7 +27,12 @@ def calibrate(
     inputs: Inputs,
     output: Annotated[
         Path,
-        Option("Camera file to write: .json, or in the format of others, see --camera-format.", "FILE", "-o --output"),
+        Option(
+            "Camera file to write: .json, or in the format of others, see --camera-format.",
+            "FILE",
+            "-o --output",
+            writes=True,
+        ),
     ],
     every: Every = None,
     as_json: Annotated[bool, Option("Print the camera as JSON.", flag="--json")] = False,

@@ -15,7 +15,7 @@ from rdstitch_cli.terminal import Reporter
     """
   rdstitch doctor flight/
   rdstitch doctor drive.mp4 --json
-""",
+"""
 )
 def doctor(
     inputs: Inputs,

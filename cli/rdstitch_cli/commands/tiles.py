@@ -38,7 +38,9 @@ def tiles(
     inputs: Inputs,
     output: Annotated[
         Path | None,
-        Option("Image to write: .ome.tif, .ome.zarr, .tif, .png, .jpg, .webp or .dzi.", flag="-o --output"),
+        Option(
+            "Image to write: .ome.tif, .ome.zarr, .tif, .png, .jpg, .webp or .dzi.", flag="-o --output", writes=True
+        ),
     ] = None,
     positions_only: Annotated[
         Path | None,
@@ -46,6 +48,7 @@ def tiles(
             "Write the places of the tiles to this CSV file, or to a .txt as Fiji's list; without --output nothing is "
             "composed.",
             "FILE",
+            writes=True,
         ),
     ] = None,
     as_json: PrintSidecar = False,

@@ -10,9 +10,8 @@ from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.options.option import Option
 from rdstitch.options.shared_options import Every, Height
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch_cli import following as live
 from rdstitch_cli.flags import Inputs, command, flags_of
-from rdstitch_cli.following import FOLLOWING
+from rdstitch_cli.following import FOLLOWING, followed, print_result
 from rdstitch_cli.stitching import report_registration, resolve, stitch_options
 from rdstitch_cli.terminal import Reporter
 
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 )
 def trajectory(
     inputs: Inputs,
-    output: Annotated[Path, Option("File to write.", "FILE", "-o --output")],
+    output: Annotated[Path, Option("File to write.", "FILE", "-o --output", writes=True)],
     *,
     layout: Annotated[
         TrajectoryFormat,
@@ -52,7 +51,7 @@ def trajectory(
         ),
     ] = None,
     height: Height = None,
-    plot: Annotated[Path | None, Option("Draw the path to FILE (SVG).", "FILE")] = None,
+    plot: Annotated[Path | None, Option("Draw the path to FILE (SVG).", "FILE", writes=True)] = None,
     every: Every = 1,
     following: bool,
     idle: float | None,
@@ -67,28 +66,32 @@ def trajectory(
     """
     from rdstitch.export.trajectory_files import frame_of
     from rdstitch.pipeline.along_odometry import with_odometry_of_bag
-    from rdstitch.pipeline.follow import FollowedPoses
+    from rdstitch.pipeline.pose import FollowedPoses
     from rdstitch.pipeline.recipes import trajectory as recipe
 
+    options = stitch_options(reporter, given)
     with ExitStack() as stack:
-        stitch = stitch_options(reporter, given)
+        paths: Sequence[Named]
         if following:
-            stitch = with_odometry_of_bag(inputs, stitch)
-            printed = FollowedPoses(height, frame or frame_of(layout))
-            watched: dict[str, Any] = {"output": output, "plot": plot, "every": every, "idle": idle, "poses": printed}
-            arrived = live.followed(inputs, stitch, reporter, **watched)
-            paths: Sequence[Named] = stack.enter_context(arrived)
+            options = with_odometry_of_bag(inputs, options)
+            arrived = followed(
+                inputs,
+                options,
+                reporter,
+                output=output,
+                plot=plot,
+                every=every,
+                idle=idle,
+                poses=FollowedPoses(height, frame or frame_of(layout)),
+            )
+            paths = stack.enter_context(arrived)
         else:
             paths = resolve(inputs)
-        how: dict[str, Any] = {
-            "layout": layout,
-            "plot": plot,
-            "height": height,
-            "frame": frame,
-        }
-        _, registration = recipe(paths, output, stitch, every=every, progress=reporter, **how)
+        _, registration = recipe(
+            paths, output, options, layout=layout, plot=plot, height=height, frame=frame, every=every, progress=reporter
+        )
         if following:
-            live.print_result(registration, reporter, output)
+            print_result(registration, reporter, output)
         else:
             report_registration(registration, reporter)
         reporter.made(f"{output}: {registration.summary}, lengths ± {registration.alignment.length_std:.2%}")

@@ -25,10 +25,9 @@ from rdstitch_cli.terminal import Reporter
 def undistort(
     inputs: Inputs,
     camera: Path | None,
-    output: Annotated[Path, Option("Folder to write to; made if missing.", "DIR", "-o --output")],
+    output: Annotated[Path, Option("Folder to write to; made if missing.", "DIR", "-o --output", writes=True)],
     view: Annotated[
-        Framing,
-        Option("Field of view: size and scale of the image, everything it shows, or without empty borders."),
+        Framing, Option("Field of view: size and scale of the image, everything it shows, or without empty borders.")
     ] = "same",
     image_format: Annotated[
         ImageFormat | None,

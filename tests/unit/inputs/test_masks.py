@@ -16,6 +16,7 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import SIDEWAYS, turned, turned_size
 from rdstitch.inputs.find import find_images
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import DecodedImage, read_image
@@ -212,7 +213,7 @@ def test_a_second_run_decodes_nothing_to_find_the_circle(tmp_path: Path, monkeyp
     for _ in range(2):
         sources, _ = read_sources(files, skip_bad=False)
         with ThreadPoolExecutor(1) as executor:
-            found.append(with_image_circle(sources, executor, Cache.at(tmp_path / "cache"), 0.6))
+            found.append(with_image_circle(sources, executor, Cache.at(tmp_path / "cache"), InputGuard(), 0.6))
     assert decoded == files
     assert found[0] == found[1]
     assert found[0][0].camera.image_circle is not None

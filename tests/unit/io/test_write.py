@@ -77,12 +77,12 @@ def test_strips_do_not_matter(tmp_path_factory: pytest.TempPathFactory, suffix: 
     alpha = np.where(pixels[..., 0] > 60, 255, 0).astype(np.uint8)
     write_image(folder / f"whole.{suffix}", pixels, alpha)
     metadata, workers = Metadata((width, height)), data.draw(st.integers(1, 3))
-    layout = ImageSpec((width, height), 3, np.dtype(np.uint8), transparent=True, metadata=metadata, workers=workers)
+    layout = ImageSpec((width, height), 3, np.dtype(np.uint8), transparent=True, metadata=metadata)
     starts = [0]
     while starts[-1] < height:
         starts.append(starts[-1] + 256 * data.draw(st.integers(1, 3)))
     strips = [(pixels[a:b], alpha[a:b]) for a, b in itertools.pairwise(starts)]
-    write_strips(folder / f"strips.{suffix}", layout, strips)
+    write_strips(folder / f"strips.{suffix}", layout, strips, workers=workers)
     if suffix == "png":  # the compressor may cut its output elsewhere; the pixels may not differ
         np.testing.assert_array_equal(read_image(folder / "whole.png").pixels, read_image(folder / "strips.png").pixels)
     else:

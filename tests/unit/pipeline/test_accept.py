@@ -24,6 +24,7 @@ from rdstitch.pipeline.aligner import AlignedPairs, Aligner, reselect_inliers, s
 from rdstitch.pipeline.realign import realigned, without
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.pipeline.register import register
+from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message, left_out
 from rdstitch.system.cache import NO_CACHE
 from rdstitch.verification.verdict import RefusedError
@@ -43,7 +44,7 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
     frames = flight(3, 3).write(tmp_path)
     sources = _read(frames)
     with open_executor(1, len(sources)) as executor:
-        found = register(sources, OPTIONS, executor)
+        found = register(sources, Run(OPTIONS), executor)
     links = tuple(replace(fit, used=2 in (fit.image1, fit.image2)) for fit in found.alignment.links)
     spoiled = replace(
         found,
@@ -58,7 +59,7 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
 def test_what_was_left_out_stays_out_of_other_hypotheses(tmp_path: Path) -> None:
     sources = _read(flight(3, 3).write(tmp_path))
     with open_executor(1, len(sources)) as executor:
-        found = register(sources, OPTIONS, executor)
+        found = register(sources, Run(OPTIONS), executor)
     accepted = replace(found, alignment=replace(found.alignment, used=np.array([True, True, False])))
     other = realigned(accepted, Aligner.of(sources, replace(OPTIONS, model="rigid"), NO_CACHE), lambda _: True)
     assert other is not None
@@ -92,8 +93,8 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
         write_image(frame, np.concatenate([plane.frame(k)[:192], ahead.frame(k)[192:]]))
     sources = _read(frames)
     with open_executor(1, len(sources)) as executor:
-        found = register(sources, OPTIONS, executor)
-        accepted = accept(found, OPTIONS, Purpose.TRAJECTORY)
+        found = register(sources, Run(OPTIONS), executor)
+        accepted = accept(found, Run(OPTIONS, purpose=Purpose.TRAJECTORY))
     picture = mosaic(frames, None, replace(OPTIONS, focal=380.0)).registration
     steps = [np.diff(k.alignment.homographies[:, 0, 2]) for k in (found, accepted, picture)]
     assert np.all(np.abs(steps[0]) < 0.2)  # heights above the ground: what drives ahead moves by a sixth
@@ -106,10 +107,10 @@ def test_what_the_alignment_itself_fails_by_is_refused(tmp_path: Path) -> None:
     """Such as depth that looks like a lens, of a calibration."""
     sources = _read(flight(2, 2).write(tmp_path))
     with open_executor(1, len(sources)) as executor:
-        found = register(sources, OPTIONS, executor).with_messages([Message("no lens shows", severity="failure")])
+        found = register(sources, Run(OPTIONS), executor).with_messages([Message("no lens shows", severity="failure")])
         with pytest.raises(RefusedError, match="no lens shows"):
-            accept(found, OPTIONS)
-        assert not accept(found, replace(OPTIONS, force=True)).ok
+            accept(found, Run(OPTIONS))
+        assert not accept(found, Run(replace(OPTIONS, force=True))).ok
 
 
 FISHEYE = Camera((640, 480), -0.49, -0.055, (335.0, 226.0), distortion3=-0.008)

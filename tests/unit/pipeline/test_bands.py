@@ -114,6 +114,16 @@ def test_all_bands_of_a_rig_at_once(rig: Path, tmp_path: Path) -> None:
         assert cogeo.cog_validate(tmp_path / file, quiet=True) == (True, [], [])
 
 
+def test_of_bands_of_which_one_fails_nothing_is_written(rig: Path, tmp_path: Path) -> None:
+    for k, file in enumerate(sorted((rig / "nir").iterdir())):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(tmp_path / file.name), np.roll(image, (12 * k, -9 * k), axis=(0, 1)))
+    inputs = set(tmp_path.iterdir())
+    with pytest.raises(InputError, match="was not taken from the same place"):
+        mosaic_bands([rig / "red", tmp_path], tmp_path / "f.tif", {"R": "*_red.png", "N": "*_nir.png"})
+    assert set(tmp_path.iterdir()) == inputs
+
+
 def test_a_lost_image_and_one_from_elsewhere_move_no_other(rig: Path, tmp_path: Path) -> None:
     files = sorted((rig / "nir").iterdir())
     stranger = tmp_path / "IMG_0099_NIR.png"

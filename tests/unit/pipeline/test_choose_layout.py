@@ -15,12 +15,14 @@ from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.choose_layout import _error, choose_layout
-from rdstitch.pipeline.compose import Layout, seam_messages
+from rdstitch.pipeline.compose import Layout
+from rdstitch.pipeline.compose_messages import seam_messages
 from rdstitch.pipeline.lay_out import is_stretched
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.realign import aligner_of, by_second_motions
 from rdstitch.pipeline.recipes import mosaic, pano
 from rdstitch.pipeline.register import register
+from rdstitch.pipeline.run import Run
 from rdstitch.synthetic.textures import ground
 from tests.registrations import CAMERA, source
 
@@ -59,7 +61,7 @@ def test_images_aligned_by_the_surface_whose_seams_break_are_aligned_by_the_othe
     options = StitchOptions(workers=1, local_alignment="off", model="rigid", distortion=0.0)
     sources = read_sources(_of_two_surfaces(tmp_path), camera=None, focal=None, distortion=0.0, skip_bad=False)[0]
     with open_executor(1, len(sources)) as executor:
-        far = register(sources, options, executor)
+        far = register(sources, Run(options), executor)
     aligner = aligner_of(far, options, Purpose.MOSAIC)
     near = by_second_motions(far, [(0, 1)], aligner)
     assert near is not None

@@ -1,12 +1,15 @@
 """``rdstitch.Tracker``: metric poses of frames as they come, and the reason where there is none."""
 
 import math
+import os
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -22,10 +25,10 @@ from rdstitch.errors import ImpossibleCameraError, InputError
 from rdstitch.features import detect, match
 from rdstitch.features.prepared_image import View, prepare
 from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.frame import Frame
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, ground, sequence_over
-from rdstitch.tracking import Tracker as FrameTracker
-from rdstitch.tracking import TrackingOptions
+from rdstitch.tracking import FrameTracker, TrackingOptions
 
 HEIGHT = 0.8
 
@@ -219,3 +222,19 @@ def test_an_alignment_that_fails_is_survived(drive: Sequence, monkeypatch: pytes
         *_, last = tracker.add(prepare(View(image), None), CAMERA)
     assert last.pose is not None
     assert "a lens that cannot be" in tracker.messages[0].text
+
+
+def test_masks_lie_in_folders_as_their_frames_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the folder of masks is listed once a frame."""
+    for kind in ("frames", "masks"):
+        for folder in ("east", "west"):
+            (tmp_path / kind / folder).mkdir(parents=True)
+            cv2.imwrite(str(tmp_path / kind / folder / "f.png"), np.full((30, 40), 255, np.uint8))
+    tracker = rdstitch.Tracker(rdstitch.StitchOptions(mask=tmp_path / "masks"))
+    listed = Mock(side_effect=os.walk)
+    monkeypatch.setattr("rdstitch.inputs.selection.os.walk", listed)
+    source, _, _ = tracker.read(Frame(tmp_path / "frames" / "east" / "f.png", label="east/f.png"))
+    assert source is not None
+    assert source.mask is not None
+    assert source.mask.path == tmp_path / "masks" / "east" / "f.png"
+    listed.assert_called_once()

@@ -20,7 +20,7 @@ TRUE = MATCHES.truth.motion
     ("wrong", "says"),
     [
         ({"solver": "six_point"}, "solver must be one of"),
-        ({"solver": "three_point", "distortion": -0.1}, "nothing to choose"),
+        ({"solver": "three_point", "distortion": -0.1}, "no solver can be chosen"),
         ({"distortion": np.nan}, "below 1"),
         ({"distortion": 1.0}, "below 1"),
         ({"threshold": 0.0}, "above 0"),

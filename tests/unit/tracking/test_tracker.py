@@ -20,7 +20,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, sequence_over
-from rdstitch.tracking import Placement, PlaneSimilarity, Preview, Tracked, Tracker, TrackingOptions
+from rdstitch.tracking import FrameTracker, Placement, PlaneSimilarity, Preview, Tracked, TrackingOptions
 from rdstitch.tracking.state import TrackState
 
 SIZE = (320, 240)
@@ -60,9 +60,9 @@ def _blank(features: Features) -> PreparedImage:
 
 def _tracker(
     distortion: float | None = None, detector: Callable[[PreparedImage], Features] = MADE_UP.__getitem__
-) -> Tracker:
+) -> FrameTracker:
     options = TrackingOptions(EstimationOptions(distortion=distortion, select_below=50))
-    return Tracker(options, detector, partial(match, ratio=0.8), ThreadPoolExecutor(1))
+    return FrameTracker(options, detector, partial(match, ratio=0.8), ThreadPoolExecutor(1))
 
 
 def _path(results: list[Tracked]) -> Trajectory:

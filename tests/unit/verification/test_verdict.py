@@ -18,6 +18,7 @@ from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import pano
 from rdstitch.pipeline.register import register
+from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic import Photometry
@@ -40,7 +41,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
     sources, _ = read_sources(frames, camera=None, focal=380.0, distortion=None, skip_bad=False)
     options = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
     with open_executor(1, len(sources)) as executor:
-        return register(sources, options, executor)
+        return register(sources, Run(options), executor)
 
 
 def judge(registration: Registration, threshold: float, purpose: Purpose = Purpose.MOSAIC) -> tuple[Message, ...]:

@@ -1,0 +1,82 @@
+"""What the user should know of an output: what is cut away, broken seams, colour profiles."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rdstitch.compositing import Canvas, CompositeOptions, SeamQuality
+from rdstitch.compositing.projection import PLANE
+from rdstitch.inputs.source import Source
+from rdstitch.io.colour import colour_space
+from rdstitch.io.deepzoom import MAX_TILE_PROFILE
+from rdstitch.pipeline.placed_images import PlacedImages
+from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened
+
+_VISIBLE_CUT = 0.02  # share of the images that is cut away, from which on a note says so
+
+
+def masked_messages(placed: PlacedImages) -> list[Message]:
+    """What was left out of every image."""
+    if placed.static is None:
+        return []
+    share = float(placed.static.mean())
+    text = f"{share:.0%} of every image is black, or stays where it is, in all of them, and was masked"
+    return [Message(text, severity="detail")]
+
+
+def cut_away_messages(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> list[Message]:
+    """How much of the images has no place in the output."""
+    if placed.grid is not None or options.like is not None or options.extent is not None:
+        return []
+    share = canvas.cut_away(placed.cameras, placed.homographies)
+    text = f"{share:.0%} of what the images show is cut away: it would be stretched over {options.max_stretch:g} times"
+    if placed.turned and canvas.projection == PLANE:
+        text += "; --projection cylinder or sphere shows more"
+    return [Message(text, severity="note")] if share > _VISIBLE_CUT else []
+
+
+def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
+    """Where seams are broken, a warning where a person sees it, else a detail; of overlaps that are unlike, one warning
+    where no seams hold that say otherwise.
+    """
+    hold = len(seams.places) and not seams.seen
+    if seams.contradicted and not hold and seams.least_alike is not None:
+        images = tuple(paths[k] for k in seams.least_alike)
+        text = (
+            f"only {seams.alike:.0%} of what the images share looks alike, the least between "
+            f"{' and '.join(names_of(images))}: something that fills a part of them (a vehicle, a mount) may have been "
+            "registered instead of the scene; mask it"
+        )
+        return [Message(text, images, code="rival-motion")]
+    if not seams.breaks:
+        return []
+    worst = list({one.images: one for one in reversed(seams.breaks)}.values())[::-1][:MAX_NAMED]
+    breaks = []
+    for one in worst:
+        (x, y), (first, second) = one.position, names_of(paths[k] for k in one.images)
+        breaks.append(f"a break of {one.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}")
+    more = f", and {rest} more" if (rest := len(seams.breaks) - len(worst)) else ""
+    text = (
+        f"{'; '.join(breaks)}{more}: something moved, or is nearer than the rest; leave one of the two out, or mask it"
+    )
+    images = tuple(dict.fromkeys(paths[k] for one in worst for k in one.images))
+    return [Message(text, images, "warning" if seams.visible else "detail", code="seam-break")]
+
+
+def lost_profile_messages(source: Source, output: Path) -> list[Message]:
+    """Why the output lacks the colour profile of the image whose metadata it has."""
+    lost, size = source.metadata.profile_lost, len(source.metadata.icc_profile)
+    if output.suffix.lower() == ".dzi" and size > MAX_TILE_PROFILE:
+        lost = f"its colour profile of {size / 1e3:.0f} kB is too large to be in every tile"
+    return [Message(f"{lost}; colours are as if it had none", (str(source.path),))] if lost else []
+
+
+def differing_profile_messages(sources: Sequence[Source]) -> list[Message]:
+    """Which images have other colours than those of the output, whose profile is the first image's."""
+    spaces = [colour_space(source.metadata.icc_profile) for source in sources]
+    others = [str(source.path) for source, space in zip(sources, spaces, strict=True) if space != spaces[0]]
+    if not others:
+        return []
+    what = f"another colour profile than {sources[0].name}, whose the output has"
+    who = "has" if len(others) == 1 else f"{len(others)} of the images ({shortened(names_of(others))}) have"
+    text = f"{who} {what}: their colours are off; convert them to one colour space first"
+    return [Message(text, tuple(others), code="colour-profiles")]

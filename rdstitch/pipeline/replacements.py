@@ -1,0 +1,87 @@
+"""Which of the given images take the places of registered ones: read, corrected, and with the cameras found then."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from rdstitch.errors import InputError, PartialResultError
+from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.input_guard import InputGuard
+from rdstitch.inputs.selection import with_masks
+from rdstitch.inputs.source import Source, read_sources
+from rdstitch.options.apply_options import ApplyOptions
+from rdstitch.pipeline.counterparts import counterparts
+from rdstitch.pipeline.read_inputs import check_size, with_flat_field
+from rdstitch.results.messages import Message, left_out, merge_by_reason
+from rdstitch.sidecar.read import SavedRegistration
+from rdstitch.sidecar.records import MatchedBy
+from rdstitch.stage.tile_frames import tile_frames
+
+
+@dataclass(frozen=True)
+class Replacements:
+    """Images in the places of registered ones, by the numbers of these."""
+
+    frames: Mapping[int, Frame]
+    sources: Mapping[int, Source]  # of the same images, with their cameras, masks and flat field
+    left_out: Mapping[int, Message]
+    matched: MatchedBy
+    messages: Sequence[Message]
+
+
+def read_replacements(
+    saved: SavedRegistration, frames: Sequence[Frame], options: ApplyOptions, guard: InputGuard, max_memory: int | None
+) -> Replacements:
+    """Find, read and correct the images of the output: at least one, or, if strict, all that were registered."""
+    messages: list[Message] = []
+    stage = saved.record.stage
+    if stage is not None:
+        frames, _, messages = tile_frames(frames, stage.z, stage.time)
+    chosen, matched, unmatched = counterparts(saved, frames, options.match)
+    read = dict(_read(saved, chosen, guard, max_memory))
+    missing = {index: one for index, one in read.items() if isinstance(one, Message)}
+    sources = {index: one for index, one in read.items() if isinstance(one, Source)}
+    if options.strict and missing:
+        raise PartialResultError("; ".join(map(str, merge_by_reason(missing.values()))))
+    if not sources:
+        first = next(iter(missing.values()))
+        raise InputError(f"{saved.path}: none of its images can be used; {first.images[0]}: {first.text}")
+    used = with_masks(list(sources.values()), options.mask)
+    if stage is not None and stage.pixel_um is not None:
+        used = [replace(s, metadata=replace(s.metadata, pixel_size=stage.pixel_um)) for s in used]
+    illumination: list[Message] = []
+    if options.flat_field != "off":
+        check_size(used)
+        used, illumination = with_flat_field(used, options.flat_field)
+    return Replacements(
+        {index: frame for index, frame in enumerate(chosen) if index in sources and frame is not None},
+        dict(zip(sources, used, strict=True)),
+        missing,
+        matched,
+        [*messages, *unmatched, *illumination],
+    )
+
+
+def _read(
+    saved: SavedRegistration, chosen: Sequence[Frame | None], guard: InputGuard, max_memory: int | None
+) -> Iterator[tuple[int, Source | Message]]:
+    """For each image that was used then the one in its place, with its camera, or why there is none."""
+    for index, (image, frame) in enumerate(zip(saved.images, chosen, strict=True)):
+        if image.camera is None or image.to_plane is None:
+            continue
+        if frame is None:
+            yield index, left_out(image.path, "is not among the given images")
+            continue
+        read, unread = read_sources([frame], skip_bad=True, guard=guard, max_memory=max_memory)
+        yield index, unread[0] if unread else replace(read[0], camera=_resized(image.camera, read[0]))
+
+
+def _resized(camera: Camera, source: Source) -> Camera:
+    """The registered camera for an image that shows the same at perhaps another size."""
+    (w1, h1), (w2, h2) = camera.image_size, source.metadata.size
+    # Sizes are whole pixels, so that the shape may differ by one pixel of the image.
+    if abs(w1 * h2 - h1 * w2) > max(w1, h1):
+        raise InputError(
+            f"{source.path}: has {w2} x {h2} pixels, which is not the shape of the {w1} x {h1} that were registered"
+        )
+    return camera.resized((w2, h2))

@@ -1,0 +1,99 @@
+"""The sidecar of an image that was composed again: what was estimated then, of the images that are in it now."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from msgspec import UNSET
+from msgspec.structs import replace as replace_fields
+
+from rdstitch.arrays import FloatArray
+from rdstitch.geometry.camera_record import CameraRecord, camera_record, lens_fields
+from rdstitch.geometry.exif_orientation import inverse
+from rdstitch.inputs.source import Source
+from rdstitch.results.messages import Message
+from rdstitch.results.stitch_result import OutputImage
+from rdstitch.sidecar.read import SavedRegistration
+from rdstitch.sidecar.records import VERSION, Applied, ImageRecord, MatchedBy
+from rdstitch.sidecar.write import displacement_record, output_record, seams_record, taken_fields, to_output, versions
+from rdstitch.system.records import to_jsonable
+
+
+def applied_sidecar(
+    saved: SavedRegistration,
+    output: OutputImage,
+    sources: Mapping[int, Source],
+    homographies: Sequence[FloatArray],
+    left_out: Mapping[int, Message],
+    matched: MatchedBy,
+) -> dict[str, Any]:
+    """The content of the sidecar, which can be applied like any other.
+
+    ``sources`` are the images of the output, by the numbers of those whose places they take, and ``homographies``
+    theirs. Pairs are those of the sidecar that was applied, and stay there.
+    """
+    then, to_plane = saved.record, dict(zip(sources, homographies, strict=True))
+    # An image without any image in it is never written.
+    source = sources.get(saved.reference) or next(iter(sources.values()))
+    # How far the camera was determined then.
+    determined = ("lens_covariance", "tilt_deg", "tilt_std_deg")
+    camera = replace_fields(
+        camera_record(source.camera.turned(inverse(source.metadata.orientation))),
+        lambda_std=then.lambda_std,
+        **{name: getattr(then.camera, name) for name in determined},
+        focal_std_px=_resized_std(then.camera, source.camera.focal),
+    )
+    now = replace_fields(
+        then,
+        version=VERSION,
+        lambda_=source.camera.distortion,
+        lambda_px=camera.lambda_px,
+        lambda_focal=camera.lambda_focal,
+        camera=camera,
+        focal_px=camera.focal_px,
+        reference=source.name,
+        output=output_record(output, turned=saved.turned),
+        seams=seams_record(output.seams, [source.name for source in sources.values()]),
+        images=[
+            _used_image(image, sources[index], to_plane[index], output)
+            if index in sources
+            else _unused_image(image, left_out.get(index))
+            for index, image in enumerate(saved.images)
+        ],
+        pairs=[],
+        options={**then.options, "composite": output.options.composite},
+        versions=versions(),
+        applied=Applied(str(saved.path), matched),
+    )
+    content: dict[str, Any] = to_jsonable(now)
+    return content
+
+
+def _used_image(image: ImageRecord, source: Source, to_plane: FloatArray, output: OutputImage) -> ImageRecord:
+    """The record of an image, with what took its place."""
+    field, size = image.displacement_field(), source.camera.image_size
+    return replace_fields(
+        image,
+        name=source.name,
+        path=str(source.path),
+        size=size,
+        to_plane=to_plane.tolist(),
+        to_output=to_output(output.canvas, to_plane),
+        displacement=displacement_record(None if field is None else field.resized(size)),
+        lambda2=UNSET,
+        **taken_fields(source),
+        **lens_fields(source.camera),
+    )
+
+
+def _unused_image(image: ImageRecord, left_out: Message | None) -> ImageRecord:
+    """The record of an image that is not in the output."""
+    lens = {} if image.camera is None else lens_fields(image.camera)
+    reason = image.reason if left_out is None else left_out.text
+    gone = {"used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
+    return replace_fields(image, **lens, **gone, lambda2=UNSET)
+
+
+def _resized_std(then: CameraRecord, focal: float | None) -> float | None:
+    """The standard deviation that a focal length had, for the same lens on an image of another size."""
+    std, former = then.focal_std_px, then.focal_px
+    return std * (focal / former) if std and former and focal else None
