@@ -188,10 +188,9 @@ class ReliefField:
 
         As waves are answered: what that lens explains is no relief.
         """
-        normal = self.response.normal
-        steps = normal.responses(normal.gradient_poses[..., None], normal.gradient_shared[:, None])
+        step = self.response.step()
         return np.concatenate(
-            [part.errors + self.response.changes(part, *steps)[..., 0] for part in self.response.parts()]
+            [part.errors + self.response.changes(part, *step)[..., 0] for part in self.response.parts()]
         )
 
     def _answers(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray, FloatArray]:

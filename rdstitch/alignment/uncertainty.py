@@ -259,9 +259,13 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
         )
 
     jacobian = _jacobian(model, parameters.poses, parameters.shared, problem.reference, size + len(of_shared))
-    steps_of_poses, steps_of_shared = _relief(adjuster, fit.adjusted).steps()
-    by_relief = np.broadcast_to(steps_of_shared, (count, *steps_of_shared.shape))
-    moved = jacobian @ np.concatenate([steps_of_poses, by_relief], axis=1)
+    relief = _relief(adjuster, fit.adjusted)
+    # A lens that was held, although the images show more of it, has moved the poses by the step to the freed one.
+    steps_of_poses, steps_of_shared = (
+        np.concatenate(steps, axis=-1) for steps in zip(relief.steps(), relief.response.step(), strict=True)
+    )
+    by_shared_steps = np.broadcast_to(steps_of_shared, (count, *steps_of_shared.shape))
+    moved = jacobian @ np.concatenate([steps_of_poses, by_shared_steps], axis=1)
     of_images = jacobian @ joint(own, by_shared) @ jacobian.transpose(0, 2, 1)
     with_first = jacobian @ joint(first, np.broadcast_to(by_shared[0], by_shared.shape)) @ jacobian[0].T
     return of_images + moved @ moved.transpose(0, 2, 1), with_first + moved @ moved[0].T

@@ -47,6 +47,10 @@ class LinearResponse:
             self.adjuster.observations, adjusted.homographies, adjusted.parameters.lens, self.adjuster.free.lens
         )
 
+    def step(self) -> tuple[FloatArray, FloatArray]:
+        """The step of poses (N, D, 1) and shared parameters (S, 1) when what the solution held is free, too."""
+        return self.normal.responses(self.normal.gradient_poses[..., None], self.normal.gradient_shared[:, None])
+
     def steps_of(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray]:
         """Steps of poses (N, D, C) and shared parameters (S, C) when the errors change by so many ``fields``."""
         o, (count, size) = self.adjuster.observations, self.adjuster.free.poses.shape
