@@ -92,7 +92,7 @@ def test_the_table_has_them_in_its_own_axes_and_units(frame: TrajectoryFrame, si
 
 @pytest.mark.parametrize(("kind", "seed"), [("relief", 2), ("plane", 15)])
 def test_what_the_model_does_not_describe_is_in_the_uncertainty_of_poses(kind: str, seed: int) -> None:
-    """Noise alone would put the height 4 standard deviations away over hills, and 8 by a lens that was held too simple."""
+    """The height is else 4 standard deviations away over hills, and 8 with a lens that was held too simple."""
     sequence = rendered(kind, seed)
     options = replace(OPTIONS, pose_covariance=True)
     stitched = rdstitch.mosaic([sequence.frame(k) for k in range(len(sequence))], None, options)
