@@ -17,7 +17,7 @@ from rdstitch.io.mask import Mask
 from rdstitch.io.metadata import Metadata
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
-from rdstitch.verification.evidence import Evidence
+from rdstitch.verification.evidence import ResultEvidence
 
 CAMERA = Camera((400, 300))
 
@@ -50,8 +50,8 @@ def registration(
 
 def evidence(
     given: Registration, purpose: Purpose = Purpose.TRAJECTORY, threshold: float = 3.0, **known: Any
-) -> Evidence:
+) -> ResultEvidence:
     """Everything that rules look at; what is known is not computed."""
-    found = Evidence(given, threshold, purpose=purpose)
+    found = ResultEvidence(given, threshold, purpose=purpose)
     vars(found).update(known)
     return found

@@ -40,8 +40,8 @@ from rdstitch.synthetic import Photometry, Sequence, blank, ground, sequence_ove
 from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import forget_peak_memory
 from rdstitch.system.progress import Progress
-from rdstitch.verification.evidence import Evidence
-from rdstitch.verification.rules import OF_MATCHES, disagreeing_pairs
+from rdstitch.verification.evidence import ResultEvidence
+from rdstitch.verification.verdict import failures_of_matches
 
 COUNTS = (300, 1000, 3000, 10_000)
 DISTORTION = -0.25
@@ -132,9 +132,7 @@ def aligned_by_drawn(
     note("aligning", 1, 1)
     keypoints = tuple(len(points) for points, _ in matches.keypoints)
     registration = Registration(tuple(sources), keypoints, tuple(aligner.used(aligned)), aligned.alignment, ())
-    evidence = Evidence(registration, options.threshold)
-    for find in (*OF_MATCHES, disagreeing_pairs):
-        list(find(evidence))
+    failures_of_matches(ResultEvidence(registration, options.threshold))
     note("checking matches", 1, 1)
     align_registration_locally(at_full_size(registration), "auto")
     note("local alignment", 1, 1)

@@ -16,9 +16,9 @@ from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
-from rdstitch.verification.evidence import Evidence
+from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Scope, messages_of
-from rdstitch.verification.limits import limit
+from rdstitch.verification.limits import Limits
 from rdstitch.verification.verdict import RefusedError, judge
 
 _MAX_ROUNDS = 20  # times that something is left out; each takes one adjustment
@@ -58,7 +58,7 @@ def accept(registration: Registration, run: Run) -> Registration:
         registration, undamaged = undamaged, None
 
     def check(candidate: Registration) -> _Checked:
-        evidence = Evidence(candidate, options.threshold, options.threads, aligner.cache, purpose)
+        evidence = ResultEvidence(candidate, options.threshold, options.threads, aligner.cache, purpose)
         return _Checked(candidate, judge(evidence))
 
     first = last = check(registration)
@@ -148,7 +148,7 @@ def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
 
 def scale_uncertainty(alignment: Alignment) -> list[Message]:
     """A warning where the focal length, and with it the length of every step, is hardly known."""
-    if not alignment.length_std > limit("length"):
+    if not alignment.length_std > Limits.length_std.value:
         return []
     off = f"all lengths may be off together by {alignment.length_std:.0%}"
     text = f"{off}: the images hardly show the focal length; give --focal"

@@ -30,7 +30,7 @@ from rdstitch.robust.loss import sigma_of
 from rdstitch.system.cache import Cache
 from rdstitch.system.file_access import canonical_name
 from rdstitch.system.process_memory import return_freed_memory
-from rdstitch.verification.limits import limit
+from rdstitch.verification.limits import Limits
 
 _ROUNDS = 2
 """Of registering more pairs and selecting inliers again at most, each by what the one before has shown."""
@@ -123,7 +123,7 @@ class Aligner:
         ground = over_rough_ground(pairs, self.threshold)
         if ground is not pairs and not self._explains(aligned.alignment, pairs, ground):
             over = self._drafted(ground)
-            if over.alignment.rms <= limit("error of rough ground") * self.threshold:  # else it is not one ground
+            if over.alignment.rms <= Limits.rough_error.value * self.threshold:  # else it is not one ground
                 aligned = replace(over, pairs=tuple(pairs), rough=True)
         return self.metric(aligned) if self.needs_poses else aligned
 

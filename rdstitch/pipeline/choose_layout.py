@@ -150,7 +150,8 @@ def _other_surface(registration: Registration, first: LaidOut, trials: _Trials, 
     other = by_second_motions(registration, broken, aligner)
     if other is None or not _joins(other, registration, _MISFIT * _error(registration)):
         return None
-    laid_out = trials.attempt(other)
+    reason = f"{other.alignment.model_reason}; by another surface of the scene, where seams break less"
+    laid_out = trials.attempt(replace(other, alignment=replace(other.alignment, model_reason=reason)))
     if laid_out is None or laid_out.layout.seams.fills < first.layout.seams.fills:
         return None
     return laid_out

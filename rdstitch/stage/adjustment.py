@@ -103,7 +103,7 @@ def adjust(
     _, draws = equations.solve(state, weights, noise, variances, _RESULT_SAMPLES)
     known = 0.0 if distortion != 0.0 else math.inf
     return Adjustment(
-        state[equations.places].reshape(-1, 2) + equations.middle,
+        state[equations.place_slice].reshape(-1, 2) + equations.middle,
         float(state[-1]),
         float(draws[:, -1].std()) if free_lens else known,
         pair_weights,
@@ -112,7 +112,7 @@ def adjust(
         noise,
         _stage_model(equations, state, variances),
         equations.off_stage(state),
-        draws[:, equations.places].reshape(len(draws), -1, 2),
+        draws[:, equations.place_slice].reshape(len(draws), -1, 2),
     )
 
 
@@ -132,9 +132,9 @@ def _variances(
     held = np.union1d(equations.first[agreeing], equations.second[agreeing])
     of_tiles = squared(equations.off_stage(state), equations.off_stage(draws), held)
     parts = (
-        (equations.row_errors, equations.rows[held]),
-        (equations.column_errors, equations.columns[held]),
-        (equations.shared, equations.links.pair[agreeing]),
+        (equations.row_slice, equations.rows[held]),
+        (equations.column_slice, equations.columns[held]),
+        (equations.shared_slice, equations.links.pair[agreeing]),
     )
     of_parts = [
         squared(state[part].reshape(-1, 2), draws[:, part].reshape(len(draws), -1, 2), np.unique(shown))
@@ -160,9 +160,9 @@ def _stage_model(equations: StageEquations, state: FloatArray, variances: Varian
         for lines, variance in ((equations.rows, variances.row), (equations.columns, variances.column))
     )
     return StageModel(
-        state[equations.matrix].reshape(2, 2),
-        state[equations.row_errors].reshape(-1, 2),
-        state[equations.column_errors].reshape(-1, 2),
+        state[equations.matrix_slice].reshape(2, 2),
+        state[equations.row_slice].reshape(-1, 2),
+        state[equations.column_slice].reshape(-1, 2),
         row_std,
         column_std,
         math.sqrt(variances.tile),

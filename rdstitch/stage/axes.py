@@ -1,20 +1,20 @@
 """Which way a stage's axes run in the image, and how far its steps go, by the strongest pairs of neighbours."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.stage.correlation import CoarseTile, wide_peaks
+from rdstitch.stage.evidence_limits import HUNDRED_TO_ONE, MIN_AXES_EVIDENCE
 from rdstitch.stage.grid import TileGrid
 
 _TRIED, _ENOUGH = 48, 8  # pairs of an axis that are compared at most, and those with evidence that are enough
 # factor of evidence that other axes must have: of two where one is right, the pairs along it agree in both
 _MIN_RATIO = 1.2
-_MIN_EVIDENCE = 10.0  # evidence below which nothing is known, about one overlap of a correlation of 0.9
-_PEAK_MARGIN = 4.6  # nats by which a peak that stands out is above the others of its pair: a hundred to one
 _ACROSS = 2.0  # times as far as along a step neighbours may be off across it
 _MAX_SKEW = 0.1  # radians that the two axes may be off it
 _SIMILAR = 0.2  # share by which the steps of pairs may differ to be compared with each other
@@ -48,6 +48,14 @@ class _Axis:
         return chosen
 
 
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """From one column or row of the grid to the next, pixels (2,)."""
+
+    told: FloatArray
+    shown: FloatArray  # by the tiles
+
+
 def with_axes_shown(
     grid: TileGrid, read: Callable[[int], CoarseTile], factor: int, search: float
 ) -> tuple[TileGrid, str]:
@@ -55,33 +63,27 @@ def with_axes_shown(
 
     ``read`` gives tiles whose pixels are ``factor`` of the grid's; within ``search`` pixels the grid is as told.
     """
-    axes = [_axis(grid, axis, read, factor) for axis in (0, 1)]
-    told = [None if axis is None else axis.step for axis in axes]
-    choices = [[None] if axis is None else [axis.step, *axis.steps(search)] for axis in axes]
+    axes = {k: axis for k in (0, 1) if (axis := _axis(grid, k, read, factor)) is not None}
 
-    def evidence(steps: Sequence[FloatArray | None]) -> float:
-        pairs = zip(axes, steps, strict=True)
-        return sum(axis.evidence(step, search) for axis, step in pairs if axis is not None and step is not None)
+    def evidence(steps: Sequence[FloatArray]) -> float:
+        return sum(axis.evidence(step, search) for axis, step in zip(axes.values(), steps, strict=True))
 
-    nominal = evidence(told)
-    most, best = nominal, told
-    for x in choices[0]:
-        for y in choices[1]:
-            if (x is None or y is None or _perpendicular(x, y)) and (score := evidence((x, y))) > most:
-                most, best = score, [x, y]
+    told, *others = product(*([axis.step, *axis.steps(search)] for axis in axes.values()))
+    best = max([told, *(steps for steps in others if len(steps) < 2 or _perpendicular(*steps))], key=evidence)
     if (
-        most < max(_MIN_EVIDENCE, _MIN_RATIO * nominal)
+        evidence(best) < max(MIN_AXES_EVIDENCE, _MIN_RATIO * evidence(told))
         or best is told
-        or all(s is None or t is None or np.abs(s - t).max() <= search for s, t in zip(best, told, strict=True))
+        or all(np.abs(shown - step).max() <= search for shown, step in zip(best, told, strict=True))
     ):
         return grid, ""
-    steps = _completed(best, told, axes, search)
-    before, after = (
-        np.array([np.eye(2)[k] if step is None else step for k, step in enumerate(pair)]) for pair in (told, steps)
-    )
+    steps = {k: _Step(axis.step, shown) for (k, axis), shown in zip(axes.items(), best, strict=True)}
+    steps = _completed(steps, axes, search)
+    before, after = np.eye(2), np.eye(2)
+    for k, step in steps.items():
+        before[k], after[k] = step.told, step.shown
     places = grid.places @ np.linalg.solve(before, after)
     turned = replace(grid, places=places - places.min(axis=0))
-    return turned, _in_words(steps, told, grid.size)
+    return turned, _in_words(steps, grid.size)
 
 
 def _axis(grid: TileGrid, axis: int, read: Callable[[int], CoarseTile], factor: int) -> _Axis | None:
@@ -105,7 +107,7 @@ def _axis(grid: TileGrid, axis: int, read: Callable[[int], CoarseTile], factor: 
             others = nats[np.abs(places - places[best]).max(axis=1) > min(tile.grain for tile in tiles)]
             shown.append(places[best] * factor)
             margins.append(max(0.0, float(nats[best] - others.max(initial=0.0))))
-            if sum(margin > _PEAK_MARGIN for margin in margins) == _ENOUGH:
+            if sum(margin > HUNDRED_TO_ONE for margin in margins) == _ENOUGH:
                 break
     return _Axis(np.asarray(step), np.array(shown).reshape(-1, 2), np.array(margins))
 
@@ -114,34 +116,27 @@ def _perpendicular(x: FloatArray, y: FloatArray) -> bool:
     return bool(abs(x @ y) <= math.sin(_MAX_SKEW) * np.linalg.norm(x) * np.linalg.norm(y))
 
 
-def _completed(
-    steps: Sequence[FloatArray | None], told: Sequence[FloatArray | None], axes: Sequence[_Axis | None], search: float
-) -> list[FloatArray | None]:
+def _completed(steps: Mapping[int, _Step], axes: Mapping[int, _Axis], search: float) -> dict[int, _Step]:
     """The steps; one that no pair shows follows the other in direction and length."""
-    completed = list(steps)
-    for k in (0, 1):
-        step, other, own, others = steps[k], steps[1 - k], told[k], told[1 - k]
-        if step is None or other is None or own is None or others is None:
-            continue
-        axis = axes[k]
-        if axis is None or axis.evidence(step, search) == 0.0:
+    completed = dict(steps)
+    for k, step in steps.items():
+        if 1 - k in steps and axes[k].evidence(step.shown, search) == 0.0:
+            other = steps[1 - k]
             # Perpendicular, on the side where it was told to be if that is one.
-            across = np.array([-other[1], other[0]]) * float(np.linalg.norm(own) / np.linalg.norm(others))
-            completed[k] = across if float(across @ own) >= 0.0 else -across
+            longer = float(np.linalg.norm(step.told) / np.linalg.norm(other.told))
+            across = np.array([-other.shown[1], other.shown[0]]) * longer
+            completed[k] = _Step(step.told, across if float(across @ step.told) >= 0.0 else -across)
     return completed
 
 
-def _in_words(steps: Sequence[FloatArray | None], told: Sequence[FloatArray | None], size: tuple[int, int]) -> str:
+def _in_words(steps: Mapping[int, _Step], size: tuple[int, int]) -> str:
     """What is not as told: directions, and overlaps."""
     said, overlaps = [], []
-    for k, (one, many) in enumerate((("column", "columns"), ("row", "rows"))):
-        step, known = steps[k], told[k]
-        if step is None or known is None:
-            continue
-        along = int(np.abs(step).argmax())
+    for k, step in steps.items():
+        along = int(np.abs(step.shown).argmax())
         if along != k:
-            said.append(f"{many} lie {'below' if along else 'beside'} each other")
-        if step[along] * known[k] < 0.0:
-            said.append(f"the next {one} is {('left', 'above')[along]}")
-        overlaps.append(f"{100.0 * (1.0 - abs(step[along]) / size[along]):.1f}")
+            said.append(f"{('columns', 'rows')[k]} lie {'below' if along else 'beside'} each other")
+        if step.shown[along] * step.told[k] < 0.0:
+            said.append(f"the next {('column', 'row')[k]} is {('left', 'above')[along]}")
+        overlaps.append(f"{100.0 * (1.0 - abs(step.shown[along]) / size[along]):.1f}")
     return f"{', '.join([*said, ''])}neighbours overlap by {' and '.join(overlaps)} %"

@@ -8,13 +8,12 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.stage.adjustment import Adjustment, adjust
+from rdstitch.stage.evidence_limits import ANYWHERE, HUNDRED_TO_ONE
 from rdstitch.stage.linked_points import LinkedPoints
-from rdstitch.stage.pair_candidates import MIN_EVIDENCE, Candidates, SearchPlan
+from rdstitch.stage.pair_candidates import Candidates, SearchPlan
 from rdstitch.stage.refinement import BlockMatches
 
 _ROUNDS = 4  # by which what is certain of the stage decides about what was not
-_SURE = math.log(99.0)  # nats of one place of a pair against all others that are possible
-_MOVED = math.log(1e-3)  # nats for that a tile is anywhere but where its stage was sent, within its errors
 AGREES = 0.25  # weight of a pair from which on it holds its tiles
 
 
@@ -36,7 +35,7 @@ def choose_places(
             chosen.pop(number, None)
             best, odds = _most_likely(of_pair, *fitted.between(pairs[number]), plan)
             # What is likely wherever the stage is goes first, and what is so only near where it should be second.
-            if odds > _SURE and (count > 0 or of_pair.nats[best] > MIN_EVIDENCE):
+            if odds > HUNDRED_TO_ONE and (count > 0 or of_pair.nats[best] > HUNDRED_TO_ONE):
                 chosen[number] = of_pair.offsets[best]
         chosen.update(_moved_tiles(pairs, candidates, fitted, chosen, plan.search))
         chosen = dict(sorted(chosen.items()))
@@ -56,7 +55,7 @@ def _most_likely(
         (2.0 * math.pi) ** 2 * float(np.linalg.det(covariance))
     )
     anywhere = -math.log(float(np.prod(plan.grid.size)))
-    score = candidates.nats + np.logaddexp(log_prior, _MOVED + anywhere)
+    score = candidates.nats + np.logaddexp(log_prior, ANYWHERE + anywhere)
     best = int(score.argmax())
     # Nothing of what was found may be right, either.
     others = np.append(score[candidates.apart(best)], anywhere)
@@ -94,7 +93,7 @@ def _moved_tiles(
             continue
         margins = {move: move.nats - candidates[move.pair].best_besides(move.candidate) for move in agreeing}
         shown = {move: margin for move, margin in margins.items() if margin > 0.0}
-        if len(shown) > 1 and sum(shown.values()) > _SURE - _MOVED:
+        if len(shown) > 1 and sum(shown.values()) > HUNDRED_TO_ONE - ANYWHERE:
             found |= {move.pair: candidates[move.pair].offsets[move.candidate] for move in shown}
     return found
 

@@ -44,20 +44,20 @@ class StageEquations:
         sizes = self.count, int(self.rows.max()) + 1, int(self.columns.max()) + 1, 2, len(links.tiles)
         ends = np.cumsum([0, *(2 * size for size in sizes), 1]).tolist()
         # Where the parts are in the vector of the unknowns; λ is the last entry, and not solved for when it is known.
-        self.places, self.row_errors, self.column_errors, self.matrix, self.shared, self.lens = (
+        self.place_slice, self.row_slice, self.column_slice, self.matrix_slice, self.shared_slice, self.lens_slice = (
             slice(start, stop) for start, stop in pairwise(ends)
         )
-        self.size = self.lens.stop if free_lens else self.lens.start
+        self.size = self.lens_slice.stop if free_lens else self.lens_slice.start
         # Inverse square roots of the blocks' covariances, which are not better than blocks can be.
         information = links.information
         covariance = np.linalg.inv(information + 1e-12 * np.eye(2)) if len(information) else information
         self.root = np.linalg.cholesky(np.linalg.inv(covariance + _MIN_STD**2 * np.eye(2))).transpose(0, 2, 1)
-        by_places = self._picking(self.places, self.first) - self._picking(self.places, self.second)
-        self._by_pairs, self._by_blocks = by_places, by_places - self._picking(self.shared, links.pair)
+        by_places = self._picking(self.place_slice, self.first) - self._picking(self.place_slice, self.second)
+        self._by_pairs, self._by_blocks = by_places, by_places - self._picking(self.shared_slice, links.pair)
         self._by_stage = (
-            self._picking(self.places, np.arange(self.count))
-            - self._picking(self.row_errors, self.rows)
-            - self._picking(self.column_errors, self.columns)
+            self._picking(self.place_slice, np.arange(self.count))
+            - self._picking(self.row_slice, self.rows)
+            - self._picking(self.column_slice, self.columns)
             - self._nominal_by_matrix()
         )
 
@@ -65,21 +65,21 @@ class StageEquations:
         """Rows that pick vectors (K, 2) by their numbers out of a part of the unknowns."""
         columns = (part.start + 2 * index[:, None] + np.arange(2)).ravel()
         rows = np.arange(len(columns))
-        return sparse.csr_matrix((np.ones(len(columns)), (rows, columns)), shape=(len(columns), self.lens.stop))
+        return sparse.csr_matrix((np.ones(len(columns)), (rows, columns)), shape=(len(columns), self.lens_slice.stop))
 
     def _nominal_by_matrix(self) -> "sparse.csr_matrix":
         """The nominal places on the camera's axes, of which each coordinate is a row of A times the nominal place."""
         rows = np.repeat(np.arange(2 * self.count), 2)
-        columns = self.matrix.start + np.tile(np.arange(4), self.count)
+        columns = self.matrix_slice.start + np.tile(np.arange(4), self.count)
         values = np.repeat(self.nominal, 2, axis=0).ravel()
-        return sparse.csr_matrix((values, (rows, columns)), shape=(2 * self.count, self.lens.stop))
+        return sparse.csr_matrix((values, (rows, columns)), shape=(2 * self.count, self.lens_slice.stop))
 
     def start(self, distortion: float) -> FloatArray:
         """Nominal places and λ."""
-        state = np.zeros(self.lens.stop)
-        state[self.places] = self.nominal.ravel()
-        state[self.matrix] = np.eye(2).ravel()
-        state[self.lens] = distortion
+        state = np.zeros(self.lens_slice.stop)
+        state[self.place_slice] = self.nominal.ravel()
+        state[self.matrix_slice] = np.eye(2).ravel()
+        state[self.lens_slice] = distortion
         return state
 
     def errors(self, state: FloatArray, *, of_blocks: bool = False) -> tuple[FloatArray, FloatArray]:
@@ -125,17 +125,19 @@ class StageEquations:
         """Rows of the least-squares problem for the change of the state, and their right sides, of unit variance."""
         errors, by_lens = self.errors(state, of_blocks=True)
         whiten = _block_diagonal(self.root * np.sqrt(weights / noise)[:, None, None])
-        place = np.arange(errors.size), np.full(errors.size, self.lens.start)
+        place = np.arange(errors.size), np.full(errors.size, self.lens_slice.start)
         blocks = self._by_blocks + sparse.csr_matrix((by_lens.ravel(), place), shape=self._by_blocks.shape)
         tile_std, row_std, column_std, pair_std = np.sqrt(variances)
-        known = (self.row_errors, row_std), (self.column_errors, column_std), (self.matrix, _SCALE_STD)
-        beforehand = [*known, (self.shared, pair_std), (self.lens, _LENS_STD)]
+        known = (self.row_slice, row_std), (self.column_slice, column_std), (self.matrix_slice, _SCALE_STD)
+        beforehand = [*known, (self.shared_slice, pair_std), (self.lens_slice, _LENS_STD)]
         stds = np.concatenate([np.full(part.stop - part.start, std) for part, std in beforehand])
-        usual = np.zeros(self.lens.stop)
-        usual[self.matrix] = np.eye(2).ravel()
-        after = slice(self.places.stop, self.size)
-        stds = stds[: self.size - self.places.stop]
-        prior = sparse.diags(1.0 / stds) @ sparse.eye(len(stds), self.lens.stop, self.places.stop, format="csr")
+        usual = np.zeros(self.lens_slice.stop)
+        usual[self.matrix_slice] = np.eye(2).ravel()
+        after = slice(self.place_slice.stop, self.size)
+        stds = stds[: self.size - self.place_slice.stop]
+        prior = sparse.diags(1.0 / stds) @ sparse.eye(
+            len(stds), self.lens_slice.stop, self.place_slice.stop, format="csr"
+        )
         rows = sparse.vstack([whiten @ blocks, self._by_stage / tile_std, prior], format="csr")
         right = [-(whiten @ errors.ravel()), -self.off_stage(state).ravel() / tile_std, (usual - state)[after] / stds]
         return rows[:, : self.size], np.concatenate(right)

@@ -5,7 +5,8 @@ there in every tile alike. So the medians, over all tiles, of the logarithmic st
 of the illumination, which is a smooth surface over them.
 
 The dark level D, which light does not multiply, is where the variance of photon noise, which is in proportion to the
-light, becomes 0 (photon transfer). Samples that are no counts of light, as of JPEG files, show none, and D is 0.
+light, becomes 0 (photon transfer). Few samples, and those that are no counts of light, as of JPEG files, show none: D
+is taken for 0, and the error of the flat field is what D may be instead.
 """
 
 import math
@@ -25,6 +26,7 @@ MIN_TILES = 20  # fewer show one flat field as well as another
 LARGEST_ERROR = 0.01  # root mean square, by which two halves of the tiles may differ from their mean
 _PARTS = 4  # of the tiles, by which the error of the dark level is known
 _KNOWN = 3.0  # standard deviations from 0 from which on it is taken out
+_MAX_DARK = 1 / 16  # of the largest sample: cameras of 12 bits are set to a hundred counts
 _CELLS = 24  # cells along each side of a tile, or one a pixel where it has fewer
 _SIDE = 512  # pixels of the longer side that are enough
 _DEGREE = 4  # degree of the polynomial that the logarithm of the illumination is
@@ -48,7 +50,7 @@ class _Statistics:
     """Ground, and variance of noise and the light that it is of, of all cells of all tiles."""
 
     def __init__(self, tiles: Iterable[NDArray[Any]]) -> None:
-        ground, light, variance = [], [], []
+        ground, light, variance, largest = [], [], [], 0.0
         for tile in tiles:
             factor = max(1, round(max(tile.shape[:2]) / _SIDE))
             small = block_mean(tile, factor).reshape(-(-tile.shape[0] // factor), -(-tile.shape[1] // factor), -1)
@@ -56,7 +58,8 @@ class _Statistics:
             mean, noise = _noise(tile.reshape(*tile.shape[:2], -1))
             light.append(mean)
             variance.append(noise)
-        self.size = small.shape[:2]
+            largest = max(largest, float(tile.max()))
+        self.size, self.largest = small.shape[:2], largest
         self.used = tuple(side - side % min(_CELLS, side) for side in self.size)
         self.ground, self.light, self.variance = (np.array(v, dtype=np.float64) for v in (ground, light, variance))
 
@@ -90,6 +93,43 @@ def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
     return np.asarray(light.mean(axis=-1)), np.asarray(variance / 6.0)
 
 
+@dataclass(frozen=True, eq=False)
+class _Channel:
+    """What tiles show of the light in one of their channels."""
+
+    surface: FloatArray  # coefficients of the logarithm of the illumination
+    dark: float
+    dark_error: float  # 0 where the tiles do not show it, and it is 0
+    halves_error: float  # by which two halves of the tiles differ from their mean; root mean squares of shares
+    dark_effect: float  # by what the dark level may be instead
+    spread: float  # of the illumination itself
+
+    @classmethod
+    def of(cls, shown: _Statistics, channel: int) -> "_Channel":
+        ground = shown.ground[..., channel]
+        dark, dark_error = _sure_dark_level(shown.light[..., channel], shown.variance[..., channel])
+        # Where it is not shown, all are as likely up to the largest that cameras have: its root mean square.
+        largest = min(_MAX_DARK * shown.largest, float(np.quantile(ground, 0.01)))
+        other = dark + dark_error if dark_error else largest / math.sqrt(3.0)
+        parts = ground - dark, ground[::2] - dark, ground[1::2] - dark, ground - other
+        down, across = (_middles(cells) for cells in ground.shape[1:])
+        surfaces = [_fitted(part) for part in parts]
+        cells = [np.exp(_surface(surface, across, down)) for surface in surfaces]
+        whole, half1, half2, darker = (light / light.mean() for light in cells)
+        halves, effect = (float(np.sqrt((off**2).mean())) for off in ((half1 - half2) / 2.0, darker - whole))
+        return cls(surfaces[0], dark, dark_error, halves, effect, float(whole.std()))
+
+    @property
+    def sure(self) -> bool:
+        """Whether its flat field is better than none."""
+        return math.hypot(self.halves_error, self.dark_effect) < min(LARGEST_ERROR, 0.5 * self.spread)
+
+    @property
+    def error(self) -> float:
+        """As of one of the halves: what both have in common, such as the form of the surface, is not seen."""
+        return math.hypot(math.sqrt(2.0) * self.halves_error, self.dark_effect)
+
+
 def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
     """Estimate the flat field and the dark level of tiles."""
     first = read(0)
@@ -97,37 +137,29 @@ def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Il
     if count < MIN_TILES or first.shape[0] < 2 or first.shape[1] < 3:
         return Illumination(None, math.inf, 0.0, np.zeros(1), np.zeros(1))
     shown = _Statistics(read(index) for index in range(count))
-    channels = shown.ground.shape[3]
-    height, width = first.shape[:2]
+    channels = [_Channel.of(shown, channel) for channel in range(shown.ground.shape[3])]
     # Centres of the pixels in the frame of the cells, from -1 to 1.
     x, y = (
-        (2.0 * (np.arange(side) + 0.5) * small / side / used - 1.0)
-        for side, small, used in ((width, shown.size[1], shown.used[1]), (height, shown.size[0], shown.used[0]))
+        2.0 * (np.arange(first.shape[axis]) + 0.5) * shown.size[axis] / first.shape[axis] / shown.used[axis] - 1.0
+        for axis in (1, 0)
     )
-    gain = np.empty((height, width, channels), dtype=np.float32)
-    dark, dark_error, errors, noise = np.zeros(channels), np.zeros(channels), [], []
-    for channel in range(channels):
-        ground = shown.ground[..., channel]
-        light, variance = shown.light[..., channel], shown.variance[..., channel]
-        dark[channel] = _dark_level(light, variance)
-        dark_parts = [_dark_level(light[k::_PARTS], variance[k::_PARTS]) for k in range(_PARTS)]
-        dark_error[channel] = float(np.std(dark_parts, ddof=1)) / math.sqrt(_PARTS)
-        if dark[channel] < _KNOWN * dark_error[channel] or not all(dark_parts):
-            dark[channel] = dark_error[channel] = 0.0
-        whole = _fitted(ground - dark[channel])
-        halves = [_fitted(ground[k::2] - dark[channel]) for k in (0, 1)]
-        gain[..., channel] = np.exp(_surface(whole, x, y))
-        gain[..., channel] /= gain[..., channel].mean()
-        down, across = (_middles(cells) for cells in ground.shape[1:])
-        cells = [np.exp(_surface(coefficients, across, down)) for coefficients in (whole, *halves)]
-        errors.append(float(np.sqrt(((cells[1] / cells[1].mean() - cells[2] / cells[2].mean()) ** 2).mean())) / 2.0)
-        noise.append(float((cells[0] / cells[0].mean()).std()))
-    field = FlatField(gain, dark.astype(np.float32)[None, None])
-    good = all(error < min(LARGEST_ERROR, 0.5 * spread) for error, spread in zip(errors, noise, strict=True))
-    good = good and bool(np.isfinite(gain).all())
+    gain = np.stack([np.exp(_surface(channel.surface, x, y)) for channel in channels], axis=-1).astype(np.float32)
+    gain /= gain.mean(axis=(0, 1))
+    dark, dark_error = (np.array(v) for v in zip(*((each.dark, each.dark_error) for each in channels), strict=True))
+    good = all(channel.sure for channel in channels) and bool(np.isfinite(gain).all())
+    field = FlatField(gain, dark.astype(np.float32)[None, None]) if good else None
     missing = float(1.0 - (gain.min(axis=(0, 1)) / gain.max(axis=(0, 1))).min())
-    # As for one of the halves: what both have in common, such as the form of the surface, is not seen between them.
-    return Illumination(field if good else None, math.sqrt(2.0) * max(errors), missing, dark, dark_error)
+    return Illumination(field, max(channel.error for channel in channels), missing, dark, dark_error)
+
+
+def _sure_dark_level(light: FloatArray, variance: FloatArray) -> tuple[float, float]:
+    """D of a channel and its standard deviation, by parts of the tiles; 0 and 0 where they do not show it."""
+    dark, parts = (
+        _dark_level(light, variance),
+        [_dark_level(light[k::_PARTS], variance[k::_PARTS]) for k in range(_PARTS)],
+    )
+    error = float(np.std(parts, ddof=1)) / math.sqrt(_PARTS)
+    return (dark, error) if all(parts) and dark >= _KNOWN * error else (0.0, 0.0)
 
 
 def agrees_with_overlaps(field: FlatField, overlaps: Iterable[tuple[NDArray[Any], NDArray[Any], FloatArray]]) -> bool:

@@ -21,6 +21,7 @@ from rdstitch.stage.correlation import (
     peaks,
     wide_peaks,
 )
+from rdstitch.stage.evidence_limits import HUNDRED_TO_ONE, WRONG_PEAK
 from rdstitch.stage.grid import TileGrid
 from rdstitch.system.progress import Progress
 
@@ -37,11 +38,7 @@ _NARROW = 2  # coarse pixels about where others say that a pair is: peaks are ke
 _CANDIDATES = 8  # highest peaks of a pair that are compared by normalized cross-correlation
 _LENSES = np.linspace(-0.04, 0.04, 21)  # values of λ that are tried before it is estimated
 _LENS_REACH = 0.02  # of a side: largest displacement of an overlap's blocks against each other by the lens
-
-# Evidence for a place of a pair is in nats: logarithms of odds.
-_LOW_EVIDENCE = 6.0  # nats below which a pair is looked for elsewhere: a correlation of about 0.6
 _MIN_CONTENT = 0.5  # share of the variance of a tile that must be content to look for it elsewhere
-MIN_EVIDENCE = 4.6  # nats from which on a place is possible that the whitened correlation does not show: 100 to 1
 
 
 @dataclass(frozen=True)
@@ -148,10 +145,10 @@ class PairFinder:
             offset = overlap.offset + at - self.radius
             there = self.overlap(number, offset * self.factor)
             value = log_evidence(tiles, there, offset, _shifts(there, lens))
-            if len(offsets) < len(likely) or value > MIN_EVIDENCE:
+            if len(offsets) < len(likely) or value > HUNDRED_TO_ONE:
                 offsets.append(offset)
                 nats.append(value)
-        if max(nats, default=0.0) < _LOW_EVIDENCE and min(tile.content_share for tile in tiles) > _MIN_CONTENT:
+        if max(nats, default=0.0) < WRONG_PEAK and min(tile.content_share for tile in tiles) > _MIN_CONTENT:
             places, values = wide_peaks(tiles)
             offsets, nats = [*offsets, *places], [*nats, *values.tolist()]
         return Candidates(self.factor * np.array(offsets).reshape(-1, 2), np.array(nats), self.factor * grain)

@@ -13,16 +13,17 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray, IntArray
 
 _SMOOTHING = 1.2  # standard deviation of the filter before derivatives are taken, pixels
-_MARGIN = 5
+_MARGIN = 5  # pixels of the second tile about a block that are looked at
 _STEP = 8  # pixels between which the lens is straight
-_ITERATIONS = 5
-_MIN_SIDE = 12
+_ITERATIONS, _SETTLED = 5, 0.003  # pixels
+_MIN_SIDE = 12  # pixels of a block
 _SIGNIFICANT = 5.0  # standard deviations by which the correlation of a block must exceed that of noise
 _CORRELATED = 4.0 * np.pi * _SMOOTHING**2  # pixels that share their noise after the filter
 
 
 Transfer = Callable[[FloatArray], FloatArray]
-Gradient = list[NDArray[np.float32]]
+Image = NDArray[np.float32]
+Gradient = list[Image]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +65,31 @@ def _refined(
     first: NDArray[Any], second: NDArray[Any], block: IntArray, transfer: Transfer, tolerance: float
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Places of a block's content in both tiles and their information; None where it shows nothing."""
+    pair = _sampled_pair(first, second, block, transfer)
+    found = None if pair is None else _displaced(pair, min(tolerance, _MARGIN - 2.0))
+    if pair is None or found is None or not found.significant:
+        return None
+    point = pair.low + _centroid(found.gradient)
+    return point, transfer(point[None])[0] - found.shift, found.information
+
+
+@dataclass(frozen=True, eq=False)
+class _SampledPair:
+    """A block of the first tile, and what may be the same in the second; both smoothed."""
+
+    low: IntArray  # (2,): first pixel of the block in its tile
+    block: Image
+    other: Image
+    maps: Image  # (h, w, 2): where ``other`` has the pixels of the block
+
+
+def _sampled_pair(
+    first: NDArray[Any], second: NDArray[Any], block: IntArray, transfer: Transfer
+) -> _SampledPair | None:
+    """As far as both tiles have what the search may need; None where that is too small."""
     sides = np.array([first.shape[::-1], second.shape[::-1]])
     corners = np.array([block[[0, 1]], block[[2, 1]], block[[0, 3]], block[[2, 3]]], dtype=np.float64)
     off = corners - transfer(corners)
-    # What the search may need beside them is there of both.
     low = np.maximum(block[:2], np.maximum(0, np.ceil(off.max(axis=0)).astype(np.intp)) + _MARGIN)
     high = np.minimum(block[2:], np.minimum(sides[0], sides[1] + np.floor(off.min(axis=0)).astype(np.intp)) - _MARGIN)
     if (high - low < _MIN_SIDE).any():
@@ -81,46 +103,74 @@ def _refined(
     corner = np.maximum(np.floor(moved.min(axis=(0, 1))).astype(np.intp) - _MARGIN, 0)
     stop = np.minimum(np.ceil(moved.max(axis=(0, 1))).astype(np.intp) + _MARGIN + 1, sides[1])
     maps = (moved - corner).astype(np.float32)
-    one, wide = _smooth(first, low, high), _smooth(second, corner, stop)
-    weight = _window(*one.shape)
-    total = float(weight.sum())
-    one -= float((weight * one).sum()) / total
-    deviation = np.sqrt(float((weight * one * one).sum()) / total)
-    without_light = _without_illumination(one, weight)
-    gradient1 = without_light(_gradient(one))
-    shift = np.zeros(2)
+    return _SampledPair(low, _smooth(first, low, high), _smooth(second, corner, stop), maps)
+
+
+@dataclass(frozen=True, eq=False)
+class _Displaced:
+    """Both images of a block when the second is displaced so that they agree; means 0, equally bright."""
+
+    shift: FloatArray  # (2,), pixels
+    first: Image
+    second: Image
+    weight: Image
+    gradient: Gradient  # weighted mean of both
+    hessian: FloatArray  # (2, 2): of half of their squared difference by the shift
+
+    @property
+    def significant(self) -> bool:
+        """Whether they correlate by more than noise would."""
+        total = float(self.weight.sum())
+        power = float((self.weight * self.first * self.first).sum())
+        correlation = float((self.weight * self.first * self.second).sum()) / power
+        return bool(correlation * np.sqrt(total / _CORRELATED) >= _SIGNIFICANT)
+
+    @property
+    def information(self) -> FloatArray:
+        """Inverse covariance (2, 2) of the shift, by what is left of their difference."""
+        left = float((self.weight * (self.first - self.second) ** 2).sum())
+        noise, weight = left / float(self.weight.sum()) * _CORRELATED, np.maximum(self.weight, 1e-6)
+        energy = np.array([[float((a * b / weight).sum()) for b in self.gradient] for a in self.gradient])
+        return np.asarray(self.hessian @ np.linalg.pinv(noise * energy) @ self.hessian)
+
+
+def _displaced(pair: _SampledPair, tolerance: float) -> _Displaced | None:
+    """Newton's method on the correlation; None where it leaves the tolerance, or nothing has structure."""
+    weight = _window(*pair.block.shape)
+    first, deviation = _centred(pair.block, weight)
+    without_light = _without_illumination(first, weight)
+    gradient1 = without_light(_gradient(first))
+    shift, found = np.zeros(2), None
     for _ in range(_ITERATIONS):
-        x, y = (maps[..., k] - np.float32(shift[k]) for k in (0, 1))
+        x, y = (pair.maps[..., k] - np.float32(shift[k]) for k in (0, 1))
         # Smoothed, so that linear interpolation will do; OpenCV's cubic kernel moves content by up to 0.05 pixels.
-        two = cv2.remap(wide, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        two = two - float((weight * two).sum()) / total
-        spread = np.sqrt(float((weight * two * two).sum()) / total)
+        sampled = cv2.remap(pair.other, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        second, spread = _centred(np.asarray(sampled, dtype=np.float32), weight)
         if not min(spread, deviation) > 0.0:
             return None
-        two *= np.float32(deviation / spread)
-        gradient2 = without_light(_gradient(two))
+        second *= np.float32(deviation / spread)
+        gradient2 = without_light(_gradient(second))
         mean = [(a + b) * np.float32(0.5) * weight for a, b in zip(gradient1, gradient2, strict=True)]
         # The gradients of both images in one product: noise, which they do not share, is not taken for structure.
         hessian = np.array([[float((weight * a * b).sum()) for b in gradient2] for a in gradient1])
         hessian = (hessian + hessian.T) / 2.0
-        difference = one - two
-        slope = np.array([float((g * difference).sum()) for g in mean])
         if np.linalg.det(hessian) <= 0.0 or np.trace(hessian) <= 0.0:
             return None
-        step = -np.linalg.solve(hessian, slope)
+        step = -np.linalg.solve(hessian, [float((g * (first - second)).sum()) for g in mean])
         shift = shift + np.clip(step, -1.0, 1.0)
-        if np.abs(shift).max() > min(tolerance, _MARGIN - 2.0):
+        if np.abs(shift).max() > tolerance:
             return None
-        if np.abs(step).max() < 0.003:
+        found = _Displaced(shift, first, second, weight, mean, hessian)
+        if np.abs(step).max() < _SETTLED:
             break
-    correlation = float((weight * one * two).sum()) / (total * deviation**2)
-    if correlation * np.sqrt(total / _CORRELATED) < _SIGNIFICANT:
-        return None
-    noise = float((weight * difference**2).sum()) / total * _CORRELATED
-    energy = np.array([[float((a * b / np.maximum(weight, 1e-6)).sum()) for b in mean] for a in mean])
-    information = hessian @ np.linalg.pinv(noise * energy) @ hessian
-    point = low + _centroid(mean)
-    return point, transfer(point[None])[0] - shift, information
+    return found
+
+
+def _centred(image: Image, weight: Image) -> tuple[Image, float]:
+    """An image without its weighted mean, and its standard deviation."""
+    total = float(weight.sum())
+    centred = image - np.float32(float((weight * image).sum()) / total)
+    return centred, math.sqrt(float((weight * centred * centred).sum()) / total)
 
 
 @lru_cache(maxsize=256)
@@ -133,18 +183,18 @@ def _interpolation(length: int) -> FloatArray:
     return weights
 
 
-def _smooth(tile: NDArray[Any], low: IntArray, high: IntArray) -> NDArray[np.float32]:
+def _smooth(tile: NDArray[Any], low: IntArray, high: IntArray) -> Image:
     part = tile[low[1] : high[1], low[0] : high[0]].astype(np.float32)
     return np.asarray(cv2.GaussianBlur(part, (0, 0), _SMOOTHING, borderType=cv2.BORDER_REFLECT), dtype=np.float32)
 
 
-def _gradient(image: NDArray[np.float32]) -> Gradient:
+def _gradient(image: Image) -> Gradient:
     """Derivatives by x and y, central differences."""
     kernel = np.array([[-0.5, 0.0, 0.5]], dtype=np.float32)
     return [np.asarray(cv2.filter2D(image, -1, k), dtype=np.float32) for k in (kernel, kernel.T)]
 
 
-def _without_illumination(image: NDArray[np.float32], weight: NDArray[np.float32]) -> Callable[[Gradient], Gradient]:
+def _without_illumination(image: Image, weight: Image) -> Callable[[Gradient], Gradient]:
     """What is left of a gradient without what a change of illumination over a block may look like.
 
     That is a ramp in front of the image, or one that multiplies it: neighbours have their overlap on opposite sides.
@@ -163,10 +213,10 @@ def _without_illumination(image: NDArray[np.float32], weight: NDArray[np.float32
     return project
 
 
-def _window(height: int, width: int) -> NDArray[np.float32]:
+def _window(height: int, width: int) -> Image:
     """Weights that fall to 0 within a few pixels of the border."""
 
-    def side(length: int) -> NDArray[np.float32]:
+    def side(length: int) -> Image:
         distance = np.minimum(np.arange(length), np.arange(length)[::-1]) + 0.5
         return np.asarray(np.minimum(1.0, distance / min(6.0, length / 4.0)), dtype=np.float32)
 

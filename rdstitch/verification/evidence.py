@@ -11,12 +11,12 @@ from rdstitch.choices import Purpose
 from rdstitch.matching.two_view import Pair
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import NO_CACHE, Cache
-from rdstitch.verification.limits import limit
+from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps, share_alike
 
 
 @dataclass(frozen=True)
-class Evidence:
+class ResultEvidence:
     """Everything that rules look at; what takes long is computed when the first of them asks for it."""
 
     registration: Registration
@@ -62,12 +62,16 @@ class Evidence:
         """Whether what an image, or a pair, or all of them if empty, has in common with others is clearly alike."""
         links = [link for link in self.checked if len({*images} & {*link.pair}) == len(images)]
         cells = sum(link.agreement.cells for link in links)
-        return cells >= limit("cells") and share_alike(links) >= limit("alike")
+        return cells >= Limits.cells.value and share_alike(links) >= Limits.alike.value
+
+    def explained_by_depth(self, images: Sequence[int]) -> bool:
+        """Whether matches of a picture disagree where its images look alike: it has depth, or something moved."""
+        return self.purpose.picture and self.looks_right(images)
 
     @cached_property
     def alike(self) -> float:
         """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
-        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= limit("cells")]
+        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= Limits.cells.value]
         return float(np.median(shares)) if shares else 0.0
 
     @property

@@ -1,9 +1,9 @@
 """What the rules find: data that repairs are made from, and the one place where they become sentences."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Any, TypedDict
 
 from rdstitch.results.messages import MAX_NAMED, Message, Severity, names_of, shortened
 from rdstitch.results.registration import Registration
@@ -20,139 +20,102 @@ class Scope(Enum):
 class Kind(Enum):
     """What there is to find: what is to blame, a heading in docs/troubleshooting.md, and the sentence."""
 
-    LENSES_MIXED = (
-        Scope.WHOLE,
-        "",
-        (
-            "two lenses or zooms are mixed: {images2} (λ about {lens2:.3f}) and {images1} ({lens1:.3f}); stitch "
-            "those of each on their own"
-        ),
+    # fmt: off
+    LENSES_MIXED = Scope.WHOLE, "", (
+        "two lenses or zooms are mixed: {images2} (λ about {lens2:.3f}) and {images1} ({lens1:.3f}); stitch those of "
+        "each on their own"
     )
-    MATCHES_DISAGREE = (
-        Scope.WHOLE,
-        "",
-        "only {inliers} of {count} matches fit the places that were found for the images",
+    MATCHES_DISAGREE = Scope.WHOLE, "", (
+        "only {inliers} of {count} matches fit the places that were found for the images"
     )
-    IMAGE_MISFITS = (
-        Scope.IMAGE,
-        "",
-        "only {inliers} of {count} of its matches fit the place that was found for it; {reason}",
+    IMAGE_MISFITS = Scope.IMAGE, "", (
+        "only {inliers} of {count} of its matches fit the place that was found for it; {reason}"
     )
-    PAIR_MISFITS = (
-        Scope.PAIR,
-        "",
-        "{both}: only {inliers} of {count} matches fit the places that were found for them; {reason}",
+    PAIR_MISFITS = Scope.PAIR, "", (
+        "{both}: only {inliers} of {count} matches fit the places that were found for them; {reason}"
     )
-    ERRORS = (
-        Scope.WHOLE,
-        "",
-        "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels",
+    ERRORS = Scope.WHOLE, "", "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels"
+    ROUGH = Scope.WHOLE, "relief", (
+        "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels, most of all "
+        "{both}: the ground is rough"
     )
-    ROUGH = (
-        Scope.WHOLE,
-        "relief",
-        (
-            "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels, most of all "
-            "{both}: the ground is rough"
-        ),
+    RELIEF = Scope.WHOLE, "relief", "{what}; most of all between {first} and {second} ({rms:.1f} pixels)"
+    DEPTH_OF_A_TURN = Scope.WHOLE, "parallax", "{what}; most of all between {first} and {second} ({rms:.1f} pixels)"
+    FREE_HOMOGRAPHIES = Scope.WHOLE, "shape", (
+        "global accuracy unknown: the images do not come from one camera with one focal length, or what they show is "
+        "not flat; each has a homography of its own, and their errors add up from image to image, most of all between "
+        "{first} and {second}"
     )
-    RELIEF = (
-        Scope.WHOLE,
-        "relief",
-        "{what}; most of all between {first} and {second} ({rms:.1f} pixels)",
+    UNLIKE = Scope.PAIR, "", (
+        "{both} do not look alike where they are put together ({confirming} of {cells} places agree)"
     )
-    DEPTH_OF_A_TURN = (
-        Scope.WHOLE,
-        "parallax",
-        "{what}; most of all between {first} and {second} ({rms:.1f} pixels)",
+    AMBIGUOUS = Scope.PAIR, "", (
+        "{both} fit as well elsewhere, {shift:.0%} of an image away (a repeated pattern?); take images that share "
+        "something unique"
     )
-    FREE_HOMOGRAPHIES = (
-        Scope.WHOLE,
-        "shape",
-        (
-            "global accuracy unknown: the images do not come from one camera with one focal length, or what they "
-            "show is not flat; each has a homography of its own, and their errors add up from image to image, most of "
-            "all between {first} and {second}"
-        ),
-    )
-    UNLIKE = (
-        Scope.PAIR,
-        "",
-        "{both} do not look alike where they are put together ({confirming} of {cells} places agree)",
-    )
-    AMBIGUOUS = (
-        Scope.PAIR,
-        "",
-        (
-            "{both} fit as well elsewhere, {shift:.0%} of an image away (a repeated pattern?); take images that "
-            "share something unique"
-        ),
-    )
-    PATTERN = (
-        Scope.WHOLE,
-        "",
-        "{count} of {of} pairs fit as well elsewhere (a repeated pattern?)",
-    )
-    LOOKED_AT = (
-        Scope.WHOLE,
-        "",
+    PATTERN = Scope.WHOLE, "", "{count} of {of} pairs fit as well elsewhere (a repeated pattern?)"
+    LOOKED_AT = Scope.WHOLE, "", (
         "of {of} overlaps {count} were compared in their pixels, {sampled} of them at random: at most {share:.1%} of "
-        "all are wrong, with a confidence of 95%",
+        "all are wrong, with a confidence of 95%"
     )
-    SETTLED_PATTERN = (
-        Scope.WHOLE,
-        "repeated-pattern",
-        (
-            "the images show a repeated pattern; what is unique in them (dirt, a mark, an object) decided where "
-            "they lie; look at the seams, that between {first} and {second} first"
-        ),
+    SETTLED_PATTERN = Scope.WHOLE, "repeated-pattern", (
+        "the images show a repeated pattern; what is unique in them (dirt, a mark, an object) decided where they lie; "
+        "look at the seams, that between {first} and {second} first"
     )
-    RIVAL_MOTION = (
-        Scope.WHOLE,
-        "rival-motion",
+    RIVAL_MOTION = Scope.WHOLE, "rival-motion", (
         "what was put together fills at most {share:.0%} of the images, and the rest looks different (something that "
-        "moved, or a second surface?); mask what does not belong to the plane",
+        "moved, or a second surface?); mask what does not belong to the plane"
     )
-    TWO_OF_ONE_LENS = (
-        Scope.WHOLE,
-        "mixed-lenses",
-        (
-            "{both} fit without the images of another lens, as any two do; if all are of one lens, the scene is "
-            "not flat, and these two lie wrongly; add images of this lens"
-        ),
+    TWO_OF_ONE_LENS = Scope.WHOLE, "mixed-lenses", (
+        "{both} fit without the images of another lens, as any two do; if all are of one lens, the scene is not flat, "
+        "and these two lie wrongly; add images of this lens"
     )
-    SEVERAL_CAMERAS = (
-        Scope.WHOLE,
-        "mixed-lenses",
-        "the images come from {number} cameras: {bodies}; stitch those of each on their own",
+    SEVERAL_CAMERAS = Scope.WHOLE, "mixed-lenses", (
+        "the images come from {number} cameras: {bodies}; stitch those of each on their own"
     )
-    ZOOMED = (
-        Scope.WHOLE,
-        "mixed-lenses",
-        (
-            "the lens was zoomed between the images, by up to {ratio:.2f} (between {near} and {far}); stitch "
-            "those of one zoom on their own"
-        ),
+    ZOOMED = Scope.WHOLE, "mixed-lenses", (
+        "the lens was zoomed between the images, by up to {ratio:.2f} (between {near} and {far}); stitch those of one "
+        "zoom on their own"
     )
-    UNMASKED = (
-        Scope.WHOLE,
-        "",
-        "{without_count} of {of_all} images have no mask: {without}",
+    UNMASKED = Scope.WHOLE, "", "{without_count} of {of_all} images have no mask: {without}"
+    OUTVOTED = Scope.WHOLE, "doubtful-seam", (
+        "{they_fit} badly, and little depends on {them}: {named}; look at the seams between them"
     )
-    OUTVOTED = (
-        Scope.WHOLE,
-        "doubtful-seam",
-        "{they_fit} badly, and little depends on {them}: {named}; look at the seams between them",
-    )
-    OUTVOTED_PATTERN = (
-        Scope.WHOLE,
-        "doubtful-seam",
+    OUTVOTED_PATTERN = Scope.WHOLE, "doubtful-seam", (
         "{they_fit} as well elsewhere (a repeated pattern?), and little depends on {them}: {named}; look at the seams "
-        "between them",
+        "between them"
     )
+    # fmt: on
 
     def __init__(self, scope: Scope, code: str, text: str) -> None:
         self.scope, self.code, self.text = scope, code, text
+
+
+class Measured(TypedDict, total=False):
+    """What a rule measured, of which each kind's sentence names some: images by their indices."""
+
+    inliers: int
+    count: int
+    of: int
+    sampled: int
+    confirming: int
+    cells: int
+    rms: float  # rms, threshold: pixels
+    threshold: float
+    share: float
+    shift: float  # share of an image
+    ratio: float
+    reason: str
+    what: str
+    lens1: float  # lens1, lens2: λ
+    lens2: float
+    images1: list[int]
+    images2: list[int]
+    without: list[int]
+    near: int
+    far: int
+    bodies: dict[str, list[int]]
+    pairs: list[tuple[int, ...]]
 
 
 @dataclass(frozen=True)
@@ -162,7 +125,7 @@ class Finding:
     kind: Kind
     images: tuple[int, ...] = ()  # indices of the images that it concerns; empty where it concerns the whole
     severity: Severity = "failure"  # as of :class:`rdstitch.results.messages.Message`
-    values: Mapping[str, object] = field(default_factory=dict)  # what was measured: sizes, shares and counts, by name
+    values: Measured = field(default_factory=Measured)
 
     @property
     def fails(self) -> bool:

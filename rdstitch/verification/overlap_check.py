@@ -16,7 +16,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import NO_CACHE, Cache
-from rdstitch.verification.limits import limit
+from rdstitch.verification.limits import Limits
 from rdstitch.verification.photometric_agreement import (
     COMPARED_SIDE,
     Agreement,
@@ -125,7 +125,7 @@ def share_alike(checked: Sequence[CheckedLink]) -> float:
 
 def wrong_at_most(checked: Sequence[CheckedLink]) -> float:
     """Share of all links that may look unlike, by those taken at random (Wilson's upper bound, 95 %); 1 without any."""
-    cells, unlike = limit("cells"), limit("unlike")
+    cells, unlike = Limits.cells.value, Limits.unlike.value
     sampled = [link.agreement for link in checked if link.sampled and link.agreement.cells >= cells]
     if not sampled:
         return 1.0

@@ -23,7 +23,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import mean_of_channels
-from rdstitch.verification.limits import limit
+from rdstitch.verification.limits import Limits
 
 Grey = NDArray[np.float32]
 
@@ -149,7 +149,7 @@ def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
 
 def _have_texture(cells: Grey) -> NDArray[np.bool_]:
     """Which cells (N, h, w) are distinctive; not those with transparent pixels, whose deviation is NaN."""
-    return np.asarray(cells.std(axis=(1, 2)) > limit("texture"))
+    return np.asarray(cells.std(axis=(1, 2)) > Limits.texture.value)
 
 
 def _confirms(cell: Grey, window: Grey) -> bool:
@@ -157,6 +157,6 @@ def _confirms(cell: Grey, window: Grey) -> bool:
     scores = np.asarray(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(scores.argmax()), scores.shape)
     return bool(
-        scores[row, column] >= limit("correlation")
-        and np.hypot(row - _SEARCH_RADIUS, column - _SEARCH_RADIUS) <= limit("offset")
+        scores[row, column] >= Limits.correlation.value
+        and np.hypot(row - _SEARCH_RADIUS, column - _SEARCH_RADIUS) <= Limits.offset.value
     )

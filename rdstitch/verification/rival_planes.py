@@ -20,7 +20,7 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import PAIRS_ESTIMATED_AT_ONCE, Pair, PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
-from rdstitch.verification.limits import limit
+from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, overlap_agreement
 
@@ -38,7 +38,7 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
         first = images.placed(pair[0], motion.camera, motion.homography)
         return fills_at_most([overlap_agreement(first, images.placed(pair[1], motion.camera2, np.eye(3)))])
 
-    half = limit("filled by a plane")
+    half = Limits.filled_by_plane.value
     found = {pair.images: (fills(pair.images, pair.relation), pair.relation) for pair in pairs}
     if all(share >= half for share, _ in found.values()):
         return None
@@ -75,7 +75,7 @@ def second_motions(
     """
     result = {}
     rests = {pair.images: np.flatnonzero(~pair.relation.inliers) for pair in pairs}
-    enough = [pair for pair in pairs if len(rests[pair.images]) >= limit("inliers of a motion")]
+    enough = [pair for pair in pairs if len(rests[pair.images]) >= Limits.motion_inliers.value]
     for batch in batches(enough, PAIRS_ESTIMATED_AT_ONCE):
         given = []
         for pair in batch:
@@ -85,7 +85,7 @@ def second_motions(
             given.append(PairMatches(matches.points1, matches.points2, camera, other, -matches.ratio))
         motions = estimate_radial_homographies(given, EstimationOptions(threshold=threshold))
         for pair, motion in zip(batch, motions, strict=True):
-            if motion and int(motion.inliers.sum()) >= limit("inliers of a motion"):
+            if motion and int(motion.inliers.sum()) >= Limits.motion_inliers.value:
                 inliers = np.zeros(len(pair.matches), dtype=np.bool_)
                 inliers[rests[pair.images][motion.inliers]] = True
                 result[pair.images] = replace(motion, inliers=inliers)

@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 from rdstitch.alignment.result import LinkFit, links_by_image
 from rdstitch.alignment.unaligned import few_features
+from rdstitch.choices import Purpose
 from rdstitch.inputs.source import Source
-from rdstitch.verification.evidence import Evidence
-from rdstitch.verification.findings import Finding, Kind
-from rdstitch.verification.limits import limit
+from rdstitch.verification.evidence import ResultEvidence
+from rdstitch.verification.findings import Finding, Kind, Measured
+from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import wrong_at_most
 from rdstitch.verification.rival_planes import fills_at_most
 
@@ -21,78 +22,76 @@ MAX_WARNINGS = 3
 """Lines of one run."""
 
 
-_TELLING = 0.1
-"""Share of overlaps that may be wrong, below which a sample of them says something."""
-
-
-def disagreeing_pairs(evidence: Evidence) -> Iterator[Finding]:
+def disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
     """Pairs of whose matches most do not fit into the whole."""
     for fit in evidence.used:
-        if fit.inliers < limit("inliers of a pair") * fit.count:
-            reason = _reason(evidence, (fit.image1, fit.image2), [fit], "stitch them on their own")
-            yield _of_matches(Kind.PAIR_MISFITS, (fit.image1, fit.image2), [fit], reason)
+        if fit.inliers < Limits.pair_inliers.value * fit.count and not evidence.explained_by_depth(fit.images):
+            reason = _reason(evidence, fit.images, [fit], "stitch them on their own")
+            yield Finding(Kind.PAIR_MISFITS, fit.images, values={**_counts([fit]), "reason": reason})
 
 
-def _misfitting_images(evidence: Evidence) -> Iterator[Finding]:
+def _misfitting_images(evidence: ResultEvidence) -> Iterator[Finding]:
     """Images of whose matches too many do not fit into the whole, over all pairs that do."""
     for k, links in sorted(links_by_image(evidence.used).items()):
-        fits = [fit for fit in links if fit.inliers >= limit("inliers of a pair") * fit.count]
-        if sum(fit.inliers for fit in fits) < limit("inliers of an image") * sum(fit.count for fit in fits):
-            yield _of_matches(Kind.IMAGE_MISFITS, (k,), fits, _reason(evidence, (k,), fits))
+        fits = [fit for fit in links if fit.inliers >= Limits.pair_inliers.value * fit.count]
+        counts = _counts(fits)
+        few = counts["inliers"] < Limits.image_inliers.value * counts["count"]
+        if few and not evidence.explained_by_depth((k,)):
+            yield Finding(Kind.IMAGE_MISFITS, (k,), values={**counts, "reason": _reason(evidence, (k,), fits)})
 
 
-def _matches_disagree(evidence: Evidence) -> Iterator[Finding]:
-    if sum(fit.inliers for fit in evidence.used) < limit("inliers of a pair") * sum(fit.count for fit in evidence.used):
-        yield _of_matches(Kind.MATCHES_DISAGREE, (), evidence.used)
+def _matches_disagree(evidence: ResultEvidence) -> Iterator[Finding]:
+    counts = _counts(evidence.used)
+    if counts["inliers"] < Limits.pair_inliers.value * counts["count"] and not evidence.explained_by_depth(()):
+        yield Finding(Kind.MATCHES_DISAGREE, values=counts)
 
 
-def _of_matches(kind: Kind, images: tuple[int, ...], fits: Sequence[LinkFit], reason: str = "") -> Finding:
-    inliers, count = sum(fit.inliers for fit in fits), sum(fit.count for fit in fits)
-    return Finding(kind, images, values={"inliers": inliers, "count": count, "reason": reason})
+def _counts(fits: Sequence[LinkFit]) -> Measured:
+    return {"inliers": sum(fit.inliers for fit in fits), "count": sum(fit.count for fit in fits)}
 
 
-def _reason(evidence: Evidence, images: Sequence[int], fits: Sequence[LinkFit], remedy: str = "") -> str:
+def _reason(evidence: ResultEvidence, images: Sequence[int], fits: Sequence[LinkFit], remedy: str = "") -> str:
     """Why matches agree with each other only."""
     few = [(evidence.registration.sources[k].name, few_features(evidence.registration.keypoints, k)) for k in images]
     if any(why for _, why in few):
         return ", ".join(f"{name} has {why}" for name, why in few if why)
     why = "they fit each other: does it show another surface, or come from another camera or zoom?"
-    if sum(fit.count for fit in fits) < limit("few matches"):
+    if sum(fit.count for fit in fits) < Limits.few_matches.value:
         why = "too few to place it: little overlap, or none?"
     return f"{why} {remedy}".strip()
 
 
-def _mixed_lenses(evidence: Evidence) -> Iterator[Finding]:
+def _mixed_lenses(evidence: ResultEvidence) -> Iterator[Finding]:
     """Two lenses whose images were not separated: it is not clear which are whose, or each has one image only."""
     mixed = evidence.registration.mixed
     if mixed is not None and not mixed.certain:
         images1, images2 = ([k for k, other in enumerate(mixed.second) if other == which] for which in (False, True))
         lens1, lens2 = mixed.distortion
-        values = {"images1": images1, "images2": images2, "lens1": lens1, "lens2": lens2}
+        values: Measured = {"images1": images1, "images2": images2, "lens1": lens1, "lens2": lens2}
         yield Finding(Kind.LENSES_MIXED, values=values)
 
 
-def _errors(evidence: Evidence) -> Iterator[Finding]:
+def _errors(evidence: ResultEvidence) -> Iterator[Finding]:
     """Errors of all pairs together; of a picture its seams say whether they are seen."""
     alignment, threshold = evidence.alignment, evidence.threshold
     rms, relief = alignment.rms, alignment.relief
-    if rms <= limit("error") * threshold:
+    if rms <= Limits.error.value * threshold:
         return
-    largest = limit("error that relief explains") * 2.0 * max(camera.scale for camera in alignment.cameras)
+    largest = Limits.relief_error.value * 2.0 * max(camera.scale for camera in alignment.cameras)
     # Without what neighbours have in common, errors are those of a plane.
-    explained = rms <= largest and rms**2 - relief.size**2 <= (limit("error") * threshold) ** 2
+    explained = rms <= largest and rms**2 - relief.size**2 <= (Limits.error.value * threshold) ** 2
     # Where the pixels agree, depth that one surface does not explain has been found a place all the same.
-    rough = (rms <= limit("error of rough ground") * threshold and evidence.alike >= limit("alike")) or (
-        relief.found and explained and evidence.alike >= limit("clearly alike")
+    rough = (rms <= Limits.rough_error.value * threshold and evidence.alike >= Limits.alike.value) or (
+        relief.found and explained and evidence.alike >= Limits.clearly_alike.value
     )
-    values = {"rms": rms, "threshold": threshold}
+    values: Measured = {"rms": rms, "threshold": threshold}
     if rough or evidence.purpose.picture:
         yield Finding(Kind.ROUGH, max(evidence.used, key=lambda fit: fit.rms).images, "warning", values)
     else:
         yield Finding(Kind.ERRORS, values=values)
 
 
-def _depth(evidence: Evidence) -> Iterator[Finding]:
+def _depth(evidence: ResultEvidence) -> Iterator[Finding]:
     """Errors that neighbouring matches have in common, and where they are largest."""
     if evidence.alignment.relief.found:
         fit = max(evidence.used, key=lambda fit: fit.rms)
@@ -101,7 +100,7 @@ def _depth(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(kind, (fit.image1, fit.image2), "warning", {"what": what, "rms": fit.rms})
 
 
-def _free_homographies(evidence: Evidence) -> Iterator[Finding]:
+def _free_homographies(evidence: ResultEvidence) -> Iterator[Finding]:
     """A homography for each of three or more images: their chain bends with whatever is not modelled."""
     alignment = evidence.alignment
     if evidence.flat and alignment.focal is None:
@@ -109,57 +108,55 @@ def _free_homographies(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(Kind.FREE_HOMOGRAPHIES, fit.images, "warning" if alignment.relief.found else "detail")
 
 
-def _unlike(evidence: Evidence) -> Iterator[Finding]:
+def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
     """Images that were put together and are no more alike there than by chance; of a picture also at a coarse scale,
     as depth shifts what it shows by a little nearly everywhere.
     """
     for link in evidence.checked:
-        coarsely = evidence.purpose.picture and link.agreement.coarsely >= limit("filled by a plane")
-        if link.agreement.cells >= limit("cells") and link.agreement.share < limit("unlike") and not coarsely:
-            values = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
+        coarsely = evidence.purpose.picture and link.agreement.coarsely >= Limits.filled_by_plane.value
+        if link.agreement.cells >= Limits.cells.value and link.agreement.share < Limits.unlike.value and not coarsely:
+            values: Measured = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
             yield Finding(Kind.UNLIKE, link.pair, "failure", values)
 
 
-def _looked_at(evidence: Evidence) -> Iterator[Finding]:
+def _looked_at(evidence: ResultEvidence) -> Iterator[Finding]:
     """How many of many overlaps were compared in their pixels, and what that says of the others."""
     checked, share = evidence.checked, wrong_at_most(evidence.checked)
-    if share < _TELLING:
+    if share < Limits.wrong_overlaps.value:
         sampled = sum(link.sampled for link in checked)
-        values = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": share}
+        values: Measured = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": share}
         yield Finding(Kind.LOOKED_AT, (), "detail", values)
 
 
-def _ambiguous(evidence: Evidence) -> Iterator[Finding]:
+def _ambiguous(evidence: ResultEvidence) -> Iterator[Finding]:
     for pair, link in evidence.ambiguous.items():
         yield Finding(Kind.AMBIGUOUS, pair, values={"shift": link.ambiguity.shift})
 
 
-def _pattern(evidence: Evidence) -> Iterator[Finding]:
+def _pattern(evidence: ResultEvidence) -> Iterator[Finding]:
     """A pattern over so many pairs that leaving some of them out proves nothing; or one in which the unique decided."""
-    if len(evidence.ambiguous) > limit("pattern") * len(evidence.checked):
+    if len(evidence.ambiguous) > Limits.pattern.value * len(evidence.checked):
         yield Finding(Kind.PATTERN, values={"count": len(evidence.ambiguous), "of": len(evidence.checked)})
     settled = [link for link in evidence.checked if link.unique]
     if settled:
         yield Finding(Kind.SETTLED_PATTERN, min(settled, key=lambda link: link.agreement.share).pair, "warning")
 
 
-def _rival_motion(evidence: Evidence) -> Iterator[Finding]:
-    """Poses by something that fills less than half of the images: what drives ahead, say. Pictures have their seams, a
-    lens is the same.
-    """
-    share = fills_at_most(link.agreement for link in evidence.checked) if evidence.purpose.poses else 1.0
-    if share < limit("filled by a plane"):
+def _rival_motion(evidence: ResultEvidence) -> Iterator[Finding]:
+    """Poses by something that fills less than half of the images: what drives ahead, say."""
+    share = fills_at_most(link.agreement for link in evidence.checked)
+    if share < Limits.filled_by_plane.value:
         yield Finding(Kind.RIVAL_MOTION, values={"share": share})
 
 
-def _two_left(evidence: Evidence) -> Iterator[Finding]:
+def _two_left(evidence: ResultEvidence) -> Iterator[Finding]:
     """Two images without a third, taken for one of another lens, which is all that tells a curved wall from a plane."""
     used = evidence.alignment.used
     if evidence.registration.mixed is not None and used.sum() == 2:
         yield Finding(Kind.TWO_OF_ONE_LENS, tuple(used.nonzero()[0].tolist()), "warning")
 
 
-def _inputs(evidence: Evidence) -> Iterator[Finding]:
+def _inputs(evidence: ResultEvidence) -> Iterator[Finding]:
     """Images of several cameras or zoom settings, and images without a mask among others, by headers and files."""
     sources = evidence.registration.sources
     bodies: dict[str, list[int]] = {}
@@ -170,7 +167,7 @@ def _inputs(evidence: Evidence) -> Iterator[Finding]:
     focal = {k: _focal_share(source) for k, source in enumerate(sources) if source.metadata.focal_px is not None}
     if len(bodies) > 1:
         yield Finding(Kind.SEVERAL_CAMERAS, (), "warning", {"bodies": bodies})
-    elif focal and max(focal.values()) > limit("zoom") * min(focal.values()):
+    elif focal and max(focal.values()) > Limits.zoom.value * min(focal.values()):
         near, far = min(focal, key=lambda k: focal[k]), max(focal, key=lambda k: focal[k])
         yield Finding(Kind.ZOOMED, (), "warning", {"ratio": focal[far] / focal[near], "near": near, "far": far})
     without = [k for k, source in enumerate(sources) if source.mask is None]
@@ -182,51 +179,60 @@ def _focal_share(source: Source) -> float:
     return float(source.metadata.focal_px or 0.0) / max(source.metadata.size)
 
 
-Find = Callable[[Evidence], Iterable[Finding]]
+class Rule(NamedTuple):
+    """What finds something, and for which recipes it speaks."""
 
-OF_MATCHES: tuple[Find, ...] = (_mixed_lenses, _matches_disagree, _misfitting_images)
+    find: Callable[[ResultEvidence], Iterable[Finding]]
+    purposes: frozenset[Purpose] = frozenset(Purpose)
+
+
+_PLACES = frozenset(Purpose) - {Purpose.CALIBRATE}
+"""A board shifted by a square is as straight as before: the lens is the same."""
+
+_POSES = frozenset({Purpose.TRAJECTORY})
+"""Pictures have their seams, a lens is the same."""
+
+OF_MATCHES = Rule(_mixed_lenses), Rule(_matches_disagree), Rule(_misfitting_images)
 """Failures by which the pixels need not be asked: of images that may be left out."""
 
-OF_PAIRS: tuple[Find, ...] = (disagreeing_pairs, _unlike, _ambiguous)
+OF_PAIRS = Rule(disagreeing_pairs, _PLACES), Rule(_unlike, _PLACES), Rule(_ambiguous, _PLACES)
 """Suspicions of pairs, the last of each counts: a failure where images hang on it alone."""
 
-OF_THE_WHOLE: tuple[Find, ...] = (
-    _errors,
-    _depth,
-    _free_homographies,
-    _looked_at,
-    _pattern,
-    _rival_motion,
-    _two_left,
-    _inputs,
+OF_THE_WHOLE = (
+    Rule(_errors),
+    Rule(_depth),
+    Rule(_free_homographies, _PLACES),
+    Rule(_looked_at),
+    Rule(_pattern, _PLACES),
+    Rule(_rival_motion, _POSES),
+    Rule(_two_left),
+    Rule(_inputs),
 )
 """Everything else."""
 
-OF_PLACES = {
-    Kind.FREE_HOMOGRAPHIES, Kind.PATTERN, Kind.SETTLED_PATTERN, Kind.AMBIGUOUS,
-    Kind.OUTVOTED, Kind.OUTVOTED_PATTERN,
-}  # fmt: skip
-"""Kinds that make the places of images doubtful and leave the lens as it is: a board shifted by a square is as straight
-as before."""
+
+def found(rules: Iterable[Rule], evidence: ResultEvidence) -> list[Finding]:
+    """What those of some rules find that speak for the recipe."""
+    return [finding for rule in rules if evidence.purpose in rule.purposes for finding in rule.find(evidence)]
 
 
-def _bent(evidence: Evidence) -> bool:
+def _bent(evidence: ResultEvidence) -> bool:
     """Whether what neighbours share shows a bent plane, even where seams hold: it adds up from image to image, and
     tilts take most of it up.
     """
-    return evidence.flat and evidence.alignment.relief.size > limit("bent") * evidence.threshold
+    return evidence.flat and evidence.alignment.relief.size > Limits.bent.value * evidence.threshold
 
 
-def _depth_seen(evidence: Evidence) -> bool:
+def _depth_seen(evidence: ResultEvidence) -> bool:
     """Whether depth leaves the images unlike; pictures have their seams."""
-    return not evidence.purpose.picture and evidence.alike < limit("alike")
+    return not evidence.purpose.picture and evidence.alike < Limits.alike.value
 
 
 class Aloud(NamedTuple):
     """When a warning of a kind is one, and not a detail; of one topic the first is."""
 
     topic: str
-    speaks: Callable[[Evidence], bool] = lambda evidence: True
+    speaks: Callable[[ResultEvidence], bool] = lambda evidence: True
 
 
 ALOUD = {

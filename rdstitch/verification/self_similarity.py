@@ -13,7 +13,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.verification.limits import limit
+from rdstitch.verification.limits import Limits
 from rdstitch.verification.photometric_agreement import ComparedImage, Grey
 
 MAX_SIDE = 256  # pixels of the images that are compared
@@ -41,8 +41,8 @@ class Ambiguity:
     def ambiguous(self) -> bool:
         """Whether the images fit elsewhere as well as here."""
         left, left_elsewhere = max(1.0 - self.here**2, _NOISE), 1.0 - self.elsewhere**2
-        as_well = self.elsewhere > max(limit("correlation"), limit("as well elsewhere") * self.here)
-        return as_well and left_elsewhere < limit("unexplained elsewhere") * left
+        as_well = self.elsewhere > max(Limits.correlation.value, Limits.as_well_elsewhere.value * self.here)
+        return as_well and left_elsewhere < Limits.unexplained_elsewhere.value * left
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ def placement_ambiguity(first: Drawing, second: Drawing, longest_side: int = MAX
     score = overlaps.correlation()
     # A peak of its own, not the flank of the one here.
     peak = score >= cv2.dilate(score, np.ones((2 * math.ceil(share * SLACK) + 1,) * 2, dtype=np.uint8))
-    enough = overlaps.area >= limit("kept overlap") * most
+    enough = overlaps.area >= Limits.kept_overlap.value * most
     other = np.where(peak & (distance > share * _MIN_SHIFT) & enough, score, np.float32(0.0))
     best = int(other.argmax())
     elsewhere = float(other.flat[best]) and _between_pixels(score, *np.unravel_index(best, score.shape))

@@ -14,7 +14,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.radial_homography import from_plane, to_plane
-from rdstitch.verification.limits import limit
+from rdstitch.verification.limits import Limits
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE, ComparedImage, Grey
 from rdstitch.verification.self_similarity import Drawing, Overlaps, draw, drawing_scale
 
@@ -40,8 +40,8 @@ class UniqueShift:
     @property
     def decides(self) -> bool:
         """Whether the images lie here and nowhere else."""
-        clear = self.matched >= max(limit("matched departures"), limit("lead") * self.rival)
-        return clear and self.share >= limit("same departures")
+        clear = self.matched >= max(Limits.matched_departures.value, Limits.lead.value * self.rival)
+        return clear and self.share >= Limits.same_departures.value
 
 
 def unique_shifts(
@@ -86,7 +86,7 @@ def departures(pixels: Grey) -> Grey | None:
     peaks = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
     periods = peaks.shift[np.hypot(*peaks.shift.T) > _MIN_SHIFT]
     periods = periods[np.argsort(np.hypot(*periods.T), kind="stable")][:_MAX_PERIODS]
-    if len(periods) < limit("periods"):
+    if len(periods) < Limits.periods.value:
         return None
     copies = np.stack([_shifted(pixels, shift) for shift in periods])
     count = np.isfinite(copies).sum(axis=0)
@@ -101,7 +101,7 @@ def departures(pixels: Grey) -> Grey | None:
         for values in (pixels - middle, spread)
     )
     relative = departure / np.maximum(usual, max(float(np.median(usual[known])), 1e-6))
-    size = np.clip(np.abs(relative) - limit("departure"), 0.0, _MOST)
+    size = np.clip(np.abs(relative) - Limits.departure.value, 0.0, _MOST)
     return np.where(known & (inside > 0), np.copysign(size, relative), np.float32(np.nan)).astype(np.float32)
 
 
@@ -139,7 +139,7 @@ def _peaks(overlaps: Overlaps, first: Grey, offset: FloatArray, least_overlap: f
     score = overlaps.correlation()
     kernel = np.ones((2 * _MIN_SHIFT + 1, 2 * _MIN_SHIFT + 1), dtype=np.uint8)
     enough = overlaps.area >= least_overlap * overlaps.area.max()
-    peak = (score >= cv2.dilate(score, kernel)) & enough & (score > limit("period"))
+    peak = (score >= cv2.dilate(score, kernel)) & enough & (score > Limits.period.value)
     peak[[0, -1]] = peak[:, [0, -1]] = False
     row, column = np.nonzero(peak)
     x, y = (

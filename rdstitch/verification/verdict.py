@@ -1,4 +1,4 @@
-"""Every run judges itself: can the result be relied on? Evidence, rules, findings."""
+"""Every run judges itself: can the result be relied on? ResultEvidence, rules, findings."""
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
@@ -10,7 +10,7 @@ from rdstitch.matching.two_view import Pair
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.verification import rules
-from rdstitch.verification.evidence import Evidence
+from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind
 
 
@@ -36,37 +36,35 @@ class RefusedError(RegistrationError):
         self.registration = registration
 
 
-def judge(evidence: Evidence) -> tuple[Finding, ...]:
+def judge(evidence: ResultEvidence) -> tuple[Finding, ...]:
     """Check an alignment against the pairs that it was made from, and against the pixels.
 
     Gives failures, with the images that they concern where that is clear, and warnings; none for a good result.
     """
-    lens_only = evidence.purpose.lens_only
+    if failures := failures_of_matches(evidence):
+        return failures
+    decisive, outvoted = _by_what_hangs_on_them(rules.found(rules.OF_PAIRS, evidence), evidence)
+    whole = rules.found(rules.OF_THE_WHOLE, evidence)
+    return _aloud([*decisive, *whole, *_outvoted(outvoted)], evidence)
+
+
+def failures_of_matches(evidence: ResultEvidence) -> tuple[Finding, ...]:
+    """Failures by matches alone: where there are any, pixels are not looked at before images are left out."""
+    found = rules.found(rules.OF_MATCHES, evidence)
+    if evidence.static:  # matches of what is static in the images agree with nothing
+        return tuple(finding for finding in found if not finding.images)
+    return *found, *_by_what_hangs_on_them(rules.disagreeing_pairs(evidence), evidence)[0]
+
+
+def _by_what_hangs_on_them(
+    suspicions: Iterable[Finding], evidence: ResultEvidence
+) -> tuple[list[Finding], list[Finding]]:
+    """Suspicions of pairs without which the images fall apart, and those of pairs on which nothing depends."""
+    by_pair = {(finding.images[0], finding.images[1]): finding for finding in suspicions}
     count = len(evidence.registration.sources)
-    of_matches = [finding for find in rules.OF_MATCHES for finding in find(evidence)]
-    if evidence.static:
-        of_matches = [finding for finding in of_matches if not finding.images]
-    else:
-        disagreeing = {(f.images[0], f.images[1]): f for f in rules.disagreeing_pairs(evidence)}
-        of_matches += [disagreeing[pair] for pair in decisive_pairs(disagreeing, evidence.used, count)]
-    of_matches = [finding for finding in of_matches if not _is_depth(finding, evidence)]
-    if of_matches:
-        return tuple(of_matches)
-    found = [finding for find in rules.OF_PAIRS for finding in find(evidence) if not _is_depth(finding, evidence)]
-    suspicions = {(finding.images[0], finding.images[1]): finding for finding in found}
-    hanging = [] if lens_only or evidence.static else decisive_pairs(suspicions, evidence.used, count)
-    whole = [finding for find in rules.OF_THE_WHOLE for finding in find(evidence)]
-    every = [*(suspicions[pair] for pair in hanging), *whole]
-    every += _outvoted([f for pair, f in suspicions.items() if pair not in hanging])
-    return _aloud([f for f in every if not (lens_only and f.kind in rules.OF_PLACES)], evidence)
-
-
-_OF_MATCHES = (Kind.MATCHES_DISAGREE, Kind.IMAGE_MISFITS, Kind.PAIR_MISFITS)
-
-
-def _is_depth(finding: Finding, evidence: Evidence) -> bool:
-    """Whether matches of a picture disagree where its images look alike: the scene has depth, or something moved."""
-    return evidence.purpose.picture and finding.kind in _OF_MATCHES and evidence.looks_right(finding.images)
+    decisive = set[Pair]() if evidence.static else set(decisive_pairs(by_pair, evidence.used, count))
+    found = [finding for pair, finding in by_pair.items() if pair in decisive]
+    return found, [finding for pair, finding in by_pair.items() if pair not in decisive]
 
 
 def decisive_pairs(suspicious: Collection[Pair], used: Sequence[LinkFit], count: int) -> list[Pair]:
@@ -89,7 +87,7 @@ def _outvoted(suspicions: Iterable[Finding]) -> list[Finding]:
     ]
 
 
-def _aloud(findings: Sequence[Finding], evidence: Evidence) -> tuple[Finding, ...]:
+def _aloud(findings: Sequence[Finding], evidence: ResultEvidence) -> tuple[Finding, ...]:
     """Make details of warnings that their rule silences, of all but the first of a kind, and of more than a few."""
     rank = {kind: number for number, kind in enumerate(rules.ALOUD)}
     topics, aloud = set[str](), set[int]()

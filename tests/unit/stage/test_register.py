@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +34,7 @@ def test_shading_of_a_third_is_found_to_a_percent(specimen: Specimen, rows: int,
     stage = StageGrid(rows=rows, columns=rows, tile=tile, specimen=specimen, content=0.5, seed=seed)
     shown = estimate_illumination(stage.render, len(stage))
     off = shown.field.gain / stage.flat_field - 1.0
-    assert np.sqrt((off**2).mean()) < 0.01
+    assert np.sqrt((off**2).mean()) < min(0.01, 3.0 * shown.error)
     if specimen == "fluorescence":
         assert shown.dark[0] == pytest.approx(100.0, abs=6.0)
     # Few tiles that show other things have none.
@@ -41,14 +42,20 @@ def test_shading_of_a_third_is_found_to_a_percent(specimen: Specimen, rows: int,
     assert estimate_illumination(few.render, 2).field is None
 
 
-@pytest.mark.parametrize("part", [np.s_[:40], np.s_[:9], np.s_[:, 200:220]])
-def test_narrow_tiles_show_their_flat_field_too(part: slice | tuple[slice, slice]) -> None:
-    stage = StageGrid(rows=7, columns=7, tile=256, specimen="brightfield", content=0.5, seed=1)
-    shown = estimate_illumination(lambda index: stage.render(index)[part], len(stage))
-    expected = stage.flat_field[part] / stage.flat_field[part].mean(axis=(0, 1))
-    assert shown.field is not None
-    off = shown.field.gain / expected - 1.0
-    assert np.sqrt((off**2).mean()) < 0.01
+_STRIPS: tuple[Any, ...] = np.s_[:40], np.s_[:9], np.s_[:, 200:220]
+
+
+@pytest.mark.parametrize(("specimen", "shown"), [("brightfield", 3), ("fluorescence", 0)])
+def test_narrow_tiles_show_their_flat_field_too_or_say_that_they_do_not(specimen: Specimen, shown: int) -> None:
+    """Strips of fluorescence do not show the dark level, which is half of their light."""
+    stage = StageGrid(rows=7, columns=7, tile=256, specimen=specimen, content=0.5, seed=1)
+    tiles = [stage.render(index) for index in range(len(stage))]
+    strips = [[tile[part] for tile in tiles] for part in _STRIPS]
+    found = [estimate_illumination(every.__getitem__, len(stage)) for every in strips]
+    assert sum(each.field is not None for each in found) == shown
+    for part, each in zip(_STRIPS, found, strict=True):
+        expected = stage.flat_field[part] / stage.flat_field[part].mean(axis=(0, 1))
+        assert each.field is None or np.sqrt(((each.field.gain / expected - 1.0) ** 2).mean()) < 0.01
 
 
 def test_what_is_read_before_the_flat_field_is_known_is_corrected_too(tmp_path: Path) -> None:

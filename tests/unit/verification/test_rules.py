@@ -15,24 +15,24 @@ from rdstitch.io.mask import Mask
 from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.results.messages import Message
 from rdstitch.verification import rules
-from rdstitch.verification.evidence import Evidence
+from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind, messages_of
-from rdstitch.verification.limits import LIMITS
+from rdstitch.verification.limits import Limit, Limits
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.self_similarity import Ambiguity
-from rdstitch.verification.verdict import _aloud
+from rdstitch.verification.verdict import _aloud, _outvoted
 from tests.registrations import CAMERA, evidence, registration, source
 
 FLAT = evidence(registration(), alike=0.8)
 
 
-def _said(*kinds: Kind, found: Evidence = FLAT) -> list[Kind]:
+def _said(*kinds: Kind, found: ResultEvidence = FLAT) -> list[Kind]:
     findings = [Finding(kind, (0,), "warning") for kind in kinds]
     return [finding.kind for finding in _aloud(findings, found) if finding.severity == "warning"]
 
 
-def _mosaic(shared: float) -> Evidence:
+def _mosaic(shared: float) -> ResultEvidence:
     relief = replace(FLAT.alignment.relief, found=True, size=shared)
     return evidence(registration(relief=relief), Purpose.MOSAIC, alike=0.8)
 
@@ -56,15 +56,15 @@ UNLIKE = evidence(TURNED.registration, alike=0.1)
         (_mosaic(0.99), [Kind.RELIEF], []),
     ],
 )
-def test_what_is_said_aloud(found: Evidence, kinds: list[Kind], said: list[Kind]) -> None:
+def test_what_is_said_aloud(found: ResultEvidence, kinds: list[Kind], said: list[Kind]) -> None:
     assert _said(*kinds, found=found) == said
 
 
 def test_failures_stay_and_what_is_not_said_is_a_detail() -> None:
     given = (Finding(Kind.ERRORS), Finding(Kind.IMAGE_MISFITS, (1,)))
     assert _aloud(given, TURNED) == given
-    (note,) = _aloud([Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "warning", {"size": 3.0})], FLAT)
-    assert note == Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "detail", {"size": 3.0})
+    (note,) = _aloud([Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "warning", {"rms": 3.0})], FLAT)
+    assert note == Finding(Kind.DEPTH_OF_A_TURN, (0, 1), "detail", {"rms": 3.0})
 
 
 def test_there_are_a_few_lines_of_a_run_the_gravest_first_and_one_of_a_kind() -> None:
@@ -73,8 +73,49 @@ def test_there_are_a_few_lines_of_a_run_the_gravest_first_and_one_of_a_kind() ->
     assert _said(others[0], others[0]) == others[:1]
 
 
-def test_every_kind_has_a_sentence_and_every_threshold_its_unit_andsource() -> None:
-    assert all(limit.unit and limit.source for limit in LIMITS.values())
+def test_every_threshold_has_its_unit_and_source() -> None:
+    limits = [limit for limit in vars(Limits).values() if isinstance(limit, Limit)]
+    assert len(limits) > 20
+    assert all(limit.unit and limit.source for limit in limits)
+
+
+def _fitting(share: float) -> tuple[LinkFit, ...]:
+    return tuple(LinkFit(i, j, 100, int(100 * share), 0.5, True) for i, j in ((0, 1), (1, 2)))
+
+
+def test_every_kind_has_a_sentence_that_its_rules_find_all_words_for() -> None:
+    rough, lenses = replace(FLAT.alignment.relief, found=True), np.array([False, True, False])
+    checked = [_checked(0.05, (0, 1), unique=False), _checked(0.9, (1, 2), unique=True)]
+    sampled = [replace(_checked(0.9, (k, k + 1), unique=False), sampled=True) for k in range(30)]
+    ahead = replace(checked[0], agreement=Agreement(80, 8, 100, 0.35))
+    cameras = [source("a.jpg", model="A"), source("b.jpg", model="B", mask=Mask(Path("m"))), source("c.jpg", model="B")]
+    zoomed = [
+        source(f"{name}.jpg", model="A", focal_px=focal) for name, focal in zip("abc", (9.0, 9.0, 7.0), strict=True)
+    ]
+    everything = [
+        evidence(
+            registration(
+                mixed=TwoLenses(lenses, (-0.1, -0.4), certain=False), links=_fitting(0.2), keypoints=(9, 9, 9)
+            ),
+            checked=[],
+        ),
+        evidence(
+            registration(links=_fitting(0.55), keypoints=(9, 9, 9)), checked=checked, ambiguous={(0, 1): checked[0]}
+        ),
+        evidence(registration(rms=4.0), alike=0.1, checked=[ahead]),
+        evidence(registration(rms=4.0, relief=rough, parameters=()), alike=0.9, checked=sampled),
+        evidence(registration(model="rotation", relief=rough), alike=0.1, checked=[]),
+        evidence(registration(mixed=TwoLenses(lenses, (-0.1, -0.4), certain=True), used=~lenses), checked=[]),
+        evidence(registration(cameras), checked=[]),
+        evidence(registration(zoomed), checked=[]),
+    ]
+    found = [
+        (each, rules.found((*rules.OF_MATCHES, *rules.OF_PAIRS, *rules.OF_THE_WHOLE), each)) for each in everything
+    ]
+    found.append((FLAT, _outvoted([Finding(Kind.UNLIKE, (0, 1)), Finding(Kind.AMBIGUOUS, (1, 2))])))
+    assert {finding.kind for _, findings in found for finding in findings} == set(Kind)
+    texts = [message.text for each, findings in found for message in messages_of(findings, each.registration)]
+    assert not any("{" in text for text in texts)
 
 
 @pytest.mark.parametrize(
@@ -92,8 +133,8 @@ def test_poses_by_what_fills_less_than_half_of_the_images_are_none(
 ) -> None:
     """A truck that drives ahead, say: four fifths of the images lie over each other, and most of that is unlike."""
     link = replace(_checked(0.1, (0, 1), unique=False), agreement=Agreement(80, 8, 100, coarsely))
-    found = list(rules._rival_motion(evidence(registration(), purpose, checked=[link])))
-    assert [finding.severity for finding in found] == severity
+    found = rules.found(rules.OF_THE_WHOLE, evidence(registration(), purpose, checked=[link]))
+    assert [finding.severity for finding in found if finding.kind is Kind.RIVAL_MOTION] == severity
 
 
 def _misfits(count: int, *, agree: float = 0.2, keypoints: tuple[int, ...] = (900, 900, 900)) -> list[Message]:

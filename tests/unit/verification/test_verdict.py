@@ -23,7 +23,7 @@ from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic import Photometry
 from rdstitch.verification import evidence, verdict
-from rdstitch.verification.evidence import Evidence
+from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind, messages_of
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
@@ -46,7 +46,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
 
 def judge(registration: Registration, threshold: float, purpose: Purpose = Purpose.MOSAIC) -> tuple[Message, ...]:
     """What is found, in words."""
-    return tuple(messages_of(verdict.judge(Evidence(registration, threshold, purpose=purpose)), registration))
+    return tuple(messages_of(verdict.judge(ResultEvidence(registration, threshold, purpose=purpose)), registration))
 
 
 def _texts(registration: Registration, purpose: Purpose = Purpose.MOSAIC) -> list[str]:
