@@ -53,9 +53,9 @@ def views_of(
     """The cameras of images that ``to_output`` (N, 3, 3) takes to the output; straight down by each one's attitude."""
     each = list(zip(cameras, to_output, strict=True))
     middle = np.array([_in_output(c, h, _middle(c)) for c, h in each])
-    beside = np.array([_in_output(c, h, _middle(c) + np.array([1.0, 0.0])) for c, h in each])
-    right = (beside - middle) / np.abs(beside - middle)
-    pixel = float(np.median(np.abs(beside - middle)))
+    next_pixel = np.array([_in_output(c, h, _middle(c) + np.array([1.0, 0.0])) for c, h in each])
+    right = (next_pixel - middle) / np.abs(next_pixel - middle)
+    pixel = float(np.median(np.abs(next_pixel - middle)))
     focal = np.array([np.nan if c.focal is None else c.focal for c in cameras])
     if np.isfinite(focal).all() and (centres := _centres(cameras, focal, to_output)) is not None:
         known = cameras[0]
@@ -66,7 +66,7 @@ def views_of(
         foot = centres[:, 0] - 1j * centres[:, 1]
         return Views(middle, foot, centres[:, 2], right, "poses", pixel, known.focal_log_std, tilt_alone)
     # A guess where nobody knows the focal length.
-    height = np.array([c.with_focal().focal or 0.0 for c in cameras]) * np.abs(beside - middle)
+    height = np.array([c.with_focal().focal or 0.0 for c in cameras]) * np.abs(next_pixel - middle)
     below = [_below(camera, nadir) for camera, nadir in zip(cameras, nadirs, strict=True)]
     if all(pixel is not None for pixel in below):
         foot = np.array([_in_output(*one, pixel) for one, pixel in zip(each, below, strict=True) if pixel is not None])

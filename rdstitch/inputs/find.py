@@ -96,8 +96,8 @@ def find_images(
             notes.append(item.unused_among(len(stills)))
             continue
         else:
-            extracted, said = item.extract(frames_folder(), every, topic)
-            images, notes = [NamedImage(frame) for frame in extracted], [*notes, *said]
+            extracted, further = item.extract(frames_folder(), every, topic)
+            images, notes = [NamedImage(frame) for frame in extracted], [*notes, *further]
         for image in images:
             path = image.frame.path
             is_output = image.frame.image is None and not is_url(path) and is_rdstitch_output(path)

@@ -143,12 +143,12 @@ def accuracy_of(row: Row) -> tuple[float, float] | None:
 def geographic_places(system: NamedSystem, places: FloatArray, file: str) -> list[tuple[float, float]]:
     """Latitude and longitude of eastings and northings (N, 2)."""
     try:
-        found = system.geographic(places)
+        degrees = system.geographic(places)
     except ArgumentError as error:
         raise InputError(f"{file}: {error}") from error
-    if not (np.isfinite(found).all() and (np.abs(found) <= (90.0, 180.0)).all()):
+    if not (np.isfinite(degrees).all() and (np.abs(degrees) <= (90.0, 180.0)).all()):
         raise InputError(f"{file}: {system.text} has no such places; give the coordinate system of x and y")
-    return [(latitude, longitude) for latitude, longitude in found.tolist()]
+    return [(latitude, longitude) for latitude, longitude in degrees.tolist()]
 
 
 def _degrees(row: Row, column: str, reference: str) -> float | None:
@@ -166,9 +166,8 @@ def _degrees(row: Row, column: str, reference: str) -> float | None:
 def _same_names(sources: Sequence[Source], listed: Iterable[str]) -> dict[str, str]:
     """What a list calls each image: its name, or that in other case where only one image and one line are called so."""
     names, lines = Counter(s.name.casefold() for s in sources), {name.casefold(): name for name in set(listed)}
-    known = set(listed)
-    found = {}
+    known, names_in_list = set(listed), {}
     for source in sources:
         alike = lines.get(source.name.casefold(), source.name)
-        found[source.name] = alike if source.name not in known and names[alike.casefold()] == 1 else source.name
-    return found
+        names_in_list[source.name] = alike if source.name not in known and names[alike.casefold()] == 1 else source.name
+    return names_in_list

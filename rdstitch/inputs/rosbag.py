@@ -105,8 +105,8 @@ def camera_in_bag(path: Path, topic: str | None = None) -> "tuple[CameraFile, st
 
     with opened_bag(path) as reader:
         images = _chosen_topic(path, _image_topics(reader), topic)
-        beside = f"{images.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
-        chosen = [c for c in reader.connections if c.msgtype == _CAMERA_INFO and c.topic == beside]
+        info_topic = f"{images.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+        chosen = [c for c in reader.connections if c.msgtype == _CAMERA_INFO and c.topic == info_topic]
         for connection, _, data in reader.messages(connections=chosen) if chosen else ():
             message = reader.deserialize(data, connection.msgtype)
             values = {name: getattr(message, name, getattr(message, name.upper(), None)) for name in "dkp"}

@@ -189,11 +189,11 @@ def _rows(found: Iterable[tuple[str, Iterable[tuple[str | None, Any]]]]) -> list
 
 def _readings(text: str) -> dict[str, float]:
     """What a numeral is, by the decimal mark."""
-    found = {}
+    numbers = {}
     for mark, notation in _NOTATIONS.items():
         if notation.fullmatch(text):
-            found[mark] = float(text.replace("," if mark == "." else ".", "").replace(mark, "."))
-    return found
+            numbers[mark] = float(text.replace("," if mark == "." else ".", "").replace(mark, "."))
+    return numbers
 
 
 def _finder(file: str, columns: Mapping[str, str], units: Sequence[str]) -> Callable[[str], str | None]:

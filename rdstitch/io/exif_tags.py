@@ -55,12 +55,12 @@ def focal_length(photo: Mapping[int, Any], xmp: str, size: tuple[int, int]) -> f
     # Pixels of the original, which a resized image keeps the tags of; it is not read of a middle that is beside it.
     width = finite(photo.get(PIXEL_WIDTH)) or size[0]
     calibrated_width = width if not middle or abs(math.log(2.0 * middle / width)) < _BESIDE else 2.0 * middle
-    found = [
+    lengths = [
         calibrated * size[0] / calibrated_width if calibrated else None,
         focal * resolution / unit * size[0] / width if focal and resolution and unit else None,
         equivalent / _DIAGONAL_35MM * math.hypot(*size) if equivalent else None,
     ]
-    known = [value for value in found if value and value > 0.0 and is_focal_length(value, size)]
+    known = [value for value in lengths if value and value > 0.0 and is_focal_length(value, size)]
     return known[0] if known and max(known) <= _CONTRADICTION * min(known) else None
 
 
@@ -89,8 +89,8 @@ def gps_position(tags: dict[int, Any], xmp: str) -> tuple[GpsPosition | None, st
     altitude = finite(tags.get(ExifTags.GPS.GPSAltitude))
     below_sea = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
     accuracies = (("RtkStdLat", "RtkStdLon", "RtkStdHgt"), ("GPSXYAccuracy", "GPSXYAccuracy", "GPSZAccuracy"))
-    told = [[xmp_number(xmp, name) or 0.0 for name in names] for names in accuracies]
-    along, across, up = next((each for each in told if min(each) > 0.0), (0.0, 0.0, 0.0))
+    deviations = [[xmp_number(xmp, name) or 0.0 for name in names] for names in accuracies]
+    along, across, up = next((each for each in deviations if min(each) > 0.0), (0.0, 0.0, 0.0))
     std = (math.hypot(along, across) / math.sqrt(2.0), up) if up else None
     return GpsPosition(latitude, longitude, -altitude if altitude and below_sea else altitude, std), ""
 

@@ -165,11 +165,11 @@ def has_late_metadata(file: Path) -> bool:
 def check_decoded_size(file: Path, size: tuple[int, int], channels: int = 3, bits: int = 8) -> None:
     """Refuse by its header what would fill the machine's memory, as only a damaged or malicious file does."""
     need = size[0] * size[1] * channels * -(-bits // 8) / 1e9
-    told = os.environ.get(MAX_IMAGE_GB, "")
+    setting = os.environ.get(MAX_IMAGE_GB, "")
     try:
-        limit = float(told) if told else max(_MIN_LIMIT, _MEMORY_FRACTION * memory_size()) / 1e9
+        limit = float(setting) if setting else max(_MIN_LIMIT, _MEMORY_FRACTION * memory_size()) / 1e9
     except ValueError:
-        raise InputError(f"{MAX_IMAGE_GB}={told}: expected a number of gigabytes") from None
+        raise InputError(f"{MAX_IMAGE_GB}={setting}: expected a number of gigabytes") from None
     if not need <= limit:
         raise InputError(
             f"{file}: {size[0]} x {size[1]} pixels take {need:.1f} GB of memory, more than {limit:.1f}; cut "

@@ -71,8 +71,8 @@ def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[Pix
             samples = np.concatenate([samples, data], axis=2)
         if stored.dtype.kind in "bu" and full < OPAQUE:
             samples = np.rint(samples * (OPAQUE / full)).astype(np.uint8)
-    found = [mask for mask in masks if mask is not None]
-    return samples[..., 0] if samples.shape[2] == 1 else samples, np.minimum.reduce(found) if found else None
+    given = [mask for mask in masks if mask is not None]
+    return samples[..., 0] if samples.shape[2] == 1 else samples, np.minimum.reduce(given) if given else None
 
 
 def _grey_or_rgb(page: "tifffile.TiffPage", kind: int, colours: Pixels, full: float) -> Pixels:

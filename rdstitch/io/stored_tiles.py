@@ -62,7 +62,7 @@ class StoredTile:
             opened: dict[Path, tifffile.TiffFile] = {}
             levels = []
             for channel in range(channels):
-                found = []
+                slices = []
                 for level in wanted:
                     page = self.planes.get((channel, level, time))
                     if page is None:
@@ -72,8 +72,8 @@ class StoredTile:
                             stream = stack.enter_context(open_regular(page.file))
                             opened[page.file] = stack.enter_context(_tiff(stream, page.file))
                         samples, alpha = _samples(opened[page.file], page.number)
-                    found.append(samples)
-                levels.append(found[0] if len(found) == 1 else np.maximum.reduce(found))
+                    slices.append(samples)
+                levels.append(slices[0] if len(slices) == 1 else np.maximum.reduce(slices))
         if len(levels) == 1:
             return levels[0], alpha if len(wanted) == 1 else None
         if any(level.ndim != 2 or level.shape != levels[0].shape for level in levels):
@@ -104,22 +104,22 @@ def _samples(tiff: "tifffile.TiffFile", number: int) -> tuple[NDArray[Any], NDAr
 
 def stored_tiles(files: Iterable[Path]) -> list[StoredTile]:
     """The tiles that files hold, in their order; those of other formats are a tile each."""
-    found: dict[object, StoredTile] = {}
+    by_first_page: dict[object, StoredTile] = {}
     folders: dict[Path, dict[str, StoredTile]] = {}
     for file in files:
         if file.parent not in folders:
             folders[file.parent] = _micro_manager_folder(file.parent)
-        beside = folders[file.parent].get(canonical_name(file.name))
+        listed = folders[file.parent].get(canonical_name(file.name))
         try:
-            tiles = [beside] if beside is not None and len(beside.planes) > 1 else _of_file(file)
+            tiles = [listed] if listed is not None and len(listed.planes) > 1 else _of_file(file)
         except (InputError, OSError):
             # Whoever reads the file says what is wrong with it.
             tiles = [StoredTile(file, {(0, 0, 0): Page(file, 0)})]
         for tile in tiles:
-            if tile.position is None and beside is not None:
-                tile = replace(tile, position=beside.position, unit=beside.unit, pixel_size=beside.pixel_size)
-            found.setdefault(tile.planes[min(tile.planes)], tile)
-    return list(found.values())
+            if tile.position is None and listed is not None:
+                tile = replace(tile, position=listed.position, unit=listed.unit, pixel_size=listed.pixel_size)
+            by_first_page.setdefault(tile.planes[min(tile.planes)], tile)
+    return list(by_first_page.values())
 
 
 def _of_file(file: Path) -> list[StoredTile]:
@@ -204,8 +204,9 @@ def _ome_tile(
     file: Path, image: ElementTree.Element, pixels: ElementTree.Element, planes: dict[tuple[int, int, int], Page]
 ) -> StoredTile:
     names = tuple(channel.get("Name", "") for channel in pixels.iter("Channel"))
-    told = [(plane, "Position") for plane in pixels.iter("Plane")] + [(label, "") for label in image.iter("StageLabel")]
-    place = next((t for t in told if {f"{t[1]}X", f"{t[1]}Y"} <= t[0].attrib.keys()), None)
+    elements = [(plane, "Position") for plane in pixels.iter("Plane")]
+    elements += [(label, "") for label in image.iter("StageLabel")]
+    place = next((t for t in elements if {f"{t[1]}X", f"{t[1]}Y"} <= t[0].attrib.keys()), None)
     position, unit = None, None
     if place is not None:
         element, prefix = place
