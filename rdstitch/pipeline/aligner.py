@@ -212,9 +212,9 @@ def draft_with_loops(
     for _ in range(_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
         tried = {pair.images for pair in pairs}
-        beside = loop_closures(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
+        neighbours = loop_closures(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
         unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
-        more = estimator.estimate(sorted(unaligned.union(beside)), distortion=alignment.distortion)
+        more = estimator.estimate(sorted(unaligned.union(neighbours)), distortion=alignment.distortion)
         selected = select_by_whole_lens(aligned, aligner.threshold)
         pairs = tuple(sorted([*(selected or pairs), *more], key=lambda pair: pair.images))
         if selected is None and not any(pair.relation for pair in more):

@@ -8,10 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import InputError
-from rdstitch.export.georeference import Georeference
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
@@ -22,7 +20,7 @@ from rdstitch.pipeline.band_lens import BandLens, band_lens
 from rdstitch.pipeline.compose import Layout, check_world_files, compose_images, image_files
 from rdstitch.pipeline.counterparts import registered_files
 from rdstitch.pipeline.deep_zoom_page import plainly_viewed, write_page
-from rdstitch.pipeline.placed_images import PlacedImages
+from rdstitch.pipeline.placed_images import PlacedImages, SavedGrid
 from rdstitch.pipeline.recomposition import Recomposition
 from rdstitch.pipeline.replacements import Replacements, read_replacements
 from rdstitch.pipeline.run import Run
@@ -107,25 +105,19 @@ def apply(
     ):
         if output is not None:
             check_outputs(image_files(check_suffix(output)), options.overwrite, [*listed.files, saved.path])
-        result = apply_found(saved, listed, output, composite or saved.composite, options, outputs, progress)
+        run = apply_run(saved, output, composite or saved.composite, options, progress)
+        result = apply_found(saved, listed, run, options, outputs)
     return replace(result, messages=(*([Message(mismatch)] if mismatch else []), *result.messages))
 
 
-def apply_found(
+def apply_run(
     saved: SavedRegistration,
-    listed: FoundImages,
     output: str | Path | None,
     composite: CompositeOptions,
     options: ApplyOptions,
-    outputs: Outputs,
     progress: Progress,
-) -> Recomposition:
-    """The same of images that were found, into memory or among the outputs."""
-    guard = InputGuard(options.strict)
-    given = read_replacements(saved, listed.frames, options, guard, composite.max_memory)
-    if output is not None:
-        check_world_files([output], list(given.sources.values()), options.overwrite)
-    layout, composite, of_layout = _laid_out(saved, given, composite, progress)
+) -> Run:
+    """What the stages after registration take of the options."""
     settings = StitchOptions(
         composite=composite,
         reference=saved.images[saved.reference].name,
@@ -133,7 +125,18 @@ def apply_found(
         workers=options.workers,
         dry_run=options.dry_run,
     )
-    run = Run(settings, output, progress=StageTimer(progress), guard=guard)
+    return Run(settings, output, progress=StageTimer(progress), guard=InputGuard(options.strict))
+
+
+def apply_found(
+    saved: SavedRegistration, listed: FoundImages, run: Run, options: ApplyOptions, outputs: Outputs
+) -> Recomposition:
+    """The same of images that were found, into memory or among the outputs."""
+    output = run.output
+    given = read_replacements(saved, listed.frames, options, run.guard, run.options.composite.max_memory)
+    if output is not None:
+        check_world_files([output], list(given.sources.values()), options.overwrite)
+    layout, run, of_layout = _laid_out(saved, given, run)
     composed, of_output = compose_images(layout, run, outputs)
     sources = dict(zip(given.sources, layout.placed.sources, strict=True))
     result = Recomposition(
@@ -142,7 +145,7 @@ def apply_found(
         matched=given.matched,
         left_out=given.left_out,
         placed=layout.placed,
-        messages=(*given.messages, *of_layout, *listed.messages, *guard.messages, *of_output),
+        messages=(*given.messages, *of_layout, *listed.messages, *run.guard.messages, *of_output),
         **composed.fields,
     )
     if options.dry_run or output is None:
@@ -154,25 +157,22 @@ def apply_found(
     return result
 
 
-def _laid_out(
-    saved: SavedRegistration, given: Replacements, composite: CompositeOptions, progress: Progress
-) -> tuple[Layout, CompositeOptions, list[Message]]:
+def _laid_out(saved: SavedRegistration, given: Replacements, run: Run) -> tuple[Layout, Run, list[Message]]:
     """Where the images lie, by the sidecar and the lens of their band, and how they are composed there."""
-    sources = given.sources
+    sources, composite = given.sources, run.options.composite
     # Channels of a microscope have their places in common, not their content.
     tiles = saved.record.stage is not None
-    lens, messages = (None, []) if tiles else _lens_of_band(saved, given.frames, sources, progress)
+    lens, messages = (None, []) if tiles else _lens_of_band(saved, given.frames, sources, run.progress)
     if lens is not None:
         sources = {index: replace(source, camera=lens.camera(source.camera)) for index, source in sources.items()}
     placed, of_turn = reoriented(_placed(saved, sources, lens), composite, saved.composite)
     if (grid := _same_grid(saved, sources, composite)) is not None:
         placed, composite = replace(placed, grid=grid), replace(composite, crop="none")
-    return Layout.of(placed, composite), composite, [*messages, *of_turn]
+    run = replace(run, options=replace(run.options, composite=composite))
+    return Layout.of(placed, composite), run, [*messages, *of_turn]
 
 
-def _same_grid(
-    saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions
-) -> tuple[FloatArray, tuple[int, int], Georeference | None] | None:
+def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions) -> SavedGrid | None:
     """The pixels of the saved output, where images of the same sizes are to have the same: bands, and dates."""
     asked = any(getattr(options, name) != getattr(saved.composite, name) for name in _GEOMETRY)
     matrix, size = saved.plane_to_output, saved.record.output.size
@@ -186,7 +186,7 @@ def _same_grid(
         or size is None
     ):
         return None
-    return matrix, size, saved.output_place
+    return SavedGrid(matrix, size, saved.output_place)
 
 
 def _lens_of_band(

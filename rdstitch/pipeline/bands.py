@@ -21,7 +21,7 @@ from rdstitch.io.tiff import written_strips
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.apply_sidecar import apply_found
+from rdstitch.pipeline.apply_sidecar import apply_found, apply_run
 from rdstitch.pipeline.read_inputs import with_camera_read
 from rdstitch.pipeline.recipes import stitch_found
 from rdstitch.pipeline.recomposition import Recomposition
@@ -88,7 +88,9 @@ def mosaic_bands(
             channel_order=options.channel_order,
         )
         others = tuple(
-            apply_found(saved, FoundImages(band, []), name, saved.composite, same, outputs, progress)
+            apply_found(
+                saved, FoundImages(band, []), apply_run(saved, name, saved.composite, same, progress), same, outputs
+            )
             for band, name in zip(chosen[1:], files[1:], strict=True)
         )
         if stack:

@@ -60,7 +60,7 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
                 raise ArgumentError(f"{name} needs a georeferenced output: {reason}; leave it out")
         return canvas, None, reason
     if placed.grid is not None:
-        return canvas, placed.grid[2], reason
+        return canvas, placed.grid.place, reason
     if (grid := _grid(options, place)) is not None:
         on_grid = grid.place.in_pixels(place) @ canvas.matrix
         laid = canvas.on_grid(on_grid, grid.size)

@@ -82,6 +82,15 @@ def align_registration_locally(
 
 
 @dataclass(frozen=True, eq=False)
+class SavedGrid:
+    """The pixels of an output of an earlier run."""
+
+    from_plane: FloatArray  # (3, 3)
+    size: tuple[int, int]
+    place: Georeference | None
+
+
+@dataclass(frozen=True, eq=False)
 class PlacedImages:
     """The images that are used, and where they belong."""
 
@@ -101,8 +110,7 @@ class PlacedImages:
     relief: float = 0.0  # pixels that neighbours are off together, where the ground is no plane
     lever_std: float = 0.0  # lever_std, leverage: see Located
     leverage: Mapping[int | str, float] = field(default_factory=dict)
-    # pixels that the output is made on, as of an earlier run: from the plane (3, 3), their size, and their place
-    grid: tuple[FloatArray, tuple[int, int], Georeference | None] | None = None
+    grid: SavedGrid | None = None  # pixels that the output is made on
 
     @classmethod
     def of(cls, registration: Registration, displacements: Sequence[Displacement | None] | None) -> Self:
@@ -214,7 +222,7 @@ def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
     """The canvas of the images, no larger than ``options.max_size``."""
     canvas = _plan(placed, options, options.scale)
     if placed.grid is not None:
-        return canvas.on_grid(*placed.grid[:2])
+        return canvas.on_grid(placed.grid.from_plane, placed.grid.size)
     if options.max_size is None or max(canvas.size) <= options.max_size:
         return canvas
     # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.

@@ -27,7 +27,7 @@ LARGEST_ERROR = 0.01  # root mean square, by which two halves of the tiles may d
 _PARTS = 4  # of the tiles, by which the error of the dark level is known
 _KNOWN = 3.0  # standard deviations from 0 from which on it is taken out
 _MAX_DARK = 1 / 16  # of the largest sample: cameras of 12 bits are set to a hundred counts
-_CELLS = 24  # cells along each side of a tile, or one a pixel where it has fewer
+_CELLS = 24  # cells along each side of a tile at most, or one a pixel where it has fewer
 _SIDE = 512  # pixels of the longer side that are enough
 _DEGREE = 4  # degree of the polynomial that the logarithm of the illumination is
 _TRUNCATED = 0.9113  # variance of a standard normal number within 2.5 of its mean
@@ -60,17 +60,21 @@ class _Statistics:
             variance.append(noise)
             largest = max(largest, float(tile.max()))
         self.size, self.largest = small.shape[:2], largest
-        self.used = tuple(side - side % min(_CELLS, side) for side in self.size)
+        self.used = tuple(math.prod(_cell_grid(side)) for side in self.size)
         self.ground, self.light, self.variance = (np.array(v, dtype=np.float64) for v in (ground, light, variance))
 
 
 def _cells(plane: NDArray[Any]) -> NDArray[Any]:
     """The samples of each cell of a plane (h, w, C), (cells down, cells across, C, n)."""
-    height, width, channels = plane.shape
-    down, across = min(_CELLS, height), min(_CELLS, width)
-    cut = plane[: height - height % down, : width - width % across]
-    parts = cut.reshape(down, height // down, across, width // across, channels)
-    return parts.transpose(0, 2, 4, 1, 3).reshape(down, across, channels, -1)
+    (down, rows), (across, columns) = (_cell_grid(side) for side in plane.shape[:2])
+    parts = plane[: down * rows, : across * columns].reshape(down, rows, across, columns, -1)
+    return parts.transpose(0, 2, 4, 1, 3).reshape(down, across, plane.shape[2], -1)
+
+
+def _cell_grid(side: int) -> tuple[int, int]:
+    """Cells along a side of a tile, and pixels of each: less than one cell's are left over at the end."""
+    pixels = -(-side // _CELLS)
+    return side // pixels, pixels
 
 
 def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:

@@ -55,7 +55,7 @@ def test_narrow_tiles_show_their_flat_field_too_or_say_that_they_do_not(specimen
     assert sum(each.field is not None for each in found) == shown
     for part, each in zip(_STRIPS, found, strict=True):
         expected = stage.flat_field[part] / stage.flat_field[part].mean(axis=(0, 1))
-        assert each.field is None or np.sqrt(((each.field.gain / expected - 1.0) ** 2).mean()) < 0.01
+        assert each.field is None or np.sqrt(((each.field.gain / expected - 1.0) ** 2).mean()) < 2.0 * each.error
 
 
 def test_what_is_read_before_the_flat_field_is_known_is_corrected_too(tmp_path: Path) -> None:
