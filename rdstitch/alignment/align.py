@@ -6,15 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import (
-    Fit,
-    Problem,
-    pairwise_homographies,
-    relations_at,
-    thin_for_selection,
-)
+from rdstitch.alignment.adjusted_images import AdjustedImages, GivenImages
+from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
-from rdstitch.alignment.build_result import AdjustedImages, GivenImages, build_alignment
+from rdstitch.alignment.build_result import build_alignment
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
 from rdstitch.alignment.least_squares.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjustmentResult
@@ -23,9 +18,11 @@ from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.lens.lens_selection import LensChoice, choose_lens, left_coherence, with_third_coefficient
 from rdstitch.alignment.map_priors import adjust_to_map
 from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, independent_errors
+from rdstitch.alignment.pairwise import pairwise_homographies, relations_at
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
+from rdstitch.alignment.starts import fit_model
 from rdstitch.alignment.uncertainty import covariances, weigh_lens
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
@@ -75,12 +72,14 @@ def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOp
     RegistrationError
         When no two images are linked.
     """
-    return AlignmentTask(cameras, links, options or AlignmentOptions()).result
+    return AlignmentTask(GivenImages(cameras, links, options or AlignmentOptions())).result
 
 
 @dataclass(frozen=True, eq=False)
-class AlignmentTask(GivenImages):
-    """Images to be aligned, as :func:`align` takes them: a draft, and the result, each computed when it is wanted."""
+class AlignmentTask:
+    """Alignment of some images: a draft, and the result, each computed when it is wanted."""
+
+    given: GivenImages
 
     @cached_property
     def draft(self) -> Alignment:
@@ -90,12 +89,12 @@ class AlignmentTask(GivenImages):
     @cached_property
     def result(self) -> Alignment:
         """Adjusted to all matches."""
-        return build_alignment(_checked_focal(_adjusted(self._selected), self.options))
+        return build_alignment(_checked_focal(_adjusted(self._selected), self.given.options))
 
     @cached_property
     def _selected(self) -> AdjustedImages:
-        _check(self.cameras, self.links, self.options)
-        return _lens_and_model(self)
+        _check(self.given)
+        return _lens_and_model(self.given)
 
 
 def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
@@ -113,7 +112,7 @@ def _lens_and_model(task: GivenImages) -> AdjustedImages:
     """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
     options, known = task.options, task.options.camera_priors(task.cameras)
     everything, relations = _observations(task.links, task.cameras, _matches_of_a_link(len(task.links), options))
-    few = everything.thinned(thin_for_selection(len(task.links)))
+    few = everything.thinned(_matches_for_selection(len(task.links)))
     lens = _choose_lens(task, few, relations, known)
     wrong, confirmed = cycle_consistency(lens.pairwise, few, len(task.cameras))
     whole = _all_links(task, few, lens, _trust(few, confirmed), known, wrong)
@@ -208,7 +207,7 @@ def from_another_start(problem: Problem, fit: Fit) -> Fit:
     """A fit that converged as it is; another one from where the links lead, where that converges or fits better."""
     if fit.adjusted.converged:
         return fit
-    return min((fit, problem.fit(fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
+    return min((fit, fit_model(problem, fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
 
 
 def _checked_focal(adjusted: AdjustedImages, given: AlignmentOptions) -> AdjustedImages:
@@ -245,6 +244,11 @@ def _matches_of_a_link(links: int, options: AlignmentOptions) -> int:
     return min(options.most, max(_MATCHES_OF_ALL // max(links, 1), _MATCHES_OF_A_LINK))
 
 
+def _matches_for_selection(links: int) -> int:
+    """Correspondences of a link that suffice to choose a model: fewer where there are many links."""
+    return int(np.clip(5_000 // max(links, 1), 40, 150))
+
+
 def _observations(
     links: Sequence[Link], cameras: Sequence[Camera], most: int
 ) -> tuple[Observations, list[RadialHomography]]:
@@ -253,7 +257,8 @@ def _observations(
     return Observations.from_links(read, cameras), [link.relation for link in read]
 
 
-def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> None:
+def _check(given: GivenImages) -> None:
+    cameras, links, options = given.cameras, given.links, given.options
     if not links:
         raise RegistrationError("nothing to align: no two images overlap")
     pairs = [(min(k.image1, k.image2), max(k.image1, k.image2)) for k in links]
@@ -315,6 +320,6 @@ def _drop_wrong_pairs(
             poses = adjusted.parameters.poses[np.searchsorted(images, kept)]
             fit = problem.refine(model, replace(adjusted.parameters, poses=poses), choice.fit.tilt_spread)
         else:
-            fit = problem.fit(model)
+            fit = fit_model(problem, model)
         choice, images = replace(choice, fit=fit), kept
     return choice, images, wrong

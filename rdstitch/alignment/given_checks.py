@@ -15,8 +15,9 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.least_squares.priors import CameraPriors
-from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA, PlanarModel
+from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA
 from rdstitch.alignment.select import select_model
+from rdstitch.alignment.starts import start_from
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, DELAYS, at_delay, smooth
@@ -69,10 +70,10 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
     # A model of one tilt shows no others.
     models = models if without.model == "auto" or options.attitudes is None else _WITH_TILTS
     fit = select_model(bare, models).fit
-    if not isinstance(fit.model, PlanarModel):
+    if not fit.model.has_metric_poses:
         return None
     if fit.model.free_tilts and not fit.model.any_tilt:  # whose prior draws tilts together
-        fit = bare.refine(POSE, bare.start_from(POSE, fit))
+        fit = bare.refine(POSE, start_from(bare, POSE, fit))
     shown = _ShownTilts.of(bare, fit, free_mount=options.tilt is None)
     if known.delayed_attitudes is not None and (late := shown.delay(known.delayed_attitudes + known.tilt)) is not None:
         attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
@@ -103,7 +104,7 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
 
 def is_strained(priors: CameraPriors, fit: Fit) -> bool:
     """Whether a focal length that the user gave gave way to the images by more than is likely."""
-    if priors.focal_source not in ("option", "file") or not isinstance(fit.model, PlanarModel):
+    if priors.focal_source not in ("option", "file") or not fit.model.has_metric_poses:
         return False
     moved = float(fit.adjusted.parameters.shared[-1]) - priors.log_focal
     return abs(moved) > _STRAINED * priors.log_focal_std
@@ -111,7 +112,7 @@ def is_strained(priors: CameraPriors, fit: Fit) -> bool:
 
 def check_focal(given: Camera, fit: Fit, covariance: FloatArray | None) -> Message | None:
     """What the user should know of a focal length that was given, by a fit without it; None where that agrees."""
-    if not isinstance(fit.model, PlanarModel) or covariance is None or given.focal is None:
+    if not fit.model.has_metric_poses or covariance is None or given.focal is None:
         return None
     place = fit.model.shared_names.index("log_focal")
     focal, std = fit.model.focal(fit.adjusted.parameters.shared) * given.scale, math.sqrt(covariance[place, place])
@@ -153,7 +154,6 @@ class _ShownTilts:
     def of(cls, problem: Problem, fit: Fit, *, free_mount: bool) -> "_ShownTilts":
         """By a planar fit that knows nothing of the tilts; with ``free_mount`` up to what all have in common."""
         adjuster, adjusted, model = problem.adjuster_of(fit), fit.adjusted, fit.model
-        assert isinstance(model, PlanarModel)
         normal = adjuster.normal_equations(adjusted)
         tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
         images = evenly_spaced(problem.count, _MAX_IMAGES)

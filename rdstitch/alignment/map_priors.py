@@ -18,7 +18,7 @@ from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster
 from rdstitch.alignment.least_squares.plane_marks import PlaneMarks
 from rdstitch.alignment.least_squares.priors import CameraPriors
-from rdstitch.alignment.motion_models import PlanarModel, X, Y
+from rdstitch.alignment.motion_models import X, Y
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.posterior import MODEL_ERROR
@@ -60,7 +60,7 @@ class MapFit:
 
 def adjust_to_map(problem: Problem, fit: Fit) -> MapFit:
     """Adjust again with positions and control points as priors, where there are enough of them, and they agree."""
-    if not isinstance(fit.model, PlanarModel):
+    if not fit.model.has_metric_poses:
         return MapFit(problem, fit)
     every: list[_KnownPlaces] = [_Control(problem, fit), _Positions(problem)]
     sides = [side for side in every if side.enough]
@@ -137,7 +137,6 @@ class _Positions(_KnownPlaces):
         return replace(known, places=places, places_precision=weights)
 
     def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
-        assert isinstance(fit.model, PlanarModel)
         image = np.flatnonzero(self.known)
         axes = [fit.model.free.index(column) for column in (X, Y)]
         shared = len(fit.model.shared_names) + int(adjuster.free.lens.sum())

@@ -11,11 +11,12 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import Fit, Problem, pairwise_homographies
+from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of
+from rdstitch.alignment.pairwise import pairwise_homographies
 from rdstitch.arrays import BoolArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD
 from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, costs

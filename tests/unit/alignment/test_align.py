@@ -10,7 +10,8 @@ import pytest
 from examples.judging.trajectories import compare_trajectories
 from examples.worlds.alignment_scenes import Scene, aligned, grid, jittered, robot_path, scene
 from rdstitch.alignment import AlignmentOptions, align, most_matches_read
-from rdstitch.alignment.build_result import AdjustedImages, build_alignment
+from rdstitch.alignment.adjusted_images import AdjustedImages
+from rdstitch.alignment.build_result import build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import Alignment, PlanarPoses, Unused
 from rdstitch.alignment.trajectory import Trajectory
