@@ -28,8 +28,8 @@ class AdjustedImages:
 
     given: GivenImages
     images: IntArray  # (N,): the images aligned, ascending; the problem numbers them 0 … N-1
-    right: BoolArray  # (L,): links not taken for wrong
-    whole: Problem  # of all links and images, with the matches that they are adjusted by in the end
+    kept_links: BoolArray  # (L,): links not taken for wrong
+    all_links: Problem  # of all links and images, with the matches that they are adjusted by in the end
     problem: Problem  # of those aligned, with the matches that they were adjusted by
     choice: ModelChoice
     lens: LensChoice  # the lens, with the distortion centre if the motion model freed it

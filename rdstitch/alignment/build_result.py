@@ -229,8 +229,8 @@ def _in_frame_of_reference(adjustment: AdjustedImages) -> tuple[FloatArray, Plan
 
 def _groups(adjustment: AdjustedImages) -> tuple[tuple[int, ...], ...]:
     """Connected groups of images by the links not taken for wrong, the aligned one first."""
-    right = [link for link, right in zip(adjustment.given.links, adjustment.right, strict=True) if right]
-    groups = connected_components(len(adjustment.given.cameras), [k.image1 for k in right], [k.image2 for k in right])
+    links = [link for link, kept in zip(adjustment.given.links, adjustment.kept_links, strict=True) if kept]
+    groups = connected_components(len(adjustment.given.cameras), [k.image1 for k in links], [k.image2 for k in links])
     aligned = set(adjustment.images.tolist())
     ordered = sorted(groups, key=lambda group: group[0] not in aligned)
     return tuple(tuple(group) for group in ordered)
@@ -247,10 +247,10 @@ def _link_fits(adjustment: AdjustedImages, agreement: _Agreement) -> tuple[LinkF
         for row, (i, j) in enumerate(zip(observations.image1, observations.image2, strict=True))
     }
     result = []
-    for link, right in zip(adjustment.given.links, adjustment.right, strict=True):
+    for link, kept in zip(adjustment.given.links, adjustment.kept_links, strict=True):
         row = rows.get(frozenset((link.image1, link.image2)))
-        if row is None or not right:
-            why = Unused.ELSEWHERE if right else Unused.CONTRADICTS
+        if row is None or not kept:
+            why = Unused.ELSEWHERE if kept else Unused.CONTRADICTS
             result.append(LinkFit(link.image1, link.image2, len(link), 0, math.nan, False, why))
             continue
         rows_of_link = slice(observations.start[row], observations.start[row + 1])

@@ -14,7 +14,7 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.link_equations import linearized_errors
-from rdstitch.alignment.lens.lens_selection import left_coherence
+from rdstitch.alignment.lens.lens_selection import residual_coherence
 from rdstitch.alignment.motion_models import SIMILARITY, TILTING
 from rdstitch.alignment.noise import independent_errors, judge_relief
 from rdstitch.alignment.relief_field import Parallax
@@ -94,7 +94,7 @@ def _is_rough(problem: Problem, fit: Fit) -> bool:
 
     Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
     """
-    return judge_relief(left_coherence(fit.adjusted), fit.model.name, len(problem.observations)).found
+    return judge_relief(residual_coherence(fit.adjusted), fit.model.name, len(problem.observations)).found
 
 
 def _settled(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:

@@ -17,7 +17,7 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.least_squares.link_equations import split_lens, whitened_errors
-from rdstitch.alignment.lens.lens_selection import NO_COHERENCE, left_coherence
+from rdstitch.alignment.lens.lens_selection import NO_COHERENCE, residual_coherence
 from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.alignment.noise import evidence_of
 from rdstitch.alignment.pairwise import fit_pairwise, fit_trial
@@ -220,7 +220,7 @@ def _with_wider_lenses(
             fit = tried[index].fit
             wider = posterior.of(posterior.problem.extend(fit, lens | fit.free_lens))
             # A centre that is off bends a plane as rough ground bends the images; directions it does not bend.
-            shown = fit.model.on_sphere or left_coherence(wider.fit.adjusted).correlation < NO_COHERENCE
+            shown = fit.model.on_sphere or residual_coherence(wider.fit.adjusted).correlation < NO_COHERENCE
             if wider.score < tried[index].score and shown:
                 tried[index] = wider
     return tried
