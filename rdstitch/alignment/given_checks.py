@@ -60,8 +60,43 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
     if options.attitudes is None and options.tilt is None:
         return None
     without = replace(options, attitudes=None, delayed_attitudes=None, tilt=None)
+    fitted = _fit_without_tilts(problem, options, without)
+    if fitted is None:
+        return None
     known = problem.camera_priors
-    given = known.attitudes + known.tilt
+    shown = _ShownTilts.of(*fitted, free_mount=options.tilt is None)
+    if known.delayed_attitudes is not None and (late := shown.delay(known.delayed_attitudes + known.tilt)) is not None:
+        attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
+        return replace(options, attitudes=attitudes, delayed_attitudes=None), attitudes_late(*late)
+    given, stated = known.attitudes + known.tilt, options.attitudes_std if options.attitudes is not None else 0.0
+    changed = [shown.likelihood(given @ change.T) for change in _SIGNED_ORDERS]
+    none = shown.likelihood(np.zeros_like(given))
+    (likelihood, scatter), best = changed[0], int(np.argmax([score for score, _ in changed]))
+    if likelihood - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
+        return None
+    if max(changed[best][0], none[0]) < likelihood + _LOG_ODDS:
+        if options.attitudes is None:
+            return None
+        text = f"the attitudes agree with the images to {math.degrees(scatter):.2g} degrees, which is taken for their "
+        text += f"standard deviation instead of {math.degrees(stated):.2g}"
+        return replace(options, attitudes_std=scatter), Message(text, severity="note")
+    if options.attitudes is None:
+        text = "the images contradict the given tilt of {:.2f}, {:.2f} degrees".format(*np.degrees(given[0]))
+        text += ", which is not used: they show {:.2f}, {:.2f}".format(*np.degrees(np.median(shown.tilts, axis=0)))
+    else:
+        text = f"the images contradict the attitudes by {math.degrees(scatter):.1f} degrees; they are not used: "
+        related = changed[best][0] > none[0] + _LOG_ODDS
+        error = math.degrees(max(changed[best][1], _EXACT))
+        better = f"with {_named(_SIGNED_ORDERS[best])} they would fit to {error:.2g} degrees"
+        text += better if related else "no signs and no order of psi and theta make them fit"
+    return without, Message(text, code="attitudes-contradicted")
+
+
+def _fit_without_tilts(
+    problem: Problem, options: AlignmentOptions, without: AlignmentOptions
+) -> tuple[Problem, Fit] | None:
+    """The problem that knows nothing of the tilts, and a fit with the tilts that it shows; None where it shows none."""
+    known = problem.camera_priors
     nothing = replace(
         known, attitudes=np.zeros_like(known.attitudes), attitudes_std=None, tilt=(0.0, 0.0), tilt_known=False
     )
@@ -74,32 +109,7 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
         return None
     if fit.model.free_tilts and not fit.model.any_tilt:  # whose prior draws tilts together
         fit = bare.refine(POSE, start_from(bare, POSE, fit))
-    shown = _ShownTilts.of(bare, fit, free_mount=options.tilt is None)
-    if known.delayed_attitudes is not None and (late := shown.delay(known.delayed_attitudes + known.tilt)) is not None:
-        attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
-        return replace(options, attitudes=attitudes, delayed_attitudes=None), attitudes_late(*late)
-    stated = options.attitudes_std if options.attitudes is not None else 0.0
-    scores = [shown.likelihood(given @ change.T) for change in _SIGNED_ORDERS]
-    none = shown.likelihood(np.zeros_like(given))
-    (likelihood, scatter), best = scores[0], int(np.argmax([score for score, _ in scores]))
-    if likelihood - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
-        return None
-    if max(scores[best][0], none[0]) < likelihood + _LOG_ODDS:
-        if options.attitudes is None:
-            return None
-        text = f"the attitudes agree with the images to {math.degrees(scatter):.2g} degrees, which is taken for their "
-        text += f"standard deviation instead of {math.degrees(stated):.2g}"
-        return replace(options, attitudes_std=scatter), Message(text, severity="note")
-    if options.attitudes is None:
-        text = "the images contradict the given tilt of {:.2f}, {:.2f} degrees".format(*np.degrees(given[0]))
-        text += ", which is not used: they show {:.2f}, {:.2f}".format(*np.degrees(np.median(shown.tilts, axis=0)))
-    else:
-        text = f"the images contradict the attitudes by {math.degrees(scatter):.1f} degrees; they are not used: "
-        related = scores[best][0] > none[0] + _LOG_ODDS
-        error = math.degrees(max(scores[best][1], _EXACT))
-        better = f"with {_named(_SIGNED_ORDERS[best])} they would fit to {error:.2g} degrees"
-        text += better if related else "no signs and no order of psi and theta make them fit"
-    return without, Message(text, code="attitudes-contradicted")
+    return bare, fit
 
 
 def is_strained(priors: CameraPriors, fit: Fit) -> bool:
