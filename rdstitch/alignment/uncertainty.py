@@ -206,15 +206,16 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
     parameters, prior = fit.adjusted.parameters, LENS[0]
     value = float(parameters.lens[0])
     # What the images say without the prior, which has had its part in the adjustment: the value and its variance.
-    told, own = 1.0 / float(problem.adjuster_of(fit).covariance(fit.adjusted)[-1, -1]), prior.curvature(value)
-    seen = max(told - own, 1e-9 * told)
-    variance = max(float(covariance[-1, -1]) - own / told**2, 1.0 / told) * (told / seen) ** 2
-    weighed = prior.combined(value + prior.slope(value) / seen, math.sqrt(variance))
+    total = 1.0 / float(problem.adjuster_of(fit).covariance(fit.adjusted)[-1, -1])
+    of_prior = prior.curvature(value)
+    of_data = max(total - of_prior, 1e-9 * total)  # information
+    variance = max(float(covariance[-1, -1]) - of_prior / total**2, 1.0 / total) * (total / of_data) ** 2
+    weighed = prior.combined(value + prior.slope(value) / of_data, math.sqrt(variance))
     if abs(weighed - value) * float(np.median(problem.observations.scale1)) < MODEL_ERROR:
         return fit
-    held = replace(problem, free_lens=np.zeros_like(problem.free_lens))
+    fixed = replace(problem, free_lens=np.zeros_like(problem.free_lens))
     lens = np.where(problem.free_lens, weighed, parameters.lens)
-    return replace(fit, adjusted=held.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread).adjusted)
+    return replace(fit, adjusted=fixed.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread).adjusted)
 
 
 def lever_std(problem: Problem, fit: Fit) -> float:
