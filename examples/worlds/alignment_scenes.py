@@ -9,6 +9,7 @@ from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, SIMILARITY, THETA, TILTING, YAW, X, Y
+from rdstitch.alignment.starts import fit_model
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
@@ -152,4 +153,4 @@ def fitted(given: Scene) -> tuple[Problem, Fit]:
     trust = np.ones(len(given.links))
     lens = np.array([given.distortion, 0.0, 0.0, 0.0, 0.0])
     problem = Problem(observations, homographies, trust, count, 0, lens, free, known)
-    return problem, problem.fit(SIMILARITY)
+    return problem, fit_model(problem, SIMILARITY)

@@ -1,5 +1,6 @@
 """From pairs of images to all of them registered as one."""
 
+from rdstitch.alignment.adjusted_images import GivenImages
 from rdstitch.alignment.align import AlignmentTask, align, most_matches_read
 from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.lens.lens_selection import LENSES
@@ -7,4 +8,14 @@ from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment
 from rdstitch.matching.links import Link
 
-__all__ = ["LENSES", "MODELS", "Alignment", "AlignmentOptions", "AlignmentTask", "Link", "align", "most_matches_read"]
+__all__ = [
+    "LENSES",
+    "MODELS",
+    "Alignment",
+    "AlignmentOptions",
+    "AlignmentTask",
+    "GivenImages",
+    "Link",
+    "align",
+    "most_matches_read",
+]

@@ -6,36 +6,30 @@ from functools import cached_property
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import (
-    Fit,
-    Problem,
-    pairwise_homographies,
-    relations_at,
-    thin_for_selection,
-)
+from rdstitch.alignment.adjusted_images import AdjustedImages, GivenImages
+from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
-from rdstitch.alignment.build_result import AdjustedImages, GivenImages, build_alignment
+from rdstitch.alignment.build_result import build_alignment
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
-from rdstitch.alignment.least_squares.bundle_adjustment import FEW_GAIN, MIN_GAIN, BundleAdjustmentResult
+from rdstitch.alignment.least_squares.bundle_adjustment import FEW_GAIN, MIN_GAIN
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import CameraPriors
-from rdstitch.alignment.lens.lens_selection import LensChoice, choose_lens, left_coherence, with_third_coefficient
+from rdstitch.alignment.lens.lens_selection import LensChoice, with_third_coefficient
+from rdstitch.alignment.lens.observability import choose_observable_lens
 from rdstitch.alignment.map_priors import adjust_to_map
-from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF, independent_errors
+from rdstitch.alignment.noise import independent_errors
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
+from rdstitch.alignment.starts import fit_model
 from rdstitch.alignment.uncertainty import covariances, weigh_lens
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
-from rdstitch.geometry.camera import LENS_STD, Camera
-from rdstitch.geometry.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
+from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
-from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link, in_alternate_directions
 from rdstitch.results.messages import Message
-from rdstitch.robust.posterior import LENS
 
 # Side of an image, beside that of the largest, below which it was reduced, and must not set the scale of the output.
 _REDUCED = 0.8
@@ -50,11 +44,6 @@ _MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 500_000, 40
 
 _ROUNDS = 3
 """Rounds of rejecting wrong pairs and adjusting again."""
-
-_FEW_VIEWS, _LENS_OVER_DEPTH = 3, 6.0
-"""Images from more than which depth does not look like a lens; times by which a lens must make what neighbours share
-smaller to be no depth itself: in published pairs λ takes the blame for up to 3 times what is left of depth, and for 14
-times of what a fisheye leaves beside λ."""
 
 
 def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions | None = None) -> Alignment:
@@ -75,12 +64,14 @@ def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOp
     RegistrationError
         When no two images are linked.
     """
-    return AlignmentTask(cameras, links, options or AlignmentOptions()).result
+    return AlignmentTask(GivenImages(cameras, links, options or AlignmentOptions())).result
 
 
 @dataclass(frozen=True, eq=False)
-class AlignmentTask(GivenImages):
-    """Images to be aligned, as :func:`align` takes them: a draft, and the result, each computed when it is wanted."""
+class AlignmentTask:
+    """Alignment of some images: a draft, and the result, each computed when it is wanted."""
+
+    given: GivenImages
 
     @cached_property
     def draft(self) -> Alignment:
@@ -90,12 +81,12 @@ class AlignmentTask(GivenImages):
     @cached_property
     def result(self) -> Alignment:
         """Adjusted to all matches."""
-        return build_alignment(_checked_focal(_adjusted(self._selected), self.options))
+        return build_alignment(_checked_focal(_adjusted(self._selected), self.given.options))
 
     @cached_property
     def _selected(self) -> AdjustedImages:
-        _check(self.cameras, self.links, self.options)
-        return _lens_and_model(self)
+        _check(self.given)
+        return _lens_and_model(self.given)
 
 
 def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
@@ -112,75 +103,53 @@ def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
 def _lens_and_model(task: GivenImages) -> AdjustedImages:
     """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
     options, known = task.options, task.options.camera_priors(task.cameras)
-    everything, relations = _observations(task.links, task.cameras, _matches_of_a_link(len(task.links), options))
-    few = everything.thinned(thin_for_selection(len(task.links)))
-    lens = _choose_lens(task, few, relations, known)
-    wrong, confirmed = cycle_consistency(lens.pairwise, few, len(task.cameras))
-    whole = _all_links(task, few, lens, _trust(few, confirmed), known, wrong)
-    problem, images = whole.part(~wrong)
+    all_matches, relations = _observations(task.links, task.cameras, _matches_of_a_link(len(task.links), options))
+    sample = all_matches.thinned(_matches_for_selection(len(task.links)))
+    lens = choose_observable_lens(task, sample, relations, known)
+    wrong, confirmed = cycle_consistency(lens.pairwise, sample, len(task.cameras))
+    all_links = _problem_of_all_links(task, sample, lens, _tree_ranks(sample, confirmed), known, wrong)
+    problem, images = all_links.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
     problem = replace(problem, overdispersion=shared)
-    if (doubt := check_attitudes(problem, options)) is not None:
-        without = _lens_and_model(replace(task, options=doubt[0]))
-        return replace(without, messages=(doubt[1], *without.messages))
+    if (contradiction := check_attitudes(problem, options)) is not None:
+        better_options, message = contradiction
+        without = _lens_and_model(replace(task, options=better_options))
+        return replace(without, messages=(message, *without.messages))
     choice = select_model(problem, options.models, lens.refinements, options.purpose)
-    choice, images, wrong = _drop_wrong_pairs(whole, problem, images, choice, wrong)
-    problem, _ = whole.part(~wrong, images)
+    choice, images, wrong = _drop_wrong_pairs(all_links, problem, images, choice, wrong)
+    problem, _ = all_links.part(~wrong, images)
     choice = choose_over_relief(problem, choice, options.models, options.purpose)
     free = choice.fit.free_lens
-    whole = replace(whole, observations=everything, free_lens=free, min_gain=MIN_GAIN)
+    all_links = replace(all_links, observations=all_matches, free_lens=free, min_gain=MIN_GAIN)
     problem, refined = replace(problem, free_lens=free), lens.refined(free)
-    return AdjustedImages(task, images, ~wrong, whole, problem, choice, refined)
+    return AdjustedImages(task, images, ~wrong, all_links, problem, choice, refined)
 
 
-def _choose_lens(
-    task: GivenImages, few: Observations, relations: Sequence[RadialHomography], known: CameraPriors
-) -> LensChoice:
-    """Of every link with a homography of its own: whether λ is seen, or could be depth, and which lens it is."""
-
-    def fit(lens: FloatArray, free: BoolArray) -> BundleAdjustmentResult:
-        return pairwise_homographies(few, relations_at(few, relations, lens), lens, free, known)
-
-    options, first, none = task.options, np.arange(len(LENS_STD)) == 0, np.zeros(len(LENS_STD), dtype=np.bool_)
-    # The images' points are already relative to the centre of the camera.
-    given = np.array([*task.cameras[0].coefficients, 0.0, 0.0])
-    if options.lens_known:
-        return choose_lens(few, fit(given, none), (), known)
-    votes = vote([k.relation.distortion for k in task.links], [k.relation.distortion_std for k in task.links])
-    pairwise = fit(np.where(first, np.nan_to_num(votes.distortion), 0.0), first)
-    observable, depth = _observable(pairwise), False
-    if few.image_count <= _FEW_VIEWS or not observable:
-        held = fit(given, none)
-        depth = observable and _is_depth(pairwise, held)
-        if depth or not observable:
-            pairwise, observable = held, False
-    choice = choose_lens(few, pairwise, options.lenses if observable else (), known)
-    return replace(choice, observable=observable, depth=depth)
-
-
-def _all_links(
-    task: GivenImages, few: Observations, lens: LensChoice, trust: FloatArray, known: CameraPriors, wrong: BoolArray
+def _problem_of_all_links(
+    task: GivenImages, sample: Observations, lens: LensChoice, trust: FloatArray, known: CameraPriors, wrong: BoolArray
 ) -> Problem:
     """The problem of all images, with the reference that was asked for, or else a good one of those not ``wrong``."""
     pairwise, reference = lens.pairwise, task.options.reference
     count, start = len(task.cameras), pairwise.parameters.lens
-    whole = Problem(few, pairwise.homographies, trust, count, reference, start, lens.free, known, min_gain=FEW_GAIN)
+    all_links = Problem(
+        sample, pairwise.homographies, trust, count, reference, start, lens.free, known, min_gain=FEW_GAIN
+    )
     if reference is None:
-        problem, images = whole.part(~wrong)
+        problem, images = all_links.part(~wrong)
         reference = int(images[_full_size_reference(problem, [task.cameras[k] for k in images])])
-    return replace(whole, fixed=reference)
+    return replace(all_links, fixed=reference)
 
 
 def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
     """Adjusted to all matches."""
     choice, options, links = chosen.choice, chosen.given.options, chosen.given.links
-    whole = chosen.whole
+    all_links = chosen.all_links
     if choice.fit.model.on_sphere and most_matches_read(len(links), options) is None:
         # Few images of a turn hardly determine the focal length; all their matches are used.
         every, _ = _observations(links, chosen.given.cameras, _MATCHES_OF_A_TURN // len(links))
-        whole = replace(whole, observations=every)
-    problem, _ = whole.part(chosen.right, chosen.images)
+        all_links = replace(all_links, observations=every)
+    problem, _ = all_links.part(chosen.kept_links, chosen.images)
     # What errors share weighs the more, the more of them there are.
     shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
     problem = replace(problem, overdispersion=max(shared, choice.fit.overdispersion))
@@ -188,8 +157,8 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
     fit = from_another_start(problem, fit)
     if len(options.lenses) > 1:
         problem, fit = with_third_coefficient(problem, fit)
-    held = adjust_to_map(problem, fit)
-    problem, fit = held.problem, held.fit
+    on_map = adjust_to_map(problem, fit)
+    problem, fit = on_map.problem, on_map.fit
     covariance, of_lens = covariances(problem, fit)
     fit = weigh_lens(problem, fit, covariance) if chosen.lens.observable else fit
     return replace(
@@ -197,8 +166,8 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         problem=problem,
         choice=replace(choice, fit=fit),
         lens=chosen.lens.refined(fit.free_lens),
-        positions_disagree=held.disagreement,
-        leverage=held.leverage_of(chosen.images),
+        positions_disagree=on_map.disagreement,
+        leverage=on_map.leverage_of(chosen.images),
         covariance=covariance,
         lens_covariance=of_lens,
     )
@@ -208,12 +177,12 @@ def from_another_start(problem: Problem, fit: Fit) -> Fit:
     """A fit that converged as it is; another one from where the links lead, where that converges or fits better."""
     if fit.adjusted.converged:
         return fit
-    return min((fit, problem.fit(fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
+    return min((fit, fit_model(problem, fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
 
 
 def _checked_focal(adjusted: AdjustedImages, given: AlignmentOptions) -> AdjustedImages:
     """Without the focal length that was given, where it gave way and the images by themselves show another one."""
-    if adjusted.covariance is None or not is_strained(adjusted.whole.camera_priors, adjusted.choice.fit):
+    if adjusted.covariance is None or not is_strained(adjusted.all_links.camera_priors, adjusted.choice.fit):
         return adjusted
     task = adjusted.given
     cameras = [camera.without_focal().with_focal() for camera in task.cameras]
@@ -237,23 +206,29 @@ def _checked_focal(adjusted: AdjustedImages, given: AlignmentOptions) -> Adjuste
 
 def most_matches_read(links: int, options: AlignmentOptions) -> int | None:
     """Correspondences of each of so many links that :func:`align` reads at the most; None for all of them."""
-    return None if links * options.most < _MATCHES_OF_A_TURN else _matches_of_a_link(links, options)
+    return None if links * options.max_matches_per_link < _MATCHES_OF_A_TURN else _matches_of_a_link(links, options)
 
 
 def _matches_of_a_link(links: int, options: AlignmentOptions) -> int:
     """Thousands of links determine lens and poses many times over: memory and time are to grow with the links alone."""
-    return min(options.most, max(_MATCHES_OF_ALL // max(links, 1), _MATCHES_OF_A_LINK))
+    return min(options.max_matches_per_link, max(_MATCHES_OF_ALL // max(links, 1), _MATCHES_OF_A_LINK))
+
+
+def _matches_for_selection(links: int) -> int:
+    """Correspondences of a link that suffice to choose a model: fewer where there are many links."""
+    return int(np.clip(5_000 // max(links, 1), 40, 150))
 
 
 def _observations(
-    links: Sequence[Link], cameras: Sequence[Camera], most: int
+    links: Sequence[Link], cameras: Sequence[Camera], max_matches: int
 ) -> tuple[Observations, list[RadialHomography]]:
     """Of each link at most so many correspondences, chosen before any is turned round; and how each maps them."""
-    read = in_alternate_directions([link.thinned(most) for link in links])
+    read = in_alternate_directions([link.thinned(max_matches) for link in links])
     return Observations.from_links(read, cameras), [link.relation for link in read]
 
 
-def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> None:
+def _check(given: GivenImages) -> None:
+    cameras, links, options = given.cameras, given.links, given.options
     if not links:
         raise RegistrationError("nothing to align: no two images overlap")
     pairs = [(min(k.image1, k.image2), max(k.image1, k.image2)) for k in links]
@@ -265,7 +240,7 @@ def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentO
         raise ArgumentError(f"the reference image {options.reference} is not among the {len(cameras)}")
 
 
-def _trust(observations: Observations, confirmed: IntArray) -> FloatArray:
+def _tree_ranks(observations: Observations, confirmed: IntArray) -> FloatArray:
     """Ranks of the links for the spanning tree: by their matches, and by the area of these where they are as many.
 
     Where all are as many, a tree of the first links may pass over neighbours, and join them a whole path away.
@@ -274,47 +249,28 @@ def _trust(observations: Observations, confirmed: IntArray) -> FloatArray:
     return np.argsort(np.lexsort((observations.areas, matches))).astype(np.float64)
 
 
-def _is_depth(bent: BundleAdjustmentResult, flat: BundleAdjustmentResult) -> bool:
-    """Whether the depth of what a few images show may look like their lens: with λ free, and held.
-
-    Depth changes most from one end of a view to the other, as the effect of a lens does: where it shows in the errors
-    that are left, λ takes the blame for more of it than that.
-    """
-    left = left_coherence(flat)
-    if left.correlation <= COHERENT_CORRELATION or left.relative_size <= LARGE_RELIEF:
-        return False
-    with_lens = left_coherence(bent)
-    return with_lens.correlation > COHERENT_CORRELATION and left.size < _LENS_OVER_DEPTH * with_lens.size
-
-
-def _observable(pairwise: BundleAdjustmentResult) -> bool:
-    """Whether one homography a pair leaves λ well determined, at a value that a lens can have."""
-    distortion = float(pairwise.parameters.lens[0])
-    # Without what the prior says.
-    information = 1.0 / float(pairwise.covariance[0, 0]) - LENS[0].curvature(distortion)
-    return information > OBSERVABLE_STD**-2.0 and PLAUSIBLE_DISTORTION[0] < distortion < PLAUSIBLE_DISTORTION[1]
-
-
 def _drop_wrong_pairs(
-    whole: Problem, problem: Problem, images: IntArray, choice: ModelChoice, wrong: BoolArray
+    all_links: Problem, problem: Problem, images: IntArray, choice: ModelChoice, wrong: BoolArray
 ) -> tuple[ModelChoice, IntArray, BoolArray]:
     """Test all links against the adjusted poses, and adjust again without those that do not fit."""
-    whole = replace(whole, free_lens=choice.fit.free_lens)
-    o = whole.observations
+    all_links = replace(all_links, free_lens=choice.fit.free_lens)
+    o = all_links.observations
     for _ in range(_ROUNDS):
         adjusted, model = choice.fit.adjusted, choice.fit.model
-        everything, _ = whole.part(np.ones_like(wrong), images)
+        between_images, _ = all_links.part(np.ones_like(wrong), images)
         inside = np.isin(o.image1, images) & np.isin(o.image2, images)
         judged = wrong.copy()
-        judged[inside] = misfitting_links(everything.squared(model, adjusted.parameters), everything.observations)
+        judged[inside] = misfitting_links(
+            between_images.squared(model, adjusted.parameters), between_images.observations
+        )
         if (judged == wrong).all():
             break
         wrong = judged
-        problem, kept = whole.part(~wrong)
+        problem, kept = all_links.part(~wrong)
         if np.isin(kept, images).all():
             poses = adjusted.parameters.poses[np.searchsorted(images, kept)]
             fit = problem.refine(model, replace(adjusted.parameters, poses=poses), choice.fit.tilt_spread)
         else:
-            fit = problem.fit(model)
+            fit = fit_model(problem, model)
         choice, images = replace(choice, fit=fit), kept
     return choice, images, wrong

@@ -37,7 +37,7 @@ class AlignmentOptions:
     lens: str = "auto"  # one of :data:`rdstitch.choices.LensName`; "auto": the simplest that the data allow
     purpose: Purpose = Purpose.MOSAIC
     pose_covariance: bool = False  # its time grows with the square of the number of images
-    most: int = 250  # correspondences used of each link; fewer where there are thousands of links
+    max_matches_per_link: int = 250  # correspondences used of each link; fewer where there are thousands of links
 
     def __post_init__(self) -> None:
         for name, choices in (("model", get_args(ModelName)), ("lens", get_args(LensName))):

@@ -1,28 +1,26 @@
 """From the adjusted parameters to the :class:`Alignment`: frames, poses, uncertainties, and what was left out."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import Problem
-from rdstitch.alignment.alignment_options import AlignmentOptions
+from rdstitch.alignment.adjusted_images import AdjustedImages
 from rdstitch.alignment.frames.level_frame import levelled
 from rdstitch.alignment.least_squares.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.lens.lens_description import radius_std
-from rdstitch.alignment.lens.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
+from rdstitch.alignment.lens.lens_selection import CENTER, ENOUGH_IMAGES
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.noise import coherence, judge_relief
-from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, Unused
-from rdstitch.alignment.select import ModelChoice
+from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, ReliefTest, Unused
 from rdstitch.alignment.uncertainty import considered_covariance, lever_std, pose_covariances
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane
 from rdstitch.geometry.radial_homography import inverses
-from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.results.messages import Message, Severity
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
@@ -44,98 +42,116 @@ _CONFIDENT = 2.0
 """Standard deviations within which the lens is taken to be known: 95 %."""
 
 
-@dataclass(frozen=True, eq=False)
-class GivenImages:
-    """Images to be aligned."""
-
-    cameras: Sequence[Camera]
-    links: Sequence[Link]
-    options: AlignmentOptions
-
-
-@dataclass(frozen=True, eq=False)
-class AdjustedImages:
-    """What the adjustment found, and what it was made from."""
-
-    given: GivenImages
-    images: IntArray  # (N,): the images aligned, ascending; the problem numbers them 0 … N-1
-    right: BoolArray  # (L,): links not taken for wrong
-    whole: Problem  # of all links and images, with the matches that they are adjusted by in the end
-    problem: Problem  # of those aligned, with the matches that they were adjusted by
-    choice: ModelChoice
-    lens: LensChoice  # the lens, with the distortion centre if the motion model freed it
-    positions_disagree: str = ""  # why the positions were not used; empty where they were, or where there are none
-    leverage: Mapping[int | str, float] = field(default_factory=dict)  # see Alignment
-    messages: tuple[Message, ...] = ()  # on what was given
-    # covariance, lens_covariance: of what was estimated, and of all parameters of a lens; none of a draft
-    covariance: FloatArray | None = None
-    lens_covariance: FloatArray | None = None
-
-
 def build_alignment(adjustment: AdjustedImages) -> Alignment:
     """The alignment, in the frame of the reference image.
 
     A draft, which has no covariances, has the deviations of independent errors.
     """
-    problem, fit = adjustment.problem, adjustment.choice.fit
-    adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
-    shared, lens = fit.model.physical_parameters(adjusted.parameters.shared)[0], adjusted.parameters.lens
-    covariance = adjusted.covariance if adjustment.covariance is None else adjustment.covariance
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    names = (
-        *fit.model.shared_names,
-        *(name for name, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free),
-    )
-    lens_covariance = _lens_covariance(names, covariance)
-    # What is reported is how far points are off, whatever moved them.
-    observations = replace(problem.observations, relief=None)
-    errors = whitened_errors(observations, adjusted.homographies, lens)
-    squared = squared_lengths(errors)
-    # No lens or plane is exact enough for matches that are off by less to disagree.
-    agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(observations.sigma(squared), MODEL_ERROR)) ** 2
-    left = coherence(observations, errors, observations.inliers(squared))
-    relief = judge_relief(left, fit.model.name, len(observations))
-    considered = lens_covariance
-    if adjustment.lens_covariance is not None and adjustment.lens.observable and problem.free_lens[0]:
-        considered = considered_covariance(problem, fit, adjustment.lens_covariance, rough=relief.found)
-    tilt, tilt_std = ((float(values[0]), float(values[1])) if planar else None for values in (shared, std))
-
-    def adjusted_camera(camera: Camera) -> Camera:
-        result = _with_lens(adjustment, camera, lens, (lens_covariance, considered))
-        if fit.model.one_camera:
-            focal = fit.model.focal(adjusted.parameters.shared) * camera.scale
-            result = result.with_focal(focal, "estimate", float(std[names.index("log_focal")]) * focal)
-        return replace(result, tilt=tilt, tilt_std=tilt_std)
-
-    # Most images are of one camera.
-    adjusted_cameras = {camera: adjusted_camera(camera) for camera in dict.fromkeys(adjustment.given.cameras)}
-    cameras = tuple(adjusted_cameras[camera] for camera in adjustment.given.cameras)
-    reference_camera = cameras[int(adjustment.images[problem.reference])]
-    groups = _groups(adjustment)
-    used = np.zeros(len(adjustment.given.cameras), dtype=np.bool_)
+    problem, fit, given = adjustment.problem, adjustment.choice.fit, adjustment.given
+    agreement = _Agreement.of(adjustment)
+    uncertainty = _Uncertainty.of(adjustment, rough=agreement.relief.found)
+    cameras = _adjusted_cameras(adjustment, uncertainty)
+    reference = int(adjustment.images[problem.reference])
+    used = np.zeros(len(given.cameras), dtype=np.bool_)
     used[adjustment.images] = True
     homographies, poses = _in_frame_of_reference(adjustment)
+    has_lever = agreement.relief.found and fit.model.has_metric_poses and adjustment.covariance is not None
     return Alignment(
         cameras=cameras,
         homographies=homographies,
         used=used,
-        components=groups,
-        reference=int(adjustment.images[problem.reference]),
+        components=_groups(adjustment),
+        reference=reference,
         model=fit.model.name,
         model_reason=adjustment.choice.reason,
         poses=poses,
         tilt_spread=fit.tilt_spread,
         lens=adjustment.lens.name,
         lens_reason=adjustment.lens.reason,
-        parameters=names,
-        covariance=covariance,
-        rms=float(np.sqrt(squared[agreeing].mean())) if agreeing.any() else math.nan,
-        links=_link_fits(adjustment, squared, agreeing),
-        relief=relief,
+        parameters=uncertainty.names,
+        covariance=uncertainty.covariance,
+        rms=agreement.rms,
+        links=_link_fits(adjustment, agreement),
+        relief=agreement.relief,
         leverage=adjustment.leverage,
-        lever_std=lever_std(problem, fit) if relief.found and planar and adjustment.covariance is not None else 0.0,
-        messages=(*_warnings(adjustment, reference_camera, considered), *adjustment.messages),
+        lever_std=lever_std(problem, fit) if has_lever else 0.0,
+        messages=(*_warnings(adjustment, cameras[reference], uncertainty.considered), *adjustment.messages),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Agreement:
+    """How well the matches agree with the adjustment."""
+
+    squared: FloatArray  # (M,): squared errors, px²
+    agreeing: BoolArray  # (M,)
+    relief: ReliefTest
+
+    @classmethod
+    def of(cls, adjustment: AdjustedImages) -> Self:
+        fit = adjustment.choice.fit
+        # What is reported is how far points are off, whatever moved them.
+        observations = replace(adjustment.problem.observations, relief=None)
+        errors = whitened_errors(observations, fit.adjusted.homographies, fit.adjusted.parameters.lens)
+        squared = squared_lengths(errors)
+        # No lens or plane is exact enough for matches that are off by less to disagree.
+        agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(observations.sigma(squared), MODEL_ERROR)) ** 2
+        left = coherence(observations, errors, observations.inliers(squared))
+        return cls(squared, agreeing, judge_relief(left, fit.model.name, len(observations)))
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the errors that agree, pixels."""
+        return float(np.sqrt(self.squared[self.agreeing].mean())) if self.agreeing.any() else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class _Uncertainty:
+    """How well the parameters that all images share are known."""
+
+    names: tuple[str, ...]  # of the P parameters that were estimated
+    covariance: FloatArray  # (P, P)
+    lens: FloatArray  # (5, 5): of the lens by what was estimated, zero for the rest
+    considered: FloatArray  # (5, 5): of all parameters of the lens, with what was not estimated
+
+    @classmethod
+    def of(cls, adjustment: AdjustedImages, *, rough: bool) -> Self:
+        """Over ``rough`` ground or not."""
+        problem, fit = adjustment.problem, adjustment.choice.fit
+        covariance = fit.adjusted.covariance if adjustment.covariance is None else adjustment.covariance
+        estimated = [name for name, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free]
+        names = (*fit.model.shared_names, *estimated)
+        lens = considered = _lens_covariance(names, covariance)
+        if adjustment.lens_covariance is not None and adjustment.lens.observable and problem.free_lens[0]:
+            considered = considered_covariance(problem, fit, adjustment.lens_covariance, rough=rough)
+        return cls(names, covariance, lens, considered)
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations (P,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+
+def _adjusted_cameras(adjustment: AdjustedImages, uncertainty: _Uncertainty) -> tuple[Camera, ...]:
+    """The camera of each image, with the lens, the focal length and the tilt that were found."""
+    fit, std = adjustment.choice.fit, uncertainty.std
+    model, shared = fit.model, fit.adjusted.parameters.shared
+    tilt = tilt_std = None
+    if model.has_metric_poses:
+        physical = model.physical_parameters(shared)[0]
+        tilt, tilt_std = ((float(values[0]), float(values[1])) for values in (physical, std))
+
+    def adjusted_camera(camera: Camera) -> Camera:
+        result = _with_lens(adjustment, camera, uncertainty)
+        if model.one_camera:
+            focal = model.focal(shared) * camera.scale
+            focal_std = float(std[uncertainty.names.index("log_focal")]) * focal
+            result = result.with_focal(focal, "estimate", focal_std)
+        return replace(result, tilt=tilt, tilt_std=tilt_std)
+
+    # Most images are of one camera.
+    adjusted = {camera: adjusted_camera(camera) for camera in dict.fromkeys(adjustment.given.cameras)}
+    return tuple(adjusted[camera] for camera in adjustment.given.cameras)
 
 
 def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray:
@@ -147,11 +163,9 @@ def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray
     return result
 
 
-def _with_lens(
-    adjustment: AdjustedImages, camera: Camera, lens: FloatArray, covariances: tuple[FloatArray, FloatArray]
-) -> Camera:
-    """The camera of an image with the lens that was found; covariances of what was estimated, and of all of a lens."""
-    covariance, considered = covariances
+def _with_lens(adjustment: AdjustedImages, camera: Camera, uncertainty: _Uncertainty) -> Camera:
+    """The camera of an image with the lens that was found."""
+    lens, covariance = adjustment.choice.fit.adjusted.parameters.lens, uncertainty.lens
     center = np.asarray(camera.center) + lens[CENTER] * camera.scale
     estimated = bool(covariance.any())
     result = replace(
@@ -166,7 +180,7 @@ def _with_lens(
         raise ImpossibleCameraError(f"with λ = {result.distortion:.3g} the corners would see behind the camera")
     lens_free = bool(adjustment.problem.free_lens.any())
     shown = adjustment.lens.observable and (adjustment.choice.fit.adjusted.converged or not lens_free)
-    std = _nearest_distortion_std(result, considered) if shown else math.inf
+    std = _nearest_distortion_std(result, uncertainty.considered) if shown else math.inf
     return replace(result, distortion_std=std)
 
 
@@ -186,11 +200,8 @@ def _in_frame_of_reference(adjustment: AdjustedImages) -> tuple[FloatArray, Plan
     The adjustment may have held the reference image anywhere; here it comes to the origin, with yaw zero and, as
     the unit of length, height one.
     """
-    fit, reference, parameters = (
-        adjustment.choice.fit,
-        adjustment.problem.reference,
-        adjustment.choice.fit.adjusted.parameters,
-    )
+    fit, reference = adjustment.choice.fit, adjustment.problem.reference
+    parameters = fit.adjusted.parameters
     matrices = fit.adjusted.matrices.matrices
 
     def of_all(values: FloatArray) -> FloatArray:
@@ -203,15 +214,11 @@ def _in_frame_of_reference(adjustment: AdjustedImages) -> tuple[FloatArray, Plan
         given = adjustment.given.options.gravity
         gravity = None if given is None else np.asarray(given, dtype=np.float64)[adjustment.images]
         return of_all(levelled(matrices, reference, gravity)), None
-    if not isinstance(fit.model, PlanarModel):
+    if not fit.model.has_metric_poses:
         return of_all(matrices[reference] @ inverses(matrices)), None
     metric = fit.model.metric_poses(parameters.poses, parameters.shared)
-    yaw, position, height, tilt = (
-        metric[:, YAW],
-        metric[:, [X, Y]],
-        np.exp(metric[:, LOG_HEIGHT]),
-        metric[:, [PSI, THETA]],
-    )
+    yaw, position = metric[:, YAW], metric[:, [X, Y]]
+    height, tilt = np.exp(metric[:, LOG_HEIGHT]), metric[:, [PSI, THETA]]
     frame = rigid_in_plane(yaw[reference], position[reference], height[reference])
     poses = PlanarPoses(yaw, position, height, tilt).relative_to(reference)
     wanted = adjustment.given.options.pose_covariance and adjustment.covariance is not None
@@ -222,15 +229,16 @@ def _in_frame_of_reference(adjustment: AdjustedImages) -> tuple[FloatArray, Plan
 
 def _groups(adjustment: AdjustedImages) -> tuple[tuple[int, ...], ...]:
     """Connected groups of images by the links not taken for wrong, the aligned one first."""
-    right = [link for link, right in zip(adjustment.given.links, adjustment.right, strict=True) if right]
-    groups = connected_components(len(adjustment.given.cameras), [k.image1 for k in right], [k.image2 for k in right])
+    links = [link for link, kept in zip(adjustment.given.links, adjustment.kept_links, strict=True) if kept]
+    groups = connected_components(len(adjustment.given.cameras), [k.image1 for k in links], [k.image2 for k in links])
     aligned = set(adjustment.images.tolist())
     ordered = sorted(groups, key=lambda group: group[0] not in aligned)
     return tuple(tuple(group) for group in ordered)
 
 
-def _link_fits(adjustment: AdjustedImages, squared: FloatArray, agreeing: BoolArray) -> tuple[LinkFit, ...]:
+def _link_fits(adjustment: AdjustedImages, agreement: _Agreement) -> tuple[LinkFit, ...]:
     """How well each link agrees, in the order of the links given."""
+    squared, agreeing = agreement.squared, agreement.agreeing
     observations = adjustment.problem.observations
     medians = observations.medians(np.sqrt(squared))
     images = adjustment.images
@@ -239,10 +247,10 @@ def _link_fits(adjustment: AdjustedImages, squared: FloatArray, agreeing: BoolAr
         for row, (i, j) in enumerate(zip(observations.image1, observations.image2, strict=True))
     }
     result = []
-    for link, right in zip(adjustment.given.links, adjustment.right, strict=True):
+    for link, kept in zip(adjustment.given.links, adjustment.kept_links, strict=True):
         row = rows.get(frozenset((link.image1, link.image2)))
-        if row is None or not right:
-            why = Unused.ELSEWHERE if right else Unused.CONTRADICTS
+        if row is None or not kept:
+            why = Unused.ELSEWHERE if kept else Unused.CONTRADICTS
             result.append(LinkFit(link.image1, link.image2, len(link), 0, math.nan, False, why))
             continue
         rows_of_link = slice(observations.start[row], observations.start[row + 1])

@@ -22,6 +22,12 @@ _MAX_TRIANGLES, _TRIANGLES_PER_LINK = 20_000, 2
 
 _TRIANGLES_AT_ONCE = 4096
 
+_OUTLYING = 8.0
+"""Times what is usual from which on a triangle does not close, and a link does not fit."""
+
+_VISIBLE, _MIN_VISIBLE = 1.5, 2
+"""Half diagonals from the middle up to which a transferred probe counts, and so many probes at least of a triangle."""
+
 _MIN_ERROR = 0.02
 """Half diagonals: a link that is off by less is no wrong pair."""
 
@@ -43,11 +49,11 @@ def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:
     jk = np.searchsorted(key, wanted, sorter=order).clip(max=max(len(order) - 1, 0))
     closed = key[order[jk]] == wanted
     result = np.stack([order[place[closed]] for place in (ij, jk, ik)], axis=1)
-    most = max(_MAX_TRIANGLES, _TRIANGLES_PER_LINK * len(low))
-    if len(result) <= most:
+    limit = max(_MAX_TRIANGLES, _TRIANGLES_PER_LINK * len(low))
+    if len(result) <= limit:
         return result
     kept = np.zeros(len(result), dtype=np.bool_)
-    kept[np.random.default_rng(0).choice(len(result), most, replace=False)] = True
+    kept[np.random.default_rng(0).choice(len(result), limit, replace=False)] = True
     links, first = np.unique(result, return_index=True)
     kept[first[~np.isin(links, result[kept])] // 3] = True
     return result[kept]
@@ -67,14 +73,14 @@ def cycle_consistency(
     corners = triangles(count, observations.image1, observations.image2)
     if not len(corners):
         return suspect, np.zeros(len(observations), dtype=np.intp)
-    bad = _open_triangles(pairwise, observations, corners)
-    alive = np.isfinite(bad) & ~suspect[corners].any(axis=1)
+    is_open = _open_triangles(pairwise, observations, corners)
+    alive = np.isfinite(is_open) & ~suspect[corners].any(axis=1)
     while True:
-        weight = np.where(alive, np.where(bad > 0, 1.0, -1.0), 0.0)
+        weight = np.where(alive, np.where(is_open > 0, 1.0, -1.0), 0.0)
         balance = np.bincount(corners.ravel(), np.repeat(weight, 3), len(observations))
         worst = int(np.lexsort((observations.matches, -balance))[0])
         if balance[worst] <= 0:
-            closed = corners[alive & (bad == 0)]
+            closed = corners[alive & (is_open == 0)]
             return suspect, np.bincount(closed.ravel(), minlength=len(observations)).astype(np.intp)
         suspect[worst] = True
         alive &= ~(corners == worst).any(axis=1)
@@ -105,19 +111,21 @@ def _open_triangles(pairwise: BundleAdjustmentResult, observations: Observations
         )
         size = np.linalg.norm(second.points - direct.points, axis=1)
         deviation = np.sqrt(np.einsum("...ii->...", total) / 2.0) + 1e-9
-        visible = np.isfinite(size) & (np.abs(second.points).max(axis=1) < 1.5)
+        visible = np.isfinite(size) & (np.abs(second.points).max(axis=1) < _VISIBLE)
         normalized, absolute = (np.where(visible, each, np.nan) for each in (size / deviation, size))
         return normalized.reshape(-1, _PROBES), absolute.reshape(-1, _PROBES)
 
     parts = np.split(corners, np.arange(_TRIANGLES_AT_ONCE, len(corners), _TRIANGLES_AT_ONCE))
     normalized, absolute = (np.concatenate(each) for each in zip(*map(misclosures, parts), strict=True))
-    seen = np.isfinite(normalized).sum(axis=1) >= 2
+    visible_triangles = np.isfinite(normalized).sum(axis=1) >= _MIN_VISIBLE
     result = np.full(len(corners), np.nan)
-    if not seen.any():
+    if not visible_triangles.any():
         return result
-    middle = np.nanmedian(normalized[seen], axis=1)
-    usual = max(1.0, _usual_misclosure(middle, corners[seen], observations))
-    result[seen] = (middle > 8.0 * usual) & (np.nanmedian(absolute[seen], axis=1) > _MIN_ERROR)
+    middle = np.nanmedian(normalized[visible_triangles], axis=1)
+    usual = max(1.0, _usual_misclosure(middle, corners[visible_triangles], observations))
+    result[visible_triangles] = (middle > _OUTLYING * usual) & (
+        np.nanmedian(absolute[visible_triangles], axis=1) > _MIN_ERROR
+    )
     return result
 
 
@@ -168,7 +176,7 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
     typical = observations.medians(np.sqrt(squared))
     usual = _weighted_median(typical, np.where(np.isfinite(typical), observations.matches, 0))
     least = _MIN_ERROR * np.sqrt(observations.scale1 * observations.scale2)
-    outlying: BoolArray = ~(typical <= np.maximum(8.0 * usual, least))
+    outlying: BoolArray = ~(typical <= np.maximum(_OUTLYING * usual, least))
     return outlying
 
 

@@ -15,8 +15,9 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.least_squares.priors import CameraPriors
-from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA, PlanarModel
+from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA
 from rdstitch.alignment.select import select_model
+from rdstitch.alignment.starts import start_from
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, DELAYS, at_delay, smooth
@@ -60,31 +61,21 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
     if options.attitudes is None and options.tilt is None:
         return None
     without = replace(options, attitudes=None, delayed_attitudes=None, tilt=None)
-    known = problem.camera_priors
-    given = known.attitudes + known.tilt
-    nothing = replace(
-        known, attitudes=np.zeros_like(known.attitudes), attitudes_std=None, tilt=(0.0, 0.0), tilt_known=False
-    )
-    bare = replace(problem, camera_priors=nothing)
-    models = [name for name in without.models if not MODELS[name].on_sphere]
-    # A model of one tilt shows no others.
-    models = models if without.model == "auto" or options.attitudes is None else _WITH_TILTS
-    fit = select_model(bare, models).fit
-    if not isinstance(fit.model, PlanarModel):
+    fitted = _fit_without_tilts(problem, options, without)
+    if fitted is None:
         return None
-    if fit.model.free_tilts and not fit.model.any_tilt:  # whose prior draws tilts together
-        fit = bare.refine(POSE, bare.start_from(POSE, fit))
-    shown = _ShownTilts.of(bare, fit, free_mount=options.tilt is None)
+    known = problem.camera_priors
+    shown = _ShownTilts.of(*fitted, free_mount=options.tilt is None)
     if known.delayed_attitudes is not None and (late := shown.delay(known.delayed_attitudes + known.tilt)) is not None:
         attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
         return replace(options, attitudes=attitudes, delayed_attitudes=None), attitudes_late(*late)
-    stated = options.attitudes_std if options.attitudes is not None else 0.0
-    scores = [shown.likelihood(given @ change.T) for change in _SIGNED_ORDERS]
+    given, stated = known.attitudes + known.tilt, options.attitudes_std if options.attitudes is not None else 0.0
+    changed = [shown.likelihood(given @ change.T) for change in _SIGNED_ORDERS]
     none = shown.likelihood(np.zeros_like(given))
-    (likelihood, scatter), best = scores[0], int(np.argmax([score for score, _ in scores]))
+    (likelihood, scatter), best = changed[0], int(np.argmax([score for score, _ in changed]))
     if likelihood - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
         return None
-    if max(scores[best][0], none[0]) < likelihood + _LOG_ODDS:
+    if max(changed[best][0], none[0]) < likelihood + _LOG_ODDS:
         if options.attitudes is None:
             return None
         text = f"the attitudes agree with the images to {math.degrees(scatter):.2g} degrees, which is taken for their "
@@ -95,16 +86,36 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
         text += ", which is not used: they show {:.2f}, {:.2f}".format(*np.degrees(np.median(shown.tilts, axis=0)))
     else:
         text = f"the images contradict the attitudes by {math.degrees(scatter):.1f} degrees; they are not used: "
-        related = scores[best][0] > none[0] + _LOG_ODDS
-        error = math.degrees(max(scores[best][1], _EXACT))
+        related = changed[best][0] > none[0] + _LOG_ODDS
+        error = math.degrees(max(changed[best][1], _EXACT))
         better = f"with {_named(_SIGNED_ORDERS[best])} they would fit to {error:.2g} degrees"
         text += better if related else "no signs and no order of psi and theta make them fit"
     return without, Message(text, code="attitudes-contradicted")
 
 
+def _fit_without_tilts(
+    problem: Problem, options: AlignmentOptions, without: AlignmentOptions
+) -> tuple[Problem, Fit] | None:
+    """The problem that knows nothing of the tilts, and a fit with the tilts that it shows; None where it shows none."""
+    known = problem.camera_priors
+    nothing = replace(
+        known, attitudes=np.zeros_like(known.attitudes), attitudes_std=None, tilt=(0.0, 0.0), tilt_known=False
+    )
+    bare = replace(problem, camera_priors=nothing)
+    models = [name for name in without.models if not MODELS[name].on_sphere]
+    # A model of one tilt shows no others.
+    models = models if without.model == "auto" or options.attitudes is None else _WITH_TILTS
+    fit = select_model(bare, models).fit
+    if not fit.model.has_metric_poses:
+        return None
+    if fit.model.free_tilts and not fit.model.any_tilt:  # whose prior draws tilts together
+        fit = bare.refine(POSE, start_from(bare, POSE, fit))
+    return bare, fit
+
+
 def is_strained(priors: CameraPriors, fit: Fit) -> bool:
     """Whether a focal length that the user gave gave way to the images by more than is likely."""
-    if priors.focal_source not in ("option", "file") or not isinstance(fit.model, PlanarModel):
+    if priors.focal_source not in ("option", "file") or not fit.model.has_metric_poses:
         return False
     moved = float(fit.adjusted.parameters.shared[-1]) - priors.log_focal
     return abs(moved) > _STRAINED * priors.log_focal_std
@@ -112,7 +123,7 @@ def is_strained(priors: CameraPriors, fit: Fit) -> bool:
 
 def check_focal(given: Camera, fit: Fit, covariance: FloatArray | None) -> Message | None:
     """What the user should know of a focal length that was given, by a fit without it; None where that agrees."""
-    if not isinstance(fit.model, PlanarModel) or covariance is None or given.focal is None:
+    if not fit.model.has_metric_poses or covariance is None or given.focal is None:
         return None
     place = fit.model.shared_names.index("log_focal")
     focal, std = fit.model.focal(fit.adjusted.parameters.shared) * given.scale, math.sqrt(covariance[place, place])
@@ -170,7 +181,6 @@ class _ShownTilts:
     def of(cls, problem: Problem, fit: Fit, *, free_mount: bool) -> "_ShownTilts":
         """By a planar fit that knows nothing of the tilts; with ``free_mount`` up to what all have in common."""
         adjuster, adjusted, model = problem.adjuster_of(fit), fit.adjusted, fit.model
-        assert isinstance(model, PlanarModel)
         normal = adjuster.normal_equations(adjusted)
         tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
         images = evenly_spaced(problem.count, _MAX_IMAGES)

@@ -18,7 +18,7 @@ from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster
 from rdstitch.alignment.least_squares.plane_marks import PlaneMarks
 from rdstitch.alignment.least_squares.priors import CameraPriors
-from rdstitch.alignment.motion_models import PlanarModel, X, Y
+from rdstitch.alignment.motion_models import X, Y
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.posterior import MODEL_ERROR
@@ -60,16 +60,16 @@ class MapFit:
 
 def adjust_to_map(problem: Problem, fit: Fit) -> MapFit:
     """Adjust again with positions and control points as priors, where there are enough of them, and they agree."""
-    if not isinstance(fit.model, PlanarModel):
+    if not fit.model.has_metric_poses:
         return MapFit(problem, fit)
-    every: list[_KnownPlaces] = [_Control(problem, fit), _Positions(problem)]
-    sides = [side for side in every if side.enough]
+    kinds: list[_KnownPlaces] = [_Control(problem, fit), _Positions(problem)]
+    known = [places for places in kinds if places.enough]
     disagreement = ""
-    while sides:
-        held = _adjusted(problem, fit, sides)
-        if not held.disagreement:
-            return replace(held, disagreement=disagreement)
-        disagreement, sides = disagreement or held.disagreement, sides[1:]
+    while known:
+        with_map = _adjusted(problem, fit, known)
+        if not with_map.disagreement:
+            return replace(with_map, disagreement=disagreement)
+        disagreement, known = disagreement or with_map.disagreement, known[1:]
     return MapFit(problem, fit, disagreement)
 
 
@@ -137,7 +137,6 @@ class _Positions(_KnownPlaces):
         return replace(known, places=places, places_precision=weights)
 
     def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
-        assert isinstance(fit.model, PlanarModel)
         image = np.flatnonzero(self.known)
         axes = [fit.model.free.index(column) for column in (X, Y)]
         shared = len(fit.model.shared_names) + int(adjuster.free.lens.sum())
@@ -173,12 +172,12 @@ class _Control(_KnownPlaces):
 
     def estimated(self, fit: Fit) -> ComplexArray:
         adjusted = fit.adjusted
-        every = np.zeros((len(self.metres), 2))
+        sums = np.zeros((len(self.metres), 2))
         focal = fit.model.focal(adjusted.parameters.shared)
-        marks = self.marks(every, np.zeros(len(every)))
-        seen = marks.places(adjusted.matrices.matrices, adjusted.parameters.lens, focal)
-        np.add.at(every, self.points.point, seen)
-        means: ComplexArray = (every / np.maximum(self.count, 1)[:, None]) @ _COMPLEX
+        marks = self.marks(sums, np.zeros(len(sums)))
+        sightings = marks.places(adjusted.matrices.matrices, adjusted.parameters.lens, focal)
+        np.add.at(sums, self.points.point, sightings)
+        means: ComplexArray = (sums / np.maximum(self.count, 1)[:, None]) @ _COMPLEX
         return means
 
     def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
@@ -195,46 +194,47 @@ class _Control(_KnownPlaces):
         return self.points.point, self.points.names
 
 
-def _adjusted(problem: Problem, fit: Fit, sides: list[_KnownPlaces]) -> MapFit:
-    """The fit with all of them, and which of the first ones the images contradict."""
-    refined, free = fit, replace(problem.camera_priors, fix_frame=False)
+def _adjusted(problem: Problem, fit: Fit, known: list[_KnownPlaces]) -> MapFit:
+    """The fit with all known places; without them and why, where the images contradict the first kind of them."""
+    refined, free_frame = fit, replace(problem.camera_priors, fix_frame=False)
     for _ in range(_ROUNDS):
-        before, known = [side.estimated(refined) for side in sides], free
-        drawn = []
-        for side in sides:
-            known, similar, excess = side.prior_from_map(known, refined)
-            drawn.append((similar, excess))
-        held = replace(problem, camera_priors=known)
-        refined = held.refine(fit.model, refined.adjusted.parameters, fit.tilt_spread or None)
+        before, priors = [places.estimated(refined) for places in known], free_frame
+        on_map: list[tuple[SimilarityFit, float]] = []
+        for places in known:
+            priors, similarity, excess = places.prior_from_map(priors, refined)
+            on_map.append((similarity, excess))
+        with_map = replace(problem, camera_priors=priors)
+        refined = with_map.refine(fit.model, refined.adjusted.parameters, fit.tilt_spread or None)
         moved = [
-            np.abs(side.estimated(refined) - was).max() * abs(similar.scale) / (np.median(side.std) * excess)
-            for side, was, (similar, excess) in zip(sides, before, drawn, strict=True)
+            np.abs(places.estimated(refined) - former).max() * abs(similarity.scale) / (np.median(places.std) * excess)
+            for places, former, (similarity, excess) in zip(known, before, on_map, strict=True)
         ]
         if max(moved) < _SETTLED:
             break
     growth = math.hypot(refined.adjusted.sigma, MODEL_ERROR) / math.hypot(fit.adjusted.sigma, MODEL_ERROR)
-    side, (similar, excess) = sides[0], drawn[0]
-    off, usual = float(np.median(similar.residuals)), max(float(np.median(side.std)), POSITION_STD)
-    why = ""
-    if isinstance(side, _Positions) and off > OUTLYING * usual:
-        why = f"half of them are {off:.0f} m or more from where the images were taken"
-    elif not growth <= _MAX_GROWTH:
-        why = f"with them the errors of the matches grow by {growth - 1.0:.0%}"
-    if why:
-        text = f"the {side.name} contradict the images ({why}) and were not used for the alignment"
+    if contradiction := _contradiction(known[0], on_map[0][0], growth):
+        text = f"the {known[0].name} contradict the images ({contradiction}) and were not used for the alignment"
         return MapFit(problem, fit, text)
-    fixed = replace(held, camera_priors=replace(held.camera_priors, fix_frame=True))
-    return MapFit(fixed, refined, "", _leverage(held, refined, sides))
+    fixed = replace(with_map, camera_priors=replace(with_map.camera_priors, fix_frame=True))
+    return MapFit(fixed, refined, "", _leverage(with_map, refined, known))
 
 
-def _leverage(problem: Problem, fit: Fit, sides: Sequence[_KnownPlaces]) -> dict[int | str, float]:
+def _contradiction(places: _KnownPlaces, similarity: SimilarityFit, growth: float) -> str:
+    """How known places contradict the images, whose errors grow so many times with them; empty where they do not."""
+    distance = float(np.median(similarity.residuals))
+    if isinstance(places, _Positions) and distance > OUTLYING * max(float(np.median(places.std)), POSITION_STD):
+        return f"half of them are {distance:.0f} m or more from where the images were taken"
+    return "" if growth <= _MAX_GROWTH else f"with them the errors of the matches grow by {growth - 1.0:.0%}"
+
+
+def _leverage(problem: Problem, fit: Fit, known: Sequence[_KnownPlaces]) -> dict[int | str, float]:
     """How far (0 to 1) what is known puts itself where the fit has it; see :meth:`_KnownPlaces.labels`."""
     adjuster = problem.adjuster_of(fit)
     normal, (count, size) = adjuster.normal_equations(fit.adjusted), adjuster.free.poses.shape
     leverage: dict[int | str, float] = {}
-    for side in sides:
-        image, derivative, precision = side.jacobians(adjuster, fit)
-        item, names = side.labels()
+    for places in known:
+        image, derivative, precision = places.jacobians(adjuster, fit)
+        item, names = places.labels()
         chosen = evenly_spaced(len(names), _MANY)
         gradients = np.zeros((count, size, len(chosen), 2))
         of_shared = np.zeros((len(normal.gradient_shared), len(chosen), 2))
@@ -246,8 +246,8 @@ def _leverage(problem: Problem, fit: Fit, sides: Sequence[_KnownPlaces]) -> dict
         flat = gradients.reshape(count, size, -1), of_shared.reshape(len(of_shared), -1)
         steps = normal.responses(-flat[0], -flat[1])
         variance = (flat[0] * steps[0]).sum(axis=(0, 1)) + (flat[1] * steps[1]).sum(axis=0)
-        own = np.clip(np.reshape(variance, (-1, 2)).mean(axis=1) * sums[chosen], 0.0, _SURE)
-        shares = np.full(len(names), np.median(own))
-        shares[chosen] = own
-        leverage.update(zip(names, np.where(sums > 0.0, shares, 0.0).tolist(), strict=True))
+        of_chosen = np.clip(np.reshape(variance, (-1, 2)).mean(axis=1) * sums[chosen], 0.0, _SURE)
+        of_all = np.full(len(names), np.median(of_chosen))
+        of_all[chosen] = of_chosen
+        leverage.update(zip(names, np.where(sums > 0.0, of_all, 0.0).tolist(), strict=True))
     return leverage

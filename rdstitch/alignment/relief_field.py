@@ -18,7 +18,7 @@ import numpy as np
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
 from rdstitch.alignment.least_squares.linear_response import Fields, LinearResponse
 from rdstitch.alignment.least_squares.link_equations import LinearizedErrors, split_lens
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y
+from rdstitch.alignment.motion_models import LOG_HEIGHT, X, Y
 from rdstitch.alignment.noise import apart, neighbours
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.division_model import distort, undistort
@@ -93,7 +93,7 @@ class Parallax:
     def _feet(self) -> tuple[FloatArray, FloatArray]:
         """What each camera is above (N, 2), and how high it is (N,); roughly, in some unit, without poses."""
         model, parameters = self.adjuster.model, self.adjusted.parameters
-        if not isinstance(model, PlanarModel):
+        if not model.has_metric_poses:
             return self._centres, self._sizes
         poses = model.metric_poses(parameters.poses, parameters.shared)
         return poses[:, [X, Y]], np.exp(poses[:, LOG_HEIGHT])

@@ -14,11 +14,12 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.link_equations import linearized_errors
-from rdstitch.alignment.lens.lens_selection import left_coherence
-from rdstitch.alignment.motion_models import SIMILARITY, TILTING, PlanarModel
+from rdstitch.alignment.lens.lens_selection import residual_coherence
+from rdstitch.alignment.motion_models import SIMILARITY, TILTING
 from rdstitch.alignment.noise import independent_errors, judge_relief
 from rdstitch.alignment.relief_field import Parallax
 from rdstitch.alignment.select import ModelChoice, best_of
+from rdstitch.alignment.starts import fit_model, start_from
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 
@@ -49,7 +50,7 @@ def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[st
     # From the least free one: a camera that is free to tilt has already followed the hills.
     for model in (SIMILARITY, TILTING):
         if model.name in names and not choice.fit.model.any_tilt:
-            start = problem.refine(model, problem.start_from(model, fits[-1])) if fits else problem.fit(model)
+            start = problem.refine(model, start_from(problem, model, fits[-1])) if fits else fit_model(problem, model)
             problem, fit = _settled(problem, start)
             fits.append(fit)
     if not fits:
@@ -71,7 +72,7 @@ def weighted_by_relief(problem: Problem, fit: Fit) -> Problem:
 
     Of one camera over a plane only.
     """
-    if not isinstance(fit.model, PlanarModel) or problem.count < _FEWEST:
+    if not fit.model.has_metric_poses or problem.count < _FEWEST:
         return problem
     plain = replace(problem, observations=replace(problem.observations, relief=None))
     adjuster, adjusted, o = plain.adjuster_of(fit), fit.adjusted, plain.observations
@@ -93,7 +94,7 @@ def _is_rough(problem: Problem, fit: Fit) -> bool:
 
     Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
     """
-    return judge_relief(left_coherence(fit.adjusted), fit.model.name, len(problem.observations)).found
+    return judge_relief(residual_coherence(fit.adjusted), fit.model.name, len(problem.observations)).found
 
 
 def _settled(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:

@@ -17,9 +17,11 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.least_squares.link_equations import split_lens, whitened_errors
-from rdstitch.alignment.lens.lens_selection import NO_COHERENCE, left_coherence
+from rdstitch.alignment.lens.lens_selection import NO_COHERENCE, residual_coherence
 from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.alignment.noise import evidence_of
+from rdstitch.alignment.pairwise import fit_pairwise, fit_trial
+from rdstitch.alignment.starts import fit_model
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.geometry.division_model import undistort
@@ -176,12 +178,12 @@ def select_model(
     planar = [MODELS[name] for name in names if not MODELS[name].on_sphere]
     for turn in [MODELS[name] for name in names if MODELS[name].on_sphere]:
         if len(problem.observations) == 1:  # a trial is the whole
-            tried.append(posterior.of(problem.fit(turn)))
+            tried.append(posterior.of(fit_model(problem, turn)))
             continue
-        trial = wide.trial(turn)
-        bound, shared = posterior.bound(turn, posterior.cost(wide.pairwise(turn, trial))), trial.parameters.shared
+        trial = fit_trial(wide, turn)
+        bound, shared = posterior.bound(turn, posterior.cost(fit_pairwise(wide, turn, trial))), trial.parameters.shared
         if not planar or bound < posterior.bound(planar[0], posterior.least):
-            tried.append(posterior.of(problem.fit(turn, shared=shared)))
+            tried.append(posterior.of(fit_model(problem, turn, shared=shared)))
         else:
             later.append((bound, turn, shared))
     for model in planar:
@@ -190,11 +192,11 @@ def select_model(
         if tried and posterior.suffices(min(tried, key=_score), model):
             break
         planes = [one.fit for one in tried if not one.fit.model.on_sphere]
-        tried.append(posterior.of(problem.fit(model, planes[-1:])))
+        tried.append(posterior.of(fit_model(problem, model, planes[-1:])))
     for bound, turn, shared in later:
         best = min((one for one in tried if one.fit.model.one_camera), key=_score)
         if best.implausible or bound < best.score:
-            tried.insert(0, posterior.of(problem.fit(turn, shared=shared)))
+            tried.insert(0, posterior.of(fit_model(problem, turn, shared=shared)))
     tried = _with_wider_lenses(posterior, tried, lenses)
     return _choice(tried, _best(posterior, tried), requested=len(names) == 1)
 
@@ -218,7 +220,7 @@ def _with_wider_lenses(
             fit = tried[index].fit
             wider = posterior.of(posterior.problem.extend(fit, lens | fit.free_lens))
             # A centre that is off bends a plane as rough ground bends the images; directions it does not bend.
-            shown = fit.model.on_sphere or left_coherence(wider.fit.adjusted).correlation < NO_COHERENCE
+            shown = fit.model.on_sphere or residual_coherence(wider.fit.adjusted).correlation < NO_COHERENCE
             if wider.score < tried[index].score and shown:
                 tried[index] = wider
     return tried

@@ -24,9 +24,10 @@ from rdstitch.alignment.least_squares.bundle_adjustment import (
 from rdstitch.alignment.least_squares.linear_response import LinearResponse
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.plane_marks import PlaneMarks
-from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, YAW, PlanarModel, X, Y
+from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, YAW, MotionModel, X, Y
 from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.select import Posterior
+from rdstitch.alignment.starts import fit_model
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.choices import Purpose
 from rdstitch.robust.covariance import enlarged
@@ -164,7 +165,7 @@ def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *,
     one. Where the ground is ``rough`` that is known, and in the covariance.
     """
     count, deviation = len(problem.free_lens), 0.0
-    if isinstance(fit.model, PlanarModel):
+    if fit.model.has_metric_poses:
         log_focal = float(fit.model.physical_parameters(fit.adjusted.parameters.shared)[0][-1])
         deviation = log_focal - problem.camera_priors.log_focal
     if not rough and abs(deviation) > _UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
@@ -173,7 +174,7 @@ def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *,
         focal = len(fit.model.shared_names) - 1
         moved = together[-count:, focal] * (deviation / together[focal, focal])
         covariance = covariance + np.outer(moved, moved)
-    if problem.count == 2 and isinstance(fit.model, PlanarModel):
+    if problem.count == 2 and fit.model.has_metric_poses:
         covariance = _with_free_motion(problem, fit, covariance, rough=rough)
     return covariance
 
@@ -184,7 +185,7 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rou
     Of two images nothing but their errors says whether they were tilted alike, and over rough ground they say little.
     Each model counts as much as Schwarz's criterion makes it likely.
     """
-    free = problem.fit(HOMOGRAPHY)
+    free = fit_model(problem, HOMOGRAPHY)
     posterior = Posterior(problem, Purpose.TRAJECTORY)
     against = float(np.clip((posterior.of(free).score - posterior.of(fit).score) / 2.0, -50.0, 50.0))
     share = 1.0 / (1.0 + math.exp(against))
@@ -205,15 +206,16 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
     parameters, prior = fit.adjusted.parameters, LENS[0]
     value = float(parameters.lens[0])
     # What the images say without the prior, which has had its part in the adjustment: the value and its variance.
-    told, own = 1.0 / float(problem.adjuster_of(fit).covariance(fit.adjusted)[-1, -1]), prior.curvature(value)
-    seen = max(told - own, 1e-9 * told)
-    variance = max(float(covariance[-1, -1]) - own / told**2, 1.0 / told) * (told / seen) ** 2
-    weighed = prior.combined(value + prior.slope(value) / seen, math.sqrt(variance))
+    total = 1.0 / float(problem.adjuster_of(fit).covariance(fit.adjusted)[-1, -1])
+    of_prior = prior.curvature(value)
+    of_data = max(total - of_prior, 1e-9 * total)  # information
+    variance = max(float(covariance[-1, -1]) - of_prior / total**2, 1.0 / total) * (total / of_data) ** 2
+    weighed = prior.combined(value + prior.slope(value) / of_data, math.sqrt(variance))
     if abs(weighed - value) * float(np.median(problem.observations.scale1)) < MODEL_ERROR:
         return fit
-    held = replace(problem, free_lens=np.zeros_like(problem.free_lens))
+    fixed = replace(problem, free_lens=np.zeros_like(problem.free_lens))
     lens = np.where(problem.free_lens, weighed, parameters.lens)
-    return replace(fit, adjusted=held.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread).adjusted)
+    return replace(fit, adjusted=fixed.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread).adjusted)
 
 
 def lever_std(problem: Problem, fit: Fit) -> float:
@@ -223,7 +225,6 @@ def lever_std(problem: Problem, fit: Fit) -> float:
     all feet right, and make the ground larger or smaller.
     """
     adjuster, parameters, model = problem.adjuster_of(fit), fit.adjusted.parameters, fit.model
-    assert isinstance(model, PlanarModel)
     steps_of_poses, steps_of_shared = _relief(adjuster, fit.adjusted).steps()
     size, images = model.pose_size, np.arange(problem.count)
     focal = model.focal(parameters.shared)
@@ -244,7 +245,6 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
     if problem.free_lens.any():  # what is left open of the lens moves them, too
         problem = replace(problem, free_lens=np.ones_like(problem.free_lens))
     adjuster, model, parameters = problem.adjuster_of(fit), fit.model, fit.adjusted.parameters
-    assert isinstance(model, PlanarModel)
     normal, (count, size) = adjuster.normal_equations(fit.adjusted), adjuster.free.poses.shape
     own, by_shared, of_shared = normal.pose_covariances()
     of_first = np.zeros((count, size, size))
@@ -271,7 +271,7 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
     return of_images + moved @ moved.transpose(0, 2, 1), with_first + moved @ moved[0].T
 
 
-def _jacobian(model: PlanarModel, poses: FloatArray, shared: FloatArray, reference: int, size: int) -> FloatArray:
+def _jacobian(model: MotionModel, poses: FloatArray, shared: FloatArray, reference: int, size: int) -> FloatArray:
     """Derivatives (N, 4, D + S) of x, y, height and yaw in the frame of the reference."""
     yaw, height = poses[reference, YAW], float(np.exp(poses[reference, LOG_HEIGHT]))
     unit = 1.0 / (height * model.focal(shared))

@@ -3,7 +3,8 @@
 from rdstitch.features.detect import detect, detect_view
 from rdstitch.features.keypoints import Correspondences, Features, PackedFeatures
 from rdstitch.features.learned import LightGlue
-from rdstitch.features.match import Matcher, match, match_near, match_overlap
+from rdstitch.features.match import Matcher, match, match_near
+from rdstitch.features.overlap import match_overlap
 from rdstitch.features.prepared_image import View
 from rdstitch.options.feature_options import FeatureOptions
 

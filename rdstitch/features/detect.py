@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Features
 from rdstitch.features.learned import AlikedDetection
-from rdstitch.features.opencv import LARGE, OpenCVDetection, SiftTilesDetection
+from rdstitch.features.opencv import OpenCVDetection
 from rdstitch.features.prepared_image import CLIP_LIMIT, Mask, PixelArray, PreparedImage, View, prepare
+from rdstitch.features.sift_tiles import LARGE, SiftTilesDetection
 from rdstitch.features.surf.descriptor import SurfDetection
 from rdstitch.options.feature_options import CLOSER, FeatureOptions
 

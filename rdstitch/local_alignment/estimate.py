@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from rdstitch.arrays import FloatArray, evenly_spaced
+from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
@@ -94,7 +95,14 @@ def align_locally(
     edges : callable
         Gives the ends of straight edges in each of some images, (K, 2, 2) measured pixels. It is called once, where
         fields may be used.
+
+    Raises
+    ------
+    ArgumentError
+        When a number of cells is less than 1.
     """
+    if choice != "auto" and choice < 1:
+        raise ArgumentError(f"local alignment takes at least one cell, not {choice}")
     images = ImagesOnSurface.of(cameras, homographies, on_sphere=on_sphere)
     if pairs is None:
         matches = list(matches)

@@ -74,7 +74,7 @@ class DisplacementField:
         down, across = (_evaluation(n) for n in self.values.shape[:2])
         # Rows, then columns: (2, rows, columns).
         moved = down @ np.moveaxis(self.values, -1, 0) @ across.T
-        spacing = (np.array(self.image_size) - 1.0) / (moved.shape[2] - 1, moved.shape[1] - 1)
+        spacing = _extent(self.image_size) / (moved.shape[2] - 1, moved.shape[1] - 1)
         (a, c), (b, d) = np.diff(moved, axis=2)[:, :-1] / spacing[0], np.diff(moved, axis=1)[:, :, :-1] / spacing[1]
         # The larger singular value of each matrix of two rows and columns.
         return float((np.hypot(a + d, c - b) + np.hypot(a - d, c + b)).max()) / 2.0
@@ -97,8 +97,13 @@ class DisplacementField:
     def _grid_coordinates(self, points: FloatArray) -> FloatArray:
         """Column and row (..., 2) in units of the grid, within it or not far from it."""
         last = np.array([self.values.shape[1] - 1, self.values.shape[0] - 1])
-        place = np.asarray(points, dtype=np.float64) * (last / (np.array(self.image_size) - 1.0))
+        place = np.asarray(points, dtype=np.float64) * (last / _extent(self.image_size))
         return np.clip(np.nan_to_num(place), -_BEYOND, last + _BEYOND)
+
+
+def _extent(image_size: tuple[int, int]) -> FloatArray:
+    """From the first to the last pixel, (2,); of a single one, whose place is the first, the pixel itself."""
+    return np.maximum(np.array(image_size) - 1.0, 1.0)
 
 
 def _cubic_weights(share: FloatArray) -> FloatArray:
@@ -136,7 +141,7 @@ def bilinear(
 ) -> tuple[NDArray[np.intp], FloatArray]:
     """Nodes (N, 4) around measured pixels (N, 2), counted row by row, and their shares (N, 4)."""
     last = np.array([shape[1] - 1, shape[0] - 1])
-    return nodes_around(points * (last / (np.array(image_size) - 1.0)), shape)
+    return nodes_around(points * (last / _extent(image_size)), shape)
 
 
 def nodes_around(place: FloatArray, shape: Sequence[int]) -> tuple[NDArray[np.intp], FloatArray]:

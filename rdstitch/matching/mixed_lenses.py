@@ -6,120 +6,13 @@ the images into two lenses predicts what every pair sees.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Self
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.matching.links import spread_choice
+from rdstitch.matching.lens_votes import LensVotes
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.robust.measurements import Measurements
-from rdstitch.robust.own_lenses import OwnLenses, own_lenses
-from rdstitch.system.late_imports import sparse, sparse_linalg
-
-_MAX_DISTANCE = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two
-_MAX_MATCHES = 250  # matches of a pair that are used
-_MIN_STD = 2e-4  # λ; no pair knows it better than that the division model holds
-_MIN_INLIERS = 30  # of a pair that votes: three times the parameters of a homography and two λ
-_COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both images alike
-_MAX_COHERENCE = 0.5  # correlation of neighbours' errors: more is depth, for which λ of either image takes the blame
-_REWEIGHTINGS = 6
-_PAIRS_AT_ONCE = 64
-
-
-@dataclass(frozen=True, eq=False)
-class Votes:
-    """What pairs see of λ, each on its own."""
-
-    image1: IntArray  # image1, image2: (L,), intp: the images of each pair
-    image2: IntArray
-    distortion: FloatArray  # (L, 2): λ of its first and of its second image, half-diagonal frame
-    covariance: FloatArray  # (L, 2, 2)
-
-    @classmethod
-    def of(cls, pairs: Sequence[PairRegistration], threshold: float) -> Self:
-        """The votes of the pairs that see λ; ``threshold``, pixels, as they were estimated with."""
-        registered = [
-            pair
-            for pair in pairs
-            if pair.relation
-            and np.isfinite(pair.relation.distortion_std)
-            and int(pair.relation.inliers.sum()) >= _MIN_INLIERS
-        ]
-        seen = [
-            (pair, vote)
-            for pair, vote in zip(registered, _votes(registered, threshold), strict=True)
-            if np.isfinite(vote.covariance).all() and vote.coherence < _MAX_COHERENCE
-        ]
-        return cls(
-            np.array([pair.image1 for pair, _ in seen], dtype=np.intp),
-            np.array([pair.image2 for pair, _ in seen], dtype=np.intp),
-            np.array([vote.distortion for _, vote in seen]).reshape(-1, 2),
-            np.array([vote.covariance for _, vote in seen]).reshape(-1, 2, 2),
-        )
-
-    def __len__(self) -> int:
-        """Number of pairs."""
-        return len(self.image1)
-
-    def mahalanobis_residuals(self, expected: FloatArray | float) -> FloatArray:
-        """How far each vote is from what is expected, (L, 2), in its standard deviations."""
-        whitened = np.einsum("lij,lj->li", self._whitening, self.distortion - expected)
-        return np.asarray(np.linalg.norm(whitened, axis=1))
-
-    def which(self, second: BoolArray) -> IntArray:
-        """From which lens, 0 or 1, the two images of each pair come, shape (L, 2)."""
-        return np.stack([second[self.image1], second[self.image2]], axis=1).astype(np.intp)
-
-    def fitted(self, which: IntArray, lenses: FloatArray) -> FloatArray:
-        """λ of the lenses that the votes miss by the least, by reweighted least squares.
-
-        ``which`` (L, 2): the lens of each image of each pair; ``lenses`` (K,): λ to start from; that of a lens without
-        votes stays.
-        """
-        count, every = len(lenses), np.arange(len(lenses))
-        both = np.broadcast_arrays(which[:, :, None], which[:, None, :])
-        places = tuple(np.concatenate([lens.ravel(), every]) for lens in both)
-        information = np.swapaxes(self._whitening, 1, 2) @ self._whitening
-        votes = np.einsum("lij,lj->li", information, self.distortion)
-        unseen = np.bincount(which.ravel(), minlength=count) == 0
-        for _ in range(_REWEIGHTINGS):
-            weight = 1.0 / np.maximum(self.mahalanobis_residuals(lenses[which]), 0.1)
-            entries = np.concatenate([(information * weight[:, None, None]).ravel(), unseen])
-            normal = sparse.coo_array((entries, places), shape=(count, count)).tocsc()
-            right = np.bincount(which.ravel(), (votes * weight[:, None]).ravel(), count)
-            lenses = np.where(unseen, lenses, sparse_linalg.splu(normal).solve(right))
-        return lenses
-
-    @cached_property
-    def _whitening(self) -> FloatArray:
-        """W (L, 2, 2), with W'W the inverse of each covariance."""
-        covariance = self.covariance + _MIN_STD**2 * np.eye(2) + _COMMON_STD**2
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
-
-
-def _votes(pairs: Sequence[PairRegistration], threshold: float) -> list[OwnLenses]:
-    """λ of both images of each pair, from what lies not too far from where one λ puts it."""
-    lenses: list[OwnLenses] = []
-    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
-        block = pairs[start : start + _PAIRS_AT_ONCE]
-        points = [_near(pair, threshold) for pair in block]
-        cameras = [(pair.relation.camera, pair.relation.camera2) for pair in block]
-        relations = [pair.relation for pair in block]
-        lenses += own_lenses(relations, Measurements.of_pairs(points, cameras), threshold)
-    return lenses
-
-
-def _near(pair: PairRegistration, threshold: float) -> tuple[FloatArray, FloatArray]:
-    """Matches not too far from where one λ puts them, evenly spread, pixels."""
-    matched = pair.correspondences
-    apart = np.linalg.norm(pair.relation.transfer(matched.points1) - matched.points2, axis=1)
-    near = np.flatnonzero(apart < _MAX_DISTANCE * threshold)
-    near = near[spread_choice(matched.points1[near], _MAX_MATCHES)]
-    return matched.points1[near], matched.points2[near]
-
 
 _STARTS = 5  # divisions that are begun with
 _ROUNDS = 3
@@ -140,7 +33,7 @@ class TwoLenses:
     certain: bool  # whether it is clear which images belong together, and a pair of them can be stitched
 
 
-def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
+def two_lenses(cameras: Sequence[Camera], votes: LensVotes) -> TwoLenses | None:
     """The division of images into two lenses that the votes support; None where one lens will do.
 
     Relief and lenses that one λ does not describe scatter the votes by many times their standard deviations, and a few
@@ -187,7 +80,7 @@ def separate_lenses(
     ``cameras``: one an image; ``threshold``: largest transfer error of an inlier, pixels; ``known_distortion``: λ in
     the half-diagonal frame, where the user gave it.
     """
-    mixed = None if known_distortion is not None else two_lenses(cameras, Votes.of(pairs, threshold))
+    mixed = None if known_distortion is not None else two_lenses(cameras, LensVotes.of(pairs, threshold))
     return mixed, {} if mixed is None else _of_the_other_lens(mixed, pairs)
 
 
@@ -210,7 +103,7 @@ def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> d
     return {int(k): reason for k in np.flatnonzero(mixed.second != kept)}
 
 
-def _divisions(count: int, votes: Votes) -> Iterator[tuple[BoolArray, FloatArray]]:
+def _divisions(count: int, votes: LensVotes) -> Iterator[tuple[BoolArray, FloatArray]]:
     """Images of the second of two lenses, and λ of both, by the widest gaps between λ of each image on its own."""
     every = np.stack([votes.image1, votes.image2], axis=1)
     of_images = votes.fitted(every, np.full(count, np.median(votes.distortion)))
@@ -223,7 +116,7 @@ def _divisions(count: int, votes: Votes) -> Iterator[tuple[BoolArray, FloatArray
         yield second, lenses
 
 
-def _margins(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> FloatArray:
+def _margins(count: int, votes: LensVotes, second: BoolArray, lenses: FloatArray) -> FloatArray:
     """By how much more the votes were missed if an image came from the other lens, for each image (N,)."""
     which = votes.which(second)
     missed = votes.mahalanobis_residuals(lenses[which])

@@ -7,6 +7,7 @@ matrix of 3 x 3 times ``p p'``, and nothing of the size of a Jacobian is ever fo
 """
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -29,9 +30,19 @@ class PairLenses:
     """
 
     distortion: FloatArray
-    own_distortion: FloatArray | None = None  # λ of image 2, where it is another
+    second_distortion: FloatArray | None = None  # λ of image 2, where it is another
     distortion2: FloatArray | None = None  # μ
     center: FloatArray | None = None
+
+    @property
+    def distortion_of_image2(self) -> FloatArray:
+        """λ of image 2, (B,)."""
+        return self.distortion if self.second_distortion is None else self.second_distortion
+
+    def growing(self, distortion: FloatArray, radius2: FloatArray, times: tuple[float, float]) -> FloatArray:
+        """``times[0] λ + times[1] μ r²`` at squared radii (B, N), of λ (B,)."""
+        first = times[0] * distortion[:, None]
+        return first if self.distortion2 is None else first + times[1] * self.distortion2[:, None] * radius2
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +76,47 @@ class TransferDerivatives(Rows):
         return errors
 
 
+@dataclass(frozen=True, eq=False)
+class _Transfer:
+    """Matches of B pairs transferred from image 1 to image 2, see :func:`differentiate`; (B, N) and (B, 2, N)."""
+
+    x1: FloatArray  # x1, radius2: the points of image 1 from the distortion centre
+    radius2: FloatArray
+    x2: FloatArray
+    lifted: FloatArray  # (B, 3, N): ``p``
+    inverse_depth: FloatArray  # ``1 / z_w``
+    u: FloatArray  # undistorted
+    d: FloatArray  # distorted
+    rho2: FloatArray  # ``|d|²``
+    back: FloatArray  # ``1 / g``
+    bend: FloatArray  # ``s / g``
+    lost: BoolArray
+
+    @classmethod
+    def of(cls, homography: FloatArray, lens: PairLenses, data: Measurements) -> Self:
+        x1, x2, radius2 = data.x1, data.x2, data.radius2
+        if lens.center is not None:
+            x1, x2 = x1 - lens.center[:, :, None], x2 - lens.center[:, :, None]
+            radius2 = x1[:, 0] ** 2 + x1[:, 1] ** 2
+        lifted = np.empty((len(x1), 3, x1.shape[2]))
+        lifted[:, :2] = x1
+        lifted[:, 2] = 1.0 + lens.growing(lens.distortion, radius2, (1.0, 1.0)) * radius2
+        z = homography @ lifted
+        lost = ~(z[:, 2] > 0.0)
+        inverse_depth = 1.0 / np.where(lost, 1.0, z[:, 2])
+        u = z[:, :2] * inverse_depth[:, None]
+        second, mu = lens.distortion_of_image2, lens.distortion2
+        g = distorted_ratio(u[:, 0] ** 2 + u[:, 1] ** 2, second[:, None], None if mu is None else mu[:, None])
+        lost |= np.isnan(g)
+        g[lost] = 1.0
+        d = u * g[:, None]
+        rho2 = d[:, 0] ** 2 + d[:, 1] ** 2
+        back = 1.0 / g
+        bend = lens.growing(second, rho2, (2.0, 4.0)) * back
+        lost |= ~(bend * rho2 < 1.0)
+        return cls(x1, radius2, x2, lifted, inverse_depth, u, d, rho2, back, bend, lost)
+
+
 def differentiate(homography: FloatArray, lens: PairLenses, data: Measurements) -> TransferDerivatives:
     """Transfer the matches of each pair from image 1 to image 2, with all derivatives.
 
@@ -75,67 +127,55 @@ def differentiate(homography: FloatArray, lens: PairLenses, data: Measurements) 
 
     ``homography`` (B, 3, 3).
     """
-    first = lens.distortion[:, None]
-    second = first if lens.own_distortion is None else lens.own_distortion[:, None]
-    mu = None if lens.distortion2 is None else lens.distortion2[:, None]
-    x1, x2, r2 = data.x1, data.x2, data.radius2
-    if lens.center is not None:
-        x1, x2 = x1 - lens.center[:, :, None], x2 - lens.center[:, :, None]
-        r2 = x1[:, 0] ** 2 + x1[:, 1] ** 2
-    lifted = np.empty((len(x1), 3, x1.shape[2]))
-    lifted[:, :2] = x1
-    lifted[:, 2] = 1.0 + (first if mu is None else first + mu * r2) * r2
-    z = homography @ lifted
-    lost = ~(z[:, 2] > 0.0)
-    inverse_depth = 1.0 / np.where(lost, 1.0, z[:, 2])
-    u = z[:, :2] * inverse_depth[:, None]
-    g = distorted_ratio(u[:, 0] ** 2 + u[:, 1] ** 2, second, mu)
-    lost |= np.isnan(g)
-    g[lost] = 1.0
-    d = u * g[:, None]
-    rho2 = d[:, 0] ** 2 + d[:, 1] ** 2
-    slope = 2.0 * second if mu is None else 2.0 * second + 4.0 * mu * rho2
-    back = 1.0 / g
-    bend = slope * back
-    lost |= ~(bend * rho2 < 1.0)
-
+    at = _Transfer.of(homography, lens, data)
     # Derivatives of u by the lifted coordinate of image 1, and M.
-    third = (homography[:, :2, 2:] - u * homography[:, 2:, 2:]) * inverse_depth[:, None]
-    slope1 = 2.0 * first if mu is None else 2.0 * first + 4.0 * mu * r2
-    by_point = (homography[:, :2, :2, None] - u[:, :, None] * homography[:, 2:, :2, None]) * inverse_depth[
-        :, None, None
-    ]
-    by_point += third[:, :, None] * (x1 * slope1[:, None])[:, None]
-    in_image2 = u * (rho2 * back)[:, None]
-    columns = np.empty((len(d), 2 if lens.own_distortion is None else 6, 2, d.shape[2]))
-    if lens.own_distortion is None:
-        columns[:, 0] = third * r2[:, None] + in_image2
-    else:
-        columns[:, 0] = third * r2[:, None]
-        columns[:, 1] = in_image2
-        columns[:, 2] = third * (r2**2)[:, None] + in_image2 * rho2[:, None]
-        columns[:, 3:5] = -(d * (bend * back)[:, None])[:, None] * d[:, :, None] - by_point.swapaxes(1, 2)
-        columns[:, 3, 0] += back
-        columns[:, 4, 1] += back
-    difference = d - x2
-    along = (d[:, 0] * difference[:, 0] + d[:, 1] * difference[:, 1]) * bend
-    error = (difference - d * along[:, None]) * back[:, None]
+    u, depth = at.u, at.inverse_depth
+    by_lifted = (homography[:, :2, 2:] - u * homography[:, 2:, 2:]) * depth[:, None]
+    by_point = (homography[:, :2, :2, None] - u[:, :, None] * homography[:, 2:, :2, None]) * depth[:, None, None]
+    slope = lens.growing(lens.distortion, at.radius2, (2.0, 4.0))
+    by_point += by_lifted[:, :, None] * (at.x1 * slope[:, None])[:, None]
+    difference = at.d - at.x2
+    along = (at.d[:, 0] * difference[:, 0] + at.d[:, 1] * difference[:, 1]) * at.bend
+    error = (difference - at.d * along[:, None]) * at.back[:, None]
+    columns = _lens_columns(lens, at, by_lifted, by_point)
     columns[:, -1] = error
-
-    by_point *= data.px_ratio[:, None, None, None]
-    back2 = back * back
-    turned = back2 * bend * (bend * rho2 - 2.0)
-    spread = by_point[:, :, 0] ** 2 + by_point[:, :, 1] ** 2 + d * d * turned[:, None] + back2[:, None]
-    across = by_point[:, 0] * by_point[:, 1]
-    xy = across[:, 0] + across[:, 1] + d[:, 0] * d[:, 1] * turned
-    xx, yy = spread[:, 0], spread[:, 1]
-    scale = (2.0 * data.px**2)[:, None] / (xx * yy - xy * xy)
-    precision = np.empty((len(d), 3, d.shape[2]))
-    precision[:, 0], precision[:, 1], precision[:, 2] = yy * scale, xy * -scale, xx * scale
+    precision = _precision(at, by_point, data)
     left = precision[:, :2] * error[:, :1] + precision[:, 1:] * error[:, 1:]
     left *= error
     squared = left[:, 0] + left[:, 1]
-    return TransferDerivatives(u, inverse_depth, lifted, columns, precision, squared, lost)
+    return TransferDerivatives(u, depth, at.lifted, columns, precision, squared, at.lost)
+
+
+def _lens_columns(lens: PairLenses, at: _Transfer, by_lifted: FloatArray, by_point: FloatArray) -> FloatArray:
+    """Derivatives of the error by the lens, see :class:`TransferDerivatives`; the last column is left to be filled."""
+    by_lambda2 = at.u * (at.rho2 * at.back)[:, None]
+    per_image = lens.second_distortion is not None
+    columns = np.empty((len(at.d), 6 if per_image else 2, 2, at.d.shape[2]))
+    if not per_image:
+        columns[:, 0] = by_lifted * at.radius2[:, None] + by_lambda2
+        return columns
+    columns[:, 0] = by_lifted * at.radius2[:, None]
+    columns[:, 1] = by_lambda2
+    columns[:, 2] = by_lifted * (at.radius2**2)[:, None] + by_lambda2 * at.rho2[:, None]
+    columns[:, 3:5] = -(at.d * (at.bend * at.back)[:, None])[:, None] * at.d[:, :, None] - by_point.swapaxes(1, 2)
+    columns[:, 3, 0] += at.back
+    columns[:, 4, 1] += at.back
+    return columns
+
+
+def _precision(at: _Transfer, by_point: FloatArray, data: Measurements) -> FloatArray:
+    """Inverse covariances (B, 3, N) of the errors, see :class:`TransferDerivatives`; ``by_point`` is M."""
+    by_point = by_point * data.px_ratio[:, None, None, None]
+    back2 = at.back * at.back
+    turned = back2 * at.bend * (at.bend * at.rho2 - 2.0)
+    spread = by_point[:, :, 0] ** 2 + by_point[:, :, 1] ** 2 + at.d * at.d * turned[:, None] + back2[:, None]
+    across = by_point[:, 0] * by_point[:, 1]
+    xy = across[:, 0] + across[:, 1] + at.d[:, 0] * at.d[:, 1] * turned
+    xx, yy = spread[:, 0], spread[:, 1]
+    scale = (2.0 * data.px**2)[:, None] / (xx * yy - xy * xy)
+    precision = np.empty((len(at.d), 3, at.d.shape[2]))
+    precision[:, 0], precision[:, 1], precision[:, 2] = yy * scale, xy * -scale, xx * scale
+    return precision
 
 
 def entry_equations(

@@ -76,7 +76,7 @@ class MapRefinement:
         window, known, keeps_focal = list(frames.keyframes), frames.known, frames.keeps_focal
         executor = self._executor if frames.state.has_plane else self._first_executor
         came = [keyframe.frame for keyframe in window]
-        options = replace(known.options_for(came), most=_MATCHES, reference=None)
+        options = replace(known.options_for(came), max_matches_per_link=_MATCHES, reference=None)
         cameras = known.cameras_for(came, _EXACT if keeps_focal else None)
         place = {keyframe.number: index for index, keyframe in enumerate(window)}
         links = [replace(link, image1=place[link.image1], image2=place[link.image2]) for link in frames.links]

@@ -34,10 +34,10 @@ class Fronts:
     """B fronts of one shape: the images that are eliminated, and those that are linked to them and come later."""
 
     images: IntArray  # (B, I): in the order of elimination
-    own: int  # how many of these are eliminated
+    pivots: int  # how many of these are eliminated
     number: IntArray  # (B,): of each front among all
     parent: IntArray  # (B,): the front that the first of the others belongs to; -1 where there are none
-    places: IntArray  # (B, I - own): where among the images of that front the others are
+    places: IntArray  # (B, I - pivots): where among the images of that front the others are
     links: IntArray  # (K,): those of the blocks between images of which the earlier one is eliminated here
     where: tuple[IntArray, IntArray, IntArray]  # (K,) each: of these the front, row and column of images
 
@@ -71,11 +71,11 @@ class Elimination:
         within = np.empty(len(level), dtype=np.intp)
         result = []
         for k, links in enumerate(np.split(by_kind, np.searchsorted(kind[owner][by_kind], np.arange(1, len(shapes))))):
-            number, own = np.flatnonzero(kind == k), int(shapes[k, 1])
+            number, pivots = np.flatnonzero(kind == k), int(shapes[k, 1])
             within[number] = np.arange(len(number))
             rows = start[number][:, None] + np.arange(shapes[k, 2])
             where = within[owner[links]], row[links], column[links]
-            result.append(Fronts(image[rows], own, number, parent[number], place[rows[:, own:]], links, where))
+            result.append(Fronts(image[rows], pivots, number, parent[number], place[rows[:, pivots:]], links, where))
         return cls(tuple(result), turned)
 
     @classmethod
@@ -98,12 +98,12 @@ class Elimination:
         factors = []
         for fronts in self.fronts:
             count, images = fronts.images.shape
-            blocks, own = np.zeros((count, images, size, images, size)), np.arange(fronts.own)
-            blocks[:, own, :, own] = diagonal[fronts.images[:, : fronts.own]].swapaxes(0, 1)
+            blocks, pivots = np.zeros((count, images, size, images, size)), np.arange(fronts.pivots)
+            blocks[:, pivots, :, pivots] = diagonal[fronts.images[:, : fronts.pivots]].swapaxes(0, 1)
             front, row, column = fronts.where
             rows, columns = scale[fronts.images[front, row]], scale[fronts.images[front, column]]
             blocks[front, row, :, column] = turned[fronts.links] * rows[:, :, None] * columns[:, None, :]
-            matrix, edge = blocks.reshape(count, images * size, images * size), fronts.own * size
+            matrix, edge = blocks.reshape(count, images * size, images * size), fronts.pivots * size
             for one, number in zip(matrix, fronts.number.tolist(), strict=True):
                 for places, update in waiting.pop(number, ()):
                     one[np.ix_(places, places)] += update
@@ -111,7 +111,7 @@ class Elimination:
             inverse = _lower_inverse(lower)
             across = matrix[:, edge:, :edge] @ inverse.swapaxes(1, 2)
             factors.append((inverse, across))
-            if images > fronts.own:
+            if images > fronts.pivots:
                 updates = matrix[:, edge:, edge:] - across @ across.swapaxes(1, 2)
                 for parent, places, update in zip(fronts.parent.tolist(), fronts.places, updates, strict=True):
                     waiting.setdefault(parent, []).append((_expanded(places, size), update))
@@ -131,15 +131,15 @@ class BlockCholesky:
         """The solution (N, D, C) for right-hand sides (N, D, C)."""
         x, (size, columns) = right * self.scale[:, :, None], right.shape[1:]
         for fronts, (inverse, across) in zip(self.elimination.fronts, self.factors, strict=True):
-            own, others = np.split(fronts.images, [fronts.own], axis=1)
-            solved = inverse @ x[own].reshape(len(own), own.shape[1] * size, columns)
-            x[own] = solved.reshape(*own.shape, size, columns)
+            pivots, others = np.split(fronts.images, [fronts.pivots], axis=1)
+            solved = inverse @ x[pivots].reshape(len(pivots), pivots.shape[1] * size, columns)
+            x[pivots] = solved.reshape(*pivots.shape, size, columns)
             np.subtract.at(x, others, (across @ solved).reshape(*others.shape, size, columns))
         for fronts, (inverse, across) in zip(self.elimination.fronts[::-1], self.factors[::-1], strict=True):
-            own, others = np.split(fronts.images, [fronts.own], axis=1)
-            below = across.swapaxes(1, 2) @ x[others].reshape(len(own), others.shape[1] * size, columns)
-            solved = inverse.swapaxes(1, 2) @ (x[own].reshape(below.shape) - below)
-            x[own] = solved.reshape(*own.shape, size, columns)
+            pivots, others = np.split(fronts.images, [fronts.pivots], axis=1)
+            below = across.swapaxes(1, 2) @ x[others].reshape(len(pivots), others.shape[1] * size, columns)
+            solved = inverse.swapaxes(1, 2) @ (x[pivots].reshape(below.shape) - below)
+            x[pivots] = solved.reshape(*pivots.shape, size, columns)
         return x * self.scale[:, :, None]
 
     def inverse_diagonal(self) -> FloatArray:
@@ -149,17 +149,17 @@ class BlockCholesky:
         for fronts, (inverse, across) in zip(self.elimination.fronts[::-1], self.factors[::-1], strict=True):
             for k, (number, parent) in enumerate(zip(fronts.number.tolist(), fronts.parent.tolist(), strict=True)):
                 edge, places = inverse.shape[1], _expanded(fronts.places[k], size)
-                whole = np.empty((edge + len(places), edge + len(places)))
+                joint = np.empty((edge + len(places), edge + len(places)))
                 if len(places):
-                    whole[edge:, edge:] = known[parent][np.ix_(places, places)]
+                    joint[edge:, edge:] = known[parent][np.ix_(places, places)]
                 below = across[k] @ inverse[k]
-                whole[edge:, :edge] = -whole[edge:, edge:] @ below
-                whole[:edge, edge:] = whole[edge:, :edge].T
-                whole[:edge, :edge] = inverse[k].T @ inverse[k] - below.T @ whole[edge:, :edge]
-                known[number] = whole
-                blocks = whole[:edge, :edge].reshape(fronts.own, size, fronts.own, size)
-                own = np.arange(fronts.own)
-                result[fronts.images[k, : fronts.own]] = blocks[own, :, own]
+                joint[edge:, :edge] = -joint[edge:, edge:] @ below
+                joint[:edge, edge:] = joint[edge:, :edge].T
+                joint[:edge, :edge] = inverse[k].T @ inverse[k] - below.T @ joint[edge:, :edge]
+                known[number] = joint
+                blocks = joint[:edge, :edge].reshape(fronts.pivots, size, fronts.pivots, size)
+                pivots = np.arange(fronts.pivots)
+                result[fronts.images[k, : fronts.pivots]] = blocks[pivots, :, pivots]
         return result * self.scale[:, :, None] * self.scale[:, None, :]
 
 
@@ -211,8 +211,8 @@ def _members(
         parent[found] = front[order[ranks[at]]]
         inherited = front[order[ranks]] != parent[fronts]
         give(parent[fronts][inherited], ranks[inherited])
-    own = front[order] * count + np.arange(count)
-    return parent, np.sort(np.concatenate([own, *known]))
+    pivots = front[order] * count + np.arange(count)
+    return parent, np.sort(np.concatenate([pivots, *known]))
 
 
 def dissection(count: int, image1: IntArray, image2: IntArray) -> tuple[IntArray, IntArray]:
@@ -241,9 +241,9 @@ def dissection(count: int, image1: IntArray, image2: IntArray) -> tuple[IntArray
             eliminated[divide[(ends.min(axis=0) < fewest)[part[divide]]]] = True
             fewest = np.minimum(fewest, ends.min(axis=0))
         eliminated[images[((size <= _UNDIVIDED) | (size < _WORTHWHILE * fewest))[of]]] = True
-        own = images[eliminated[images]]
-        parts, number = np.unique(part[own], return_inverse=True)
-        front[own] = fronts + number.reshape(-1)
+        pivots = images[eliminated[images]]
+        parts, number = np.unique(part[pivots], return_inverse=True)
+        front[pivots] = fronts + number.reshape(-1)
         fronts += len(parts)
         levels.append(np.full(len(parts), len(levels) - 1))
         images = images[~eliminated[images]]

@@ -143,6 +143,15 @@ class _Descent:
     converged: bool
 
 
+_STEPS, _LAST_STEPS = 4, 12
+"""Linearizations at one width of the loss, and at the last one."""
+
+_NARROWING, _NARROW = 3.0, 1.05
+"""By how much the loss narrows from one width to the next; widths of the last one up to which it is that."""
+
+_SETTLED = 0.02
+"""Relative change of the errors' standard deviation that is none."""
+
 _FIRST_DAMPING = 1e-6
 """Of the diagonal of the normal matrix. Focal length and tilts of many images are so weak together that a hundred times
 as much held them: of 300 frames the focal length stayed 13 % off, with a standard deviation of 2 %."""
@@ -170,20 +179,21 @@ class BundleAdjuster:
         squared = self.squared(start)
         half_diagonal = float(np.median(self.observations.scale2))  # of errors from which a descent may find back
         sigma = min(self.observations.sigma(squared), half_diagonal)
-        damping, parameters, used = _FIRST_DAMPING, start, 0
-        wide = max(self._rough_width(squared) if rough else 0.0, ALIGNMENT_WIDTH * sigma)
+        damping, parameters, iterations = _FIRST_DAMPING, start, 0
+        width = max(self._rough_width(squared) if rough else 0.0, ALIGNMENT_WIDTH * sigma)
         while True:
-            last = wide <= ALIGNMENT_WIDTH * sigma * 1.05
-            descent = self._descend(parameters, sigma, wide, damping, 12 if last else 4)
-            parameters, damping, used = descent.parameters, descent.damping, used + descent.iterations
+            last = width <= ALIGNMENT_WIDTH * sigma * _NARROW
+            descent = self._descend(parameters, sigma, width, damping, _LAST_STEPS if last else _STEPS)
+            parameters, damping = descent.parameters, descent.damping
+            iterations += descent.iterations
             squared, previous = squared_lengths(descent.errors), sigma
             scatter = self.observations.sigma(squared)
             sigma = min(scatter, half_diagonal)
-            wide = max(wide / 3.0, ALIGNMENT_WIDTH * sigma)
-            settled = abs(sigma - previous) <= 0.02 * previous and np.isfinite(scatter)
+            width = max(width / _NARROWING, ALIGNMENT_WIDTH * sigma)
+            settled = abs(sigma - previous) <= _SETTLED * previous and np.isfinite(scatter)
             converged = bool(last and descent.converged and settled)
-            if converged or used >= self.max_iterations:
-                return BundleAdjustmentResult(self, parameters, sigma, converged, used)
+            if converged or iterations >= self.max_iterations:
+                return BundleAdjustmentResult(self, parameters, sigma, converged, iterations)
 
     def squared(self, parameters: Parameters) -> FloatArray:
         """``|r|²`` of each correspondence (M,), px², whitened; inf where it cannot be transferred."""
@@ -201,10 +211,10 @@ class BundleAdjuster:
         named: FloatArray = derivative @ covariance @ derivative.T
         return named
 
-    def _descend(self, parameters: Parameters, sigma: float, width: float, damping: float, most: int) -> _Descent:
+    def _descend(self, parameters: Parameters, sigma: float, width: float, damping: float, max_steps: int) -> _Descent:
         """Levenberg-Marquardt at one width of the loss, in at most so many linearizations and steps that fail."""
-        used, failures, moved = 1, 0, True
-        while used < most:
+        steps, failures, moved = 1, 0, True
+        while steps < max_steps:
             if moved:
                 state, moved = self.linearized(parameters, width), False
                 normal, errors = self._normal_equations(state, sigma), state.equations.errors
@@ -212,14 +222,14 @@ class BundleAdjuster:
             try:
                 step_poses, step_shared = normal.solve(damping)
             except np.linalg.LinAlgError:  # no correspondence of some images can be transferred
-                return _Descent(parameters, errors, damping, used, False)
+                return _Descent(parameters, errors, damping, steps, False)
             # The decrease of the quadratic model, less what the damping adds to it.
             predicted = -(np.vdot(normal.gradient_poses, step_poses) + normal.gradient_shared @ step_shared)
             if not np.isfinite(predicted):
-                return _Descent(parameters, errors, damping, used, False)
+                return _Descent(parameters, errors, damping, steps, False)
             if predicted <= self.min_gain * max(cost, 1e-12):
                 if failures or damping <= _FIRST_DAMPING:
-                    return _Descent(parameters, errors, damping, used, True)
+                    return _Descent(parameters, errors, damping, steps, True)
                 damping = _FIRST_DAMPING  # steps that an earlier damping makes short show no minimum
                 continue
             trial, after = parameters.retract(self.model, step_poses, step_shared, self.free.lens), np.inf
@@ -227,13 +237,13 @@ class BundleAdjuster:
                 homographies = self._homographies(trial)
                 trial_error = trial_errors(self.observations, homographies, trial.lens, state.equations.whitening)
                 after = self._cost(trial, trial_error, sigma, width)
-            used += 1
+            steps += 1
             damping, failures = damping_by_gain(damping, failures, float((cost - after) / predicted))
             if after < cost:
                 parameters, errors, moved = trial, trial_error, True
             elif damping > MAX_DAMPING:
-                return _Descent(parameters, errors, damping, used, False)
-        return _Descent(parameters, errors, damping, used, False)
+                return _Descent(parameters, errors, damping, steps, False)
+        return _Descent(parameters, errors, damping, steps, False)
 
     def linearized(self, parameters: Parameters, width: float) -> _State:
         """The errors at some parameters, linearized and weighted by a loss of this width, pixels."""
@@ -260,8 +270,8 @@ class BundleAdjuster:
     def _rough_width(self, squared: FloatArray) -> float:
         """Width of the loss, pixels, at which most links still count, as far off as a chain may have put them."""
         medians = self.observations.medians(np.sqrt(squared))
-        most = 1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95))
-        return min(most, WIDEST_START * float(np.median(self.observations.scale2)))
+        of_most_links = 1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95))
+        return min(of_most_links, WIDEST_START * float(np.median(self.observations.scale2)))
 
     def weight(self, sigma: float) -> float:
         """Of squared errors of this scatter: one over their variance, as far as they are independent."""
@@ -319,9 +329,9 @@ class BundleAdjuster:
         """The named parameters (S,), and their derivatives by the shared ones and by the lens (S', S')."""
         physical, derivative = self.model.physical_parameters(shared)
         size, lens = len(physical), int(self.free.lens.sum())
-        whole = np.eye(size + lens)
-        whole[:size, :size] = derivative
-        return physical, whole
+        with_lens = np.eye(size + lens)
+        with_lens[:size, :size] = derivative
+        return physical, with_lens
 
 
 def inverse_information(information: FloatArray) -> FloatArray:

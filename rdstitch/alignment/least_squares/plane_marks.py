@@ -57,16 +57,16 @@ class ControlPoints:
 
     def within(self, images: IntArray) -> Self:
         """In some of the images (N,), ascending, which get the numbers 0 to N - 1."""
-        seen = np.isin(self.image, images)
-        known, point = np.unique(self.point[seen], return_inverse=True)
+        shown = np.isin(self.image, images)
+        known, point = np.unique(self.point[shown], return_inverse=True)
         return type(self)(
             tuple(self.names[k] for k in known.tolist()),
             self.places[known],
             self.std[known],
             point.astype(np.intp),
-            np.searchsorted(images, self.image[seen]).astype(np.intp),
-            self.points[seen],
-            self.pixel[seen],
+            np.searchsorted(images, self.image[shown]).astype(np.intp),
+            self.points[shown],
+            self.pixel[shown],
         )
 
 
@@ -81,8 +81,8 @@ class PlaneMarks:
 
     def places(self, matrices: FloatArray, lens: FloatArray, focal: float) -> FloatArray:
         """Where images with plane-to-image matrices (N, 3, 3) put the marks, (M, 2)."""
-        seen = self._lifted(matrices, lens)[0]
-        places: FloatArray = focal * seen[:, :2] / seen[:, 2:]
+        lifted = self._lifted(matrices, lens)[0]
+        places: FloatArray = focal * lifted[:, :2] / lifted[:, 2:]
         return places
 
     def cost(self, matrices: FloatArray, lens: FloatArray, focal: float) -> float:
@@ -94,16 +94,16 @@ class PlaneMarks:
         self, matrices: ModelMatrices, lens: FloatArray, free_lens: BoolArray, focal: float
     ) -> tuple[FloatArray, FloatArray]:
         """Errors (M, 2); derivatives (M, 2, D + S + K) by pose, shared parameters, of which log f is last, and lens."""
-        seen, inverse = self._lifted(matrices.matrices, lens)
+        lifted, inverse = self._lifted(matrices.matrices, lens)
         by_matrix = np.concatenate([matrices.by_pose, matrices.by_shared], axis=1)[self.image]
-        moved = -np.einsum("mij,mpjk,mk->mpi", inverse, by_matrix, seen)
+        moved = -np.einsum("mij,mpjk,mk->mpi", inverse, by_matrix, lifted)
         steps = [_STEP * unit for unit in np.eye(len(lens))[free_lens]]
         ends = [[self._lifted(matrices.matrices, lens + sign * step)[0] for sign in (1.0, -1.0)] for step in steps]
         by_lens = [(after - before)[:, None] / (2.0 * _STEP) for after, before in ends]
         moved = np.concatenate([moved, *by_lens], axis=1)
-        place = seen[:, :2] / seen[:, 2:]
-        by_seen = (moved[..., :2] - place[:, None] * moved[..., 2:]) / seen[:, None, 2:]
-        derivative = focal * by_seen.transpose(0, 2, 1)
+        place = lifted[:, :2] / lifted[:, 2:]
+        by_lifted = (moved[..., :2] - place[:, None] * moved[..., 2:]) / lifted[:, None, 2:]
+        derivative = focal * by_lifted.transpose(0, 2, 1)
         derivative[:, :, by_matrix.shape[1] - 1] += focal * place
         return focal * place - self.target, derivative
 

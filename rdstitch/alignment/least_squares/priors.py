@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment.least_squares.plane_marks import ControlPoints, PlaneMarks
-from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, PlanarModel, X, Y
+from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.robust.posterior import LENS, TILT, Prior, exact, focal_prior
@@ -62,7 +62,7 @@ class CameraPriors:
         Tilts are turned into what they do in the images with ``log_focal``, the prior one if not given.
         """
         known = self.of_camera(model, count)
-        if not isinstance(model, PlanarModel):
+        if not model.has_metric_poses:
             return known
         poses, precision = np.zeros_like(known.poses), np.zeros_like(known.poses)
         free = model.free

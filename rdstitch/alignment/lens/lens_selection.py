@@ -11,11 +11,12 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import Fit, Problem, pairwise_homographies
+from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of
+from rdstitch.alignment.pairwise import pairwise_homographies
 from rdstitch.arrays import BoolArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD
 from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, costs
@@ -127,7 +128,7 @@ def _choose_by_some(
     return replace(choice, pairwise=pairwise)
 
 
-def left_coherence(adjusted: BundleAdjustmentResult) -> Coherence:
+def residual_coherence(adjusted: BundleAdjustmentResult) -> Coherence:
     """How much the errors of neighbours agree that an adjustment leaves."""
     return coherence(adjusted.adjuster.observations, adjusted.errors, adjusted.inliers)
 
@@ -142,7 +143,7 @@ def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     finer = free_parameters("division3")
     if problem.count < ENOUGH_IMAGES or (fit.free_lens != free_parameters("division2")).any():
         return problem, fit
-    if left_coherence(fit.adjusted).correlation >= NO_COHERENCE:
+    if residual_coherence(fit.adjusted).correlation >= NO_COHERENCE:
         return problem, fit
     return replace(problem, free_lens=finer), problem.extend(fit, finer)
 

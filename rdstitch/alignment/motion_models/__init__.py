@@ -17,10 +17,9 @@ homography 8                                               any motion, any camer
 rotation   R                                               a turn about the centre: directions instead of a plane
 ========== =============================================== ===================================================
 
-A model is one class, with what it is capable of (:class:`MotionModel`); others ask only whether it has metric poses (a
-:class:`PlanarModel`) or leads to directions. A new one is one more of
-:data:`PLANAR_MODELS`, or a class in a file of its own with its entry in :data:`MODELS`; its name is a word of
-:mod:`rdstitch.choices`.
+A model is one class, with what it is capable of (:class:`MotionModel`): others ask whether it has metric poses, or
+leads to directions, never which one it is. A new one is one more of :data:`PLANAR_MODELS`, or a class in a file of its
+own with its entry in :data:`MODELS`; its name is a word of :mod:`rdstitch.choices`.
 """
 
 from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel

@@ -30,6 +30,18 @@ class MotionModel(ABC):
     # Whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one
     free_tilts: bool = False
     any_tilt: bool = False
+    # Which columns of poses in a metric plane move, see :mod:`rdstitch.alignment.motion_models.planar`; none where
+    # poses are of another kind
+    free: tuple[int, ...] = ()
+
+    @property
+    def has_metric_poses(self) -> bool:
+        """Whether all images are of one camera over a metric plane, with a position, a height and a tilt."""
+        return bool(self.free)
+
+    def metric_poses(self, poses: FloatArray, shared: FloatArray) -> FloatArray:
+        """Poses (N, 6) in the metric plane; only of models that have them."""
+        raise NotImplementedError(f"a model {self.name} has no metric poses")
 
     @property
     def gauge(self) -> BoolArray:
@@ -71,6 +83,13 @@ class MotionModel(ABC):
     @abstractmethod
     def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The poses with these tilts (N, 2) that come nearest to plane-to-image homographies (N, 3, 3)."""
+
+    def poses_from(
+        self, other: "MotionModel", poses: FloatArray, shared: FloatArray, attitudes: FloatArray
+    ) -> FloatArray:
+        """Poses of another model as those of this one that come nearest to them, with its shared parameters."""
+        own = shared if self.one_camera else np.empty(0)
+        return self.nearest_poses(other.matrices(poses, shared).matrices, own, attitudes)
 
     @abstractmethod
     def description(self, poses: FloatArray, shared: FloatArray) -> str:

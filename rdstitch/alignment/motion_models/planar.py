@@ -110,8 +110,12 @@ class PlanarModel(MotionModel):
         result[:, [PSI, THETA]] = self._tilts(poses, shared) + shared[:2] * focal
         return result
 
-    def start_from(self, other: "PlanarModel", poses: FloatArray, shared: FloatArray) -> FloatArray:
-        """Poses (N, 6) of another planar model in the units of this one."""
+    def poses_from(
+        self, other: MotionModel, poses: FloatArray, shared: FloatArray, attitudes: FloatArray
+    ) -> FloatArray:
+        """Those of another planar model only change their units."""
+        if not isinstance(other, PlanarModel):
+            return super().poses_from(other, poses, shared, attitudes)
         result = poses.copy()
         result[:, [PSI, THETA]] = self._tilted(other._tilts(poses, shared), shared)[:, [PSI, THETA]]
         return result

@@ -14,16 +14,9 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Features
-from rdstitch.features.surf.hessian import (
-    Blobs,
-    Grey,
-    apply_kernels,
-    find_blobs,
-    integer_kernels,
-    pyramid,
-    refine,
-    sample_patches,
-)
+from rdstitch.features.surf.hessian import Blobs, find_blobs
+from rdstitch.features.surf.patches import Grey, apply_kernels, integer_kernels, pyramid, sample_patches
+from rdstitch.features.surf.refinement import refine
 
 _THRESHOLD = 100.0  # determinant of the Hessian from which on a blob counts, grey levels²
 _OCTAVES, _LAYERS = 4, 3  # of scale, and scales per octave

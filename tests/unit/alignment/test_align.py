@@ -10,7 +10,8 @@ import pytest
 from examples.judging.trajectories import compare_trajectories
 from examples.worlds.alignment_scenes import Scene, aligned, grid, jittered, robot_path, scene
 from rdstitch.alignment import AlignmentOptions, align, most_matches_read
-from rdstitch.alignment.build_result import AdjustedImages, build_alignment
+from rdstitch.alignment.adjusted_images import AdjustedImages
+from rdstitch.alignment.build_result import build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import Alignment, PlanarPoses, Unused
 from rdstitch.alignment.trajectory import Trajectory
@@ -289,14 +290,14 @@ def test_the_order_of_links_does_not_matter() -> None:
 def test_links_need_no_more_matches_than_are_read(most: int, read: int | None) -> None:
     rng = np.random.default_rng(5)
     given = scene(grid(5, 4, (0.4, 0.3), 0.1, rng), per_link=220, rng=rng)
-    options = AlignmentOptions(most=most, lens="division")
+    options = AlignmentOptions(max_matches_per_link=most, lens="division")
     assert most_matches_read(len(given.links), options) == read
     few = align(given.cameras, [link.thinned(read) for link in given.links], options)
     every = align(given.cameras, given.links, options)
     assert np.array_equal(few.homographies, every.homographies)
     assert few.links == every.links
     # Many links are read in part, and those of a short turn whole.
-    options = AlignmentOptions(most=100)
+    options = AlignmentOptions(max_matches_per_link=100)
     assert [most_matches_read(links, options) for links in (10, 100, 6000, 50_000)] == [None, 100, 83, 40]
 
 

@@ -7,12 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from examples.worlds.alignment_scenes import Scene, grid, scene
-from rdstitch.alignment.adjustment_problem import pairwise_homographies, relations_at
 from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links, triangles
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.motion_models import Y
+from rdstitch.alignment.pairwise import pairwise_homographies, relations_at
 from rdstitch.arrays import BoolArray
 from rdstitch.geometry.camera import LENS_PARAMETERS
 from rdstitch.matching.links import Link

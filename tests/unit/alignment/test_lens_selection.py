@@ -12,11 +12,11 @@ import pytest
 from examples.worlds.alignment_scenes import Scene, aligned, grid, scene
 from examples.worlds.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
 from rdstitch.alignment import LENSES, Alignment, AlignmentOptions
-from rdstitch.alignment.adjustment_problem import pairwise_homographies
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.lens import lens_selection
 from rdstitch.alignment.lens.lens_description import describe_lens, radius_std
 from rdstitch.alignment.lens.lens_selection import LensChoice, free_parameters
+from rdstitch.alignment.pairwise import pairwise_homographies
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from tests.alignment_stubs import adjusted, independent_errors, observations

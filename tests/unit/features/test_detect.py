@@ -17,8 +17,9 @@ from rdstitch.errors import ArgumentError
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, View, detect, detect_view, match
 from rdstitch.features.crossings import find_crossings
 from rdstitch.features.detect import spread, strongest
-from rdstitch.features.opencv import OpenCVDetection, SiftTilesDetection
+from rdstitch.features.opencv import OpenCVDetection
 from rdstitch.features.prepared_image import common_stretch, halving, prepare, usual_stretch
+from rdstitch.features.sift_tiles import SiftTilesDetection
 from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import ImageTexture, Photometry, grid_poses, ground, sequence_over
 from tests.cli.running import flight

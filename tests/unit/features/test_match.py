@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features import Correspondences, Features, match, match_near, match_overlap
-from rdstitch.features.match import overlapping
+from rdstitch.features.overlap import overlapping
 
 SIZE = (800, 600)
 

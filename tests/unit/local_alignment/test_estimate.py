@@ -73,6 +73,14 @@ def test_what_is_no_field_is_refused() -> None:
         DisplacementField(SIZE, np.zeros((3, 3)))
     with pytest.raises(ArgumentError, match="finite"):
         DisplacementField(SIZE, np.full((3, 3, 2), np.nan))
+    with pytest.raises(ArgumentError, match="at least one cell"):
+        align_locally([], CAMERAS, np.zeros((6, 3, 3)), choice=0)
+
+
+def test_of_an_image_one_pixel_wide_there_is_a_field() -> None:
+    field = DisplacementField((1, 9), np.ones((2, 2, 2)))
+    np.testing.assert_allclose(field(np.array([[0.0, 4.0]])), 1.0)
+    assert field.steepest == pytest.approx(0.0, abs=1e-9)
 
 
 LENS = Camera((640, 480), -0.2, focal=520.0)

@@ -10,7 +10,8 @@ from examples.worlds.correspondences import stored
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.distortion_consensus import vote
-from rdstitch.matching.mixed_lenses import TwoLenses, Votes, two_lenses
+from rdstitch.matching.lens_votes import LensVotes
+from rdstitch.matching.mixed_lenses import TwoLenses, two_lenses
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust import estimate_radial_homography
 
@@ -27,13 +28,13 @@ def test_few_inliers_have_no_vote(count: int, votes: int) -> None:
     relation = estimate_radial_homography(points1, points2, LENS.image_size, focal=520.0)
     assert relation.inliers.all()
     pair = PairRegistration(0, 1, stored(points1, points2), relation)
-    assert len(Votes.of([pair], 3.0)) == votes
+    assert len(LensVotes.of([pair], 3.0)) == votes
 
 
-def _votes(distortion: list[list[float]], covariance: FloatArray) -> Votes:
+def _votes(distortion: list[list[float]], covariance: FloatArray) -> LensVotes:
     count = len(distortion)
     chain = np.arange(count)
-    return Votes(chain, chain + 1, np.array(distortion), np.tile(covariance, (count, 1, 1)))
+    return LensVotes(chain, chain + 1, np.array(distortion), np.tile(covariance, (count, 1, 1)))
 
 
 OWN = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
@@ -79,7 +80,7 @@ def _divided(
     votes += common * rng.standard_normal((len(pairs), 1)) + std * rng.standard_normal((len(pairs), 2))
     covariance = common**2 + std**2 * np.eye(2)
     cameras = [Camera(size)] * len(lenses)
-    return two_lenses(cameras, Votes(i, j, votes, np.tile(covariance, (len(pairs), 1, 1))))
+    return two_lenses(cameras, LensVotes(i, j, votes, np.tile(covariance, (len(pairs), 1, 1))))
 
 
 @pytest.mark.parametrize(
@@ -117,7 +118,7 @@ def test_an_image_that_may_belong_to_either_makes_the_division_uncertain() -> No
     votes = np.array([(-0.2, -0.2), (-0.2, -0.05), (-0.05, -0.05), (-0.05, -0.13)])
     std = np.array([0.001, 0.001, 0.001, 0.05])
     covariance = std[:, None, None] ** 2 * np.eye(2)
-    found = two_lenses([Camera((640, 480))] * 5, Votes(i, j, votes, covariance))
+    found = two_lenses([Camera((640, 480))] * 5, LensVotes(i, j, votes, covariance))
     assert not found.certain
 
 
@@ -133,11 +134,13 @@ def test_a_few_wrong_votes_are_no_lens() -> None:
     i, j = np.array(_ALL).T
     votes = np.full((len(_ALL), 2), -0.2)
     votes[2], votes[7] = (0.05, 0.04), (-0.4, -0.2)
-    assert two_lenses([Camera((640, 480))] * 6, Votes(i, j, votes, np.tile(0.002**2 * np.eye(2), (15, 1, 1)))) is None
+    assert (
+        two_lenses([Camera((640, 480))] * 6, LensVotes(i, j, votes, np.tile(0.002**2 * np.eye(2), (15, 1, 1)))) is None
+    )
 
 
 def test_lenses_that_differ_by_less_than_a_result_shows_are_one_and_pairs_that_see_nothing_say_nothing() -> None:
-    assert two_lenses([Camera((640, 480))] * 3, Votes.of([], 3.0)) is None
+    assert two_lenses([Camera((640, 480))] * 3, LensVotes.of([], 3.0)) is None
     assert _divided(_CHAIN[:1], [-0.2, -0.1], std=0.05) is None
     assert _divided(_CHAIN, [-0.2] * 4 + [-0.185], 1e-4, size=(320, 240)) is None
     assert _divided(_CHAIN, [-0.2] * 4 + [-0.185], 1e-4, size=(640, 480)) is not None

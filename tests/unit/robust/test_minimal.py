@@ -14,7 +14,7 @@ from rdstitch.geometry.radial_homography import transfer
 from rdstitch.robust import SolverName, estimate_radial_homography
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import minimal_solvers
-from rdstitch.robust.own_lenses import OwnLenses, own_lenses
+from rdstitch.robust.per_image_distortion import PerImageDistortion, estimate_per_image_distortion
 from rdstitch.robust.sampling import Sampler
 
 FOCAL = 1.4
@@ -168,7 +168,7 @@ def test_the_least_free_model_is_chosen() -> None:
 _THRESHOLD = 3.0
 
 
-def _seen(first: Camera | None, second: Camera | None, seed: int, motion: str = "similarity") -> OwnLenses:
+def _seen(first: Camera | None, second: Camera | None, seed: int, motion: str = "similarity") -> PerImageDistortion:
     """What own lenses come to where images of one lens were taken with others instead."""
     matches = correspondences(400, seed=seed, motion=motion, noise=0.3)
     lens = matches.truth.camera
@@ -181,10 +181,10 @@ def _seen(first: Camera | None, second: Camera | None, seed: int, motion: str = 
     points1, points2 = points1[kept], points2[kept]
     relation = estimate_radial_homography(points1, points2, lens.image_size)
     data = Measurements.from_pixels(points1, points2, relation.camera, relation.camera2)
-    return own_lenses([relation], data, _THRESHOLD)[0]
+    return estimate_per_image_distortion([relation], data, _THRESHOLD)[0]
 
 
-def _difference(found: OwnLenses) -> tuple[float, float]:
+def _difference(found: PerImageDistortion) -> tuple[float, float]:
     """λ of the second image less that of the first, and its standard deviation."""
     sign = np.array([-1.0, 1.0])
     return float(sign @ found.distortion), float(np.sqrt(sign @ found.covariance @ sign))
@@ -219,5 +219,5 @@ def test_rotation_about_the_axis_does_not_show_the_lens() -> None:
     points2 = (points1 - lens.center) @ np.array([[c, s], [-s, c]]) + lens.center + 0.3 * rng.standard_normal((300, 2))
     relation = estimate_radial_homography(points1, points2, lens.image_size)
     data = Measurements.from_pixels(points1, points2, lens, lens)
-    found = own_lenses([replace(relation, camera=lens, camera2=lens)], data, _THRESHOLD)[0]
+    found = estimate_per_image_distortion([replace(relation, camera=lens, camera2=lens)], data, _THRESHOLD)[0]
     assert np.sqrt(np.diag(found.covariance)).min() > 0.1

@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from rdstitch.features import FeatureOptions, detect, match
 from rdstitch.features.surf.descriptor import describe_patches, orientations
-from rdstitch.features.surf.hessian import find_blobs, pyramid, refine, to_level
+from rdstitch.features.surf.hessian import find_blobs
+from rdstitch.features.surf.patches import pyramid, to_level
+from rdstitch.features.surf.refinement import refine
 from rdstitch.synthetic import ground
 
 Grey = NDArray[np.uint8]

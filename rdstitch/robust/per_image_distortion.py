@@ -20,12 +20,12 @@ from rdstitch.robust.pair_models import HomographyPairModel
 from rdstitch.robust.refinement import PairProblems
 
 _HOMOGRAPHY = HomographyPairModel()
-_OWN_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of image 1, λ of image 2, μ, and the distortion centre
+_LENS_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of image 1, λ of image 2, μ, and the distortion centre
 _ITERATIONS = 20
 
 
 @dataclass(frozen=True, eq=False)
-class OwnLenses:
+class PerImageDistortion:
     """λ of both images of a pair, half-diagonal frame."""
 
     distortion: FloatArray  # (2,)
@@ -34,18 +34,20 @@ class OwnLenses:
     coherence: float
 
 
-def own_lenses(relations: Sequence[RadialHomography], data: Measurements, threshold: float) -> list[OwnLenses]:
+def estimate_per_image_distortion(
+    relations: Sequence[RadialHomography], data: Measurements, threshold: float
+) -> list[PerImageDistortion]:
     """Free λ of each image of pairs, from the relations that one λ gave.
 
     ``relations``: one a pair; ``data``: also of what one λ could not explain; ``threshold``: largest transfer error of
     an inlier, pixels.
     """
-    count, lens = len(data), len(_OWN_STD)
+    count, lens = len(data), len(_LENS_STD)
     parameters = np.zeros((count, lens + 9))
     parameters[:, :2] = [[relation.distortion] * 2 for relation in relations]
     parameters[:, lens:] = _HOMOGRAPHY.initialize(np.stack([relation.homography for relation in relations]))
     with np.errstate(all="ignore"):  # a step may leave the domain of the lens model
-        problems = PairProblems(_HOMOGRAPHY, data, np.full(count, threshold), lens_std=_OWN_STD)
+        problems = PairProblems(_HOMOGRAPHY, data, np.full(count, threshold), lens_std=_LENS_STD)
         parameters, equations = descend(problems, parameters, _ITERATIONS)
         covariance = problems.covariances(parameters, equations)
         inliers = equations.squared < equations.scale[:, None] ** 2
@@ -54,7 +56,7 @@ def own_lenses(relations: Sequence[RadialHomography], data: Measurements, thresh
         for points, errors, row in zip(data.x1, equations.transferred.columns[:, -1], inliers, strict=True)
     ]
     return [
-        OwnLenses(row[:2], known[:2, :2], shared)
+        PerImageDistortion(row[:2], known[:2, :2], shared)
         for row, known, shared in zip(parameters, covariance, coherence, strict=True)
     ]
 

@@ -1,0 +1,70 @@
+"""Whether the images show λ at all, or depth that looks like it; and then, which lens it is."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rdstitch.alignment.adjusted_images import GivenImages
+from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.priors import CameraPriors
+from rdstitch.alignment.lens.lens_selection import LensChoice, choose_lens, residual_coherence
+from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF
+from rdstitch.alignment.pairwise import pairwise_homographies, relations_at
+from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.geometry.camera import LENS_STD
+from rdstitch.geometry.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
+from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.matching.distortion_consensus import vote
+from rdstitch.robust.posterior import LENS
+
+_FEW_VIEWS, _LENS_OVER_DEPTH = 3, 6.0
+"""Images from more than which depth does not look like a lens; times by which a lens must make what neighbours share
+smaller to be no depth itself: in published pairs λ takes the blame for up to 3 times what is left of depth, and for 14
+times of what a fisheye leaves beside λ."""
+
+
+def choose_observable_lens(
+    task: GivenImages, sample: Observations, relations: Sequence[RadialHomography], known: CameraPriors
+) -> LensChoice:
+    """Of every link with a homography of its own: whether λ is seen, or could be depth, and which lens it is."""
+
+    def fit(lens: FloatArray, free: BoolArray) -> BundleAdjustmentResult:
+        return pairwise_homographies(sample, relations_at(sample, relations, lens), lens, free, known)
+
+    options, first, none = task.options, np.arange(len(LENS_STD)) == 0, np.zeros(len(LENS_STD), dtype=np.bool_)
+    # The images' points are already relative to the centre of the camera.
+    given = np.array([*task.cameras[0].coefficients, 0.0, 0.0])
+    if options.lens_known:
+        return choose_lens(sample, fit(given, none), (), known)
+    votes = vote([k.relation.distortion for k in task.links], [k.relation.distortion_std for k in task.links])
+    pairwise = fit(np.where(first, np.nan_to_num(votes.distortion), 0.0), first)
+    observable, depth = _observable(pairwise), False
+    if sample.image_count <= _FEW_VIEWS or not observable:
+        with_given_lens = fit(given, none)
+        depth = observable and _is_depth(pairwise, with_given_lens)
+        if depth or not observable:
+            pairwise, observable = with_given_lens, False
+    choice = choose_lens(sample, pairwise, options.lenses if observable else (), known)
+    return replace(choice, observable=observable, depth=depth)
+
+
+def _is_depth(free_lens: BundleAdjustmentResult, given_lens: BundleAdjustmentResult) -> bool:
+    """Whether the depth of what a few images show may look like their lens: with λ free, and held.
+
+    Depth changes most from one end of a view to the other, as the effect of a lens does: where it shows in the errors
+    that are left, λ takes the blame for more of it than that.
+    """
+    without, with_lens = residual_coherence(given_lens), residual_coherence(free_lens)
+    if without.correlation <= COHERENT_CORRELATION or without.relative_size <= LARGE_RELIEF:
+        return False
+    return with_lens.correlation > COHERENT_CORRELATION and without.size < _LENS_OVER_DEPTH * with_lens.size
+
+
+def _observable(pairwise: BundleAdjustmentResult) -> bool:
+    """Whether one homography a pair leaves λ well determined, at a value that a lens can have."""
+    distortion = float(pairwise.parameters.lens[0])
+    # Without what the prior says.
+    information = 1.0 / float(pairwise.covariance[0, 0]) - LENS[0].curvature(distortion)
+    return information > OBSERVABLE_STD**-2.0 and PLAUSIBLE_DISTORTION[0] < distortion < PLAUSIBLE_DISTORTION[1]

@@ -1,0 +1,120 @@
+"""Every link on its own: what is wrong with a link, and which lens all have in common, shows nowhere else."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rdstitch.alignment.adjustment_problem import Problem
+from rdstitch.alignment.least_squares.bundle_adjustment import (
+    ROUGH_GAIN,
+    BundleAdjuster,
+    BundleAdjustmentResult,
+    FreeParameters,
+    Parameters,
+)
+from rdstitch.alignment.least_squares.link_equations import split_lens
+from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.least_squares.priors import CameraPriors
+from rdstitch.alignment.motion_models import HOMOGRAPHY, MotionModel
+from rdstitch.arrays import BoolArray, FloatArray, evenly_spaced
+from rdstitch.geometry.division_model import undistort
+from rdstitch.geometry.radial_homography import RadialHomography, transfer
+from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost, sigma_of
+from rdstitch.solvers.homography import direct_linear
+
+_MAX_ITERATIONS = 24  # a start need not be the minimum
+
+_TRIAL_LINKS, _TRIAL_MATCHES = 30, 40
+"""What the shared parameters to start from are tried on."""
+
+
+def relations_at(observations: Observations, relations: Sequence[RadialHomography], lens: FloatArray) -> FloatArray:
+    """Each link's homography (L, 3, 3) expressed with one common lens.
+
+    A pair's homography belongs to the pair's own λ. Where that differs from the common one, the homography is fitted
+    anew (DLT) to the pair's own, outlier-free transfer of its points.
+    """
+    distortion, higher, center = split_lens(lens)
+    result = np.empty((len(relations), 3, 3))
+    for link, relation in enumerate(relations):
+        result[link] = relation.homography
+        if abs(relation.distortion - distortion) < 1e-9 and not center.any() and relation.camera.higher == higher:
+            continue
+        points1 = observations.points1[observations.start[link] : observations.start[link + 1]]
+        transferred = transfer(relation.homography, relation.distortion, points1, relation.camera.higher)
+        x1, x2 = (undistort(points - center, distortion, higher) for points in (points1, transferred))
+        valid = np.isfinite(x1).all(axis=1) & np.isfinite(x2).all(axis=1)
+        if valid.sum() >= 4:
+            result[link] = direct_linear(x1[valid], x2[valid])
+    return result
+
+
+def independent_pairs(
+    model: MotionModel,
+    observations: Observations,
+    homographies: FloatArray,
+    shared: FloatArray,
+    lens: FloatArray,
+    free_lens: BoolArray,
+    known: CameraPriors,
+) -> tuple[BundleAdjuster, Parameters]:
+    """Return the adjustment of every link on its own, with the shared parameters in common, and where it starts.
+
+    Of the links' homographies (L, 3, 3) at this lens. Of what is known of the camera, attitudes are taken as exact, and
+    nothing of the poses besides.
+    """
+    count = 2 * len(observations)
+    start = Parameters(nearest_pairs(model, observations, homographies, shared, known.attitudes), shared, lens)
+    freedom = FreeParameters.fixing(model, count, list(range(0, count, 2)), free_lens)
+    first = 2 * np.arange(len(observations))
+    apart = replace(observations, image1=first, image2=first + 1)
+    return BundleAdjuster(model, apart, freedom, known.of_camera(model, count), max_iterations=_MAX_ITERATIONS), start
+
+
+def nearest_pairs(
+    model: MotionModel, observations: Observations, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray
+) -> FloatArray:
+    """Poses of both images of every link, (2 L, ...), nearest to its homography (L, 3, 3); the first at the origin."""
+    tilts = attitudes[np.stack([observations.image1, observations.image2], axis=1)].reshape(-1, 2)
+    matrices = model.nominal_homographies(shared, tilts)
+    matrices[1::2] = homographies @ matrices[0::2]
+    return model.nearest_poses(matrices, shared, tilts)
+
+
+def pairwise_homographies(
+    observations: Observations, homographies: FloatArray, lens: FloatArray, free_lens: BoolArray, known: CameraPriors
+) -> BundleAdjustmentResult:
+    """Every link on its own with a homography."""
+    adjuster, at = independent_pairs(HOMOGRAPHY, observations, homographies, np.empty(0), lens, free_lens, known)
+    return adjuster.run(at)
+
+
+def best_trial(problem: Problem, model: MotionModel) -> tuple[BundleAdjuster, Parameters]:
+    """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
+    known, links = problem.camera_priors, len(problem.observations)
+    few = evenly_spaced(links, _TRIAL_LINKS)
+    sample, homographies = problem.observations.subset(few).thinned(_TRIAL_MATCHES), problem.homographies[few]
+    trials = [
+        independent_pairs(model, sample, homographies, shared, problem.lens, problem.free_lens, known)
+        for shared in model.shared_starts(known.log_focal, known.tilt, tilt_known=known.tilt_known)
+    ]
+    squared = [adjuster.squared(start) for adjuster, start in trials]
+    width = ALIGNMENT_WIDTH * min(float(np.median(sample.scale2)), *map(sigma_of, squared))
+    adjuster, start = trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
+    return replace(adjuster, min_gain=ROUGH_GAIN), start
+
+
+def fit_trial(problem: Problem, model: MotionModel) -> BundleAdjustmentResult:
+    """A few links on their own under one camera."""
+    adjuster, start = best_trial(problem, model)
+    return adjuster.run(start)
+
+
+def fit_pairwise(problem: Problem, model: MotionModel, trial: BundleAdjustmentResult) -> BundleAdjustmentResult:
+    """All links on their own under one camera, which starts as a trial has it."""
+    shared, known = trial.parameters.shared, problem.camera_priors
+    adjuster, start = independent_pairs(
+        model, problem.observations, problem.homographies, shared, problem.lens, problem.free_lens, known
+    )
+    return replace(adjuster, min_gain=problem.min_gain).run(start)
