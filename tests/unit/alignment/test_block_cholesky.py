@@ -57,7 +57,7 @@ def test_solution_and_diagonal_of_the_inverse_are_those_of_the_dense_matrix(
     np.testing.assert_allclose(found.solve(right) * units[..., None], expected * units[..., None], rtol=1e-6, atol=1e-8)
     blocks = inverse.reshape(count, _SIZE, count, _SIZE)[np.arange(count), :, np.arange(count)]
     np.testing.assert_allclose(found.inverse_diagonal(), blocks, rtol=1e-6, atol=1e-9 * np.abs(blocks).max())
-    assert max(fronts.own for fronts in elimination.fronts) <= 40  # the strip is divided, the whole group is not
+    assert max(fronts.pivots for fronts in elimination.fronts) <= 40  # the strip is divided, the whole group is not
     for broken in ((diagonal, 3.0 * links), (-diagonal, links)):
         with pytest.raises(np.linalg.LinAlgError):
             elimination.factorized(*broken)
@@ -76,6 +76,6 @@ def test_factors_grow_little_faster_than_the_images() -> None:
         far = np.sort(rng.choice(side * side, (2, wrong), replace=False), axis=0)
         image1, image2 = (np.concatenate([*(step[k].ravel() for step in steps), far[k]]) for k in (0, 1))
         fronts = Elimination.of(side * side, image1, image2).fronts
-        entries.append(sum(len(each.images) * each.own * each.images.shape[1] for each in fronts) / side**2)
+        entries.append(sum(len(each.images) * each.pivots * each.images.shape[1] for each in fronts) / side**2)
     assert entries[1] < 1.5 * entries[0]
     assert entries[2] < 1.5 * entries[1]
