@@ -250,12 +250,11 @@ def _spectrum(left: FloatArray, agreement: FloatArray, std: FloatArray) -> Float
 
     By the agreement at each distance that each band leaves (D, B), what was found (D,), and its standard deviation.
     """
-    # Less what chance makes of it: the positive part of James and Stein's estimate.
-    certain = agreement[0] - std[0] ** 2 / agreement[0]
-    steep = certain / float(left[0].mean()) if left[0].mean() > 0.0 else 0.0
-    if steep <= 0.0:
-        return np.zeros(left.shape[1])
     bands = left.shape[1]
+    if agreement[0] <= std[0] or left[0].mean() <= 0.0:
+        return np.zeros(bands)
+    # Less what chance makes of it: the positive part of James and Stein's estimate.
+    steep = float((agreement[0] - std[0] ** 2 / agreement[0]) / left[0].mean())
     weight = 1.0 / np.maximum(std, 1e-12)
     # What the errors do not show is as of equally steep waves: an octave may have next to nothing or twice as much.
     equations = np.concatenate([left * (steep / bands) * weight[:, None], np.eye(bands)])

@@ -211,7 +211,7 @@ def test_a_lens_with_more_freed_is_the_next_that_has_it_all(freed: list[int], na
     assert ("series" in found.reason) is (name == "division3")
 
 
-align_module = importlib.import_module("rdstitch.alignment.align")
+observability = importlib.import_module("rdstitch.alignment.lens.observability")
 
 
 def test_all_images_together_show_a_third_coefficient_that_pairs_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,7 +222,7 @@ def test_all_images_together_show_a_third_coefficient_that_pairs_do_not(monkeypa
         chosen.append(lens_selection.choose_lens(seen, apart, ["division", "division2"], known))
         return chosen[-1]
 
-    monkeypatch.setattr(align_module, "choose_lens", choose)
+    monkeypatch.setattr(observability, "choose_lens", choose)
     found, simpler = aligned(given), aligned(given, lens="division2")
     assert chosen[0].name == "division2"
     assert found.lens == "division3"
