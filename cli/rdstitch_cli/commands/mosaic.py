@@ -74,7 +74,6 @@ def mosaic(
     list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
-    from rdstitch.pipeline.bands import mosaic_bands, parse_bands
     from rdstitch.pipeline.blocks import mosaic_blocks
     from rdstitch.pipeline.recipes import mosaic as recipe
 
@@ -94,6 +93,8 @@ def mosaic(
         else:
             paths = resolve(inputs)
         if bands is not None:
+            from rdstitch.pipeline.bands import mosaic_bands, parse_bands  # with all that reads an earlier result
+
             patterns = parse_bands(bands)
             first, others = mosaic_bands(
                 paths, output, patterns, options, every=every, progress=reporter, beside=beside

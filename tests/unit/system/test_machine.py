@@ -146,7 +146,8 @@ def test_the_c_library_of_a_host_keeps_its_own_choices(monkeypatch: pytest.Monke
         def __getattr__(self, name: str) -> Callable[..., None]:
             return lambda *_: called.append(name)
 
-    monkeypatch.setattr(ctypes, "CDLL", lambda _: Library())
+    loaded = ctypes.CDLL
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: Library() if name is None else loaded(name))
     scene = np.random.default_rng(0).integers(0, 255, (60, 200), dtype=np.uint8).repeat(4, 0).repeat(2, 1)
     rdstitch.pano([scene[:, :280], scene[:, 100:]], options=rdstitch.StitchOptions(distortion=0.0, force=True))
     assert set(called) == {"malloc_trim"}
