@@ -1,13 +1,12 @@
-"""Images warped by the package ``stitching``: ``PEER_PYTHON examples/benchmarks/peer_layers.py OUTPUT.npz FILE…``.
+"""Images warped by the package ``stitching``.
 
-Stitches with its defaults, but does not crop, and writes every warped image as it is blended, its mask, what its seams
-leave of it, and its place, and the stitched image. Runs by itself in a Python that has the package;
-:func:`layers_of_peer` runs it there.
+It stitches with its defaults, but does not crop; every warped image is kept as it is blended, with its mask, what its
+seams leave of it, and its place. The package runs in a Python of its own, which imports this file.
 """
 
 import math
+import os
 import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -35,7 +34,11 @@ def layers_of_peer(python: str, files: list[str], output: Path | None = None) ->
     """
     with tempfile.TemporaryDirectory() as folder:
         saved = Path(folder, "layers.npz")
-        done = subprocess.run([python, __file__, str(saved), *files], capture_output=True, check=False)
+        code = "import sys, peer_layers; peer_layers.save_layers(sys.argv[1], sys.argv[2:])"
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+        done = subprocess.run(
+            [python, "-c", code, str(saved), *files], env=environment, capture_output=True, check=False
+        )
         if done.returncode:
             return [], math.nan
         with np.load(saved) as arrays:
@@ -47,8 +50,8 @@ def layers_of_peer(python: str, files: list[str], output: Path | None = None) ->
         return [PeerLayer(*layer) for layer in zip(*columns, corners, strict=True)], seconds
 
 
-def _record(saved: str, files: list[str]) -> None:
-    """Stitch, and save everything."""
+def save_layers(saved: str, files: list[str]) -> None:
+    """Stitch, and save everything as arrays of NumPy; in a Python that has the package."""
     import cv2
     from stitching import Stitcher  # type: ignore[import-not-found, unused-ignore]
 
@@ -72,7 +75,3 @@ def _record(saved: str, files: list[str]) -> None:
     seconds = time.process_time()
     jpeg = cv2.imencode(".jpg", stitched)[1]
     np.savez(saved, count=len(places), seconds=seconds, corners=places, stitched=jpeg, **arrays)
-
-
-if __name__ == "__main__":
-    _record(sys.argv[1], sys.argv[2:])
