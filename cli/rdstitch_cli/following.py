@@ -131,13 +131,18 @@ def _print_poses(
     """One line for each frame that arrives, until no more come."""
     from rdstitch.pipeline.follow import follow
 
-    again = arrivals.comes_again
+    again, read = arrivals.comes_again, True
     frames = follow(arrivals, stitch, poses, comes_again=again, preview=preview, refresh=refresh)
     with closing(frames):
         for frame in frames:
-            print_line(frame.as_dict())
+            if read:
+                try:
+                    print_line(frame.as_dict())
+                except BrokenPipeError:
+                    read = False
+                    reporter.warn("nobody reads the poses any more; what arrives is registered all the same")
             for message in frame.messages:
-                reporter.warn(str(message))
+                reporter.tell(message)
 
 
 def print_line(record: dict[str, object]) -> None:

@@ -123,7 +123,8 @@ def main() -> None:
         warnings.filterwarnings("ignore", module=rf"{name}\b")
         logging.getLogger(name).addHandler(logging.NullHandler())
     for number in _TERMINATION_SIGNALS:
-        signal.signal(number, _end)
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup starts programs
+            signal.signal(number, _end)
     status = run(sys.argv[1:])
     # The interpreter would look three times for cycles among all that lives, before it is gone anyway.
     gc.freeze()

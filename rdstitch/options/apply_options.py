@@ -1,6 +1,7 @@
 """Options of composing again by a saved registration."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from rdstitch.choices import MatchBy
 from rdstitch.options.option import check_options, documented, option
@@ -14,6 +15,7 @@ from rdstitch.options.shared_options import (
     Strict,
     Topic,
     Workers,
+    files_in,
 )
 
 
@@ -39,6 +41,11 @@ class ApplyOptions:
     strict: Strict = False
     dry_run: DryRun = False
     channel_order: ArrayChannels = "bgr"
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that are read besides the images, none of which may be written over."""
+        return files_in(self.mask, self.flat_field if self.flat_field not in ("off", "auto") else None)
 
     def __post_init__(self) -> None:
         check_options(self)

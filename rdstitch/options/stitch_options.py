@@ -11,7 +11,17 @@ from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.estimation_options import EstimationOptions, RansacOptions
 from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.options.option import documented, option
-from rdstitch.options.shared_options import ArrayChannels, Distortion, DryRun, Mask, Overwrite, Strict, Topic, Workers
+from rdstitch.options.shared_options import (
+    ArrayChannels,
+    Distortion,
+    DryRun,
+    Mask,
+    Overwrite,
+    Strict,
+    Topic,
+    Workers,
+    files_in,
+)
 from rdstitch.system.machine import processor_count
 
 if TYPE_CHECKING:
@@ -173,7 +183,7 @@ class StitchOptions(RansacOptions):
     @property
     def files(self) -> list[Path]:
         """The files that are read besides the images, none of which may be written over."""
-        named = (
+        return files_in(
             self.mask,
             self.attitude,
             self.timestamps,
@@ -185,8 +195,6 @@ class StitchOptions(RansacOptions):
             self.features.aliked_model,
             self.composite.like,
         )
-        given = [Path(file) for file in named if file is not None]
-        return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
 
     @property
     def estimation(self) -> EstimationOptions:

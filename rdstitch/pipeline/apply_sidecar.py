@@ -104,7 +104,9 @@ def apply(
         Outputs(options.overwrite) as outputs,
     ):
         if output is not None:
-            check_outputs(image_files(check_suffix(output)), options.overwrite, [*listed.files, saved.path])
+            like = (composite or saved.composite).like
+            read = [*listed.files, saved.path, *options.files, *([] if like is None else [Path(like)])]
+            check_outputs(image_files(check_suffix(output)), options.overwrite, read)
         run = apply_run(saved, output, composite or saved.composite, options, progress)
         result = apply_found(saved, listed, run, options, outputs)
     return replace(result, messages=(*([Message(mismatch)] if mismatch else []), *result.messages))

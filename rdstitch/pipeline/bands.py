@@ -70,7 +70,7 @@ def mosaic_bands(
         Outputs(options.overwrite) as outputs,  # all are published together
     ):
         stack = [file] if file.suffix.lower() in (".tif", ".tiff") else []
-        check_outputs([*files, *stack], options.overwrite, listed.files)
+        check_outputs([*files, *stack], options.overwrite, [*listed.files, *options.files])
         frames = selected(listed.frames, options.exclude, options.include_only)
         chosen = [_of_band(frames, pattern) for pattern in bands.values()]
         options = replace(options, exclude=(), include_only=())

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from rdstitch.errors import OutputError, RdstitchError
+from rdstitch.errors import InputError, OutputError, RdstitchError, RegistrationError
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.selection import selected
@@ -84,7 +84,9 @@ def mosaic_blocks(
                 if not results or isinstance(error, OutputError):
                     raise
                 if not isinstance(error, RefusedError):
-                    # What is left does not overlap, or cannot be read, which the first block has said.
+                    # That the rest does not overlap, or cannot be read, the first block has said.
+                    if not isinstance(error, RegistrationError | InputError):
+                        refused.append(Message(f"there are no blocks after the {len(results)} first: {error}"))
                     break
                 registration = error.registration
                 refused.append(Message(f"a further block of {registration.alignment.used.sum()} images: {error}"))

@@ -138,10 +138,14 @@ def _by_measurement(
     """By what is nearer than half the way to the next registered image; None where most have no such counterpart."""
     if any(frame.image is not None or frame.number is not None for frame in frames):
         return None
-    theirs = []
+    theirs: list[_Known] = []
     for frame in frames:
-        metadata = read_metadata(frame.path)
-        theirs.append((metadata.timestamp, metadata.gps))
+        try:
+            metadata = read_metadata(frame.path)
+        except InputError:
+            theirs.append((None, None))  # it is left out by name, when it is read
+        else:
+            theirs.append((metadata.timestamp, metadata.gps))
     here, there = measure([_known_of(image) for image in saved.images], theirs)
     used = np.array([image.to_plane is not None for image in saved.images])
     here = np.where(used[:, None], here, np.nan)

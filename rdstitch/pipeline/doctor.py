@@ -30,6 +30,7 @@ _BLURRED = 0.6  # of the median sharpness
 _DARK, _BURNT = 0.06, 0.05  # mean brightness; share of burnt-out pixels
 _MIN_OVERLAP = 0.3
 _ZOOMED = 1.03  # ratio of focal lengths by EXIF
+_UNKNOWN_CAMERA = "unknown"
 _GRID = 24  # points a side by which an overlap is measured
 
 
@@ -161,11 +162,12 @@ def examine(
         alone, overlap = tuple(source.name for source, is_used in placed if not is_used), _overlap(registration)
     focal, zoomed = _focal(chosen)
     cameras = Counter(map(_camera, chosen)).most_common()
+    known = [camera for camera, _ in cameras if camera != _UNKNOWN_CAMERA]
     blurred = named(sharpness < _BLURRED * np.median(sharpness))
     dark, burnt = named(brightness < _DARK), named(burnt_out > _BURNT)
     advice = (
         (len(chosen) < 2, "stitching needs two images or more; name another one"),
-        (len(cameras) > 1, f"the images come from {len(cameras)} cameras: stitch those of each on their own"),
+        (len(known) > 1, f"the images come from {len(known)} cameras: stitch those of each on their own"),
         (zoomed, "the lens was zoomed between the images: stitch those of one zoom on their own"),
         (unreadable, f"{len(unreadable)} file{'s' * (len(unreadable) != 1)} cannot be read: {''.join(unreadable[:1])}"),
         *((True, str(problem)) for problem in problems),
@@ -245,7 +247,7 @@ def _camera(source: Source) -> str:
     m = source.metadata
     # Many makers begin the model with their name.
     make = "" if m.make and m.model and m.model.lower().startswith(m.make.lower().split()[0]) else m.make
-    return " ".join(filter(None, (make, m.model, m.serial))) or "unknown"
+    return " ".join(filter(None, (make, m.model, m.serial))) or _UNKNOWN_CAMERA
 
 
 def _focal(sources: Sequence[Source]) -> tuple[str, bool]:

@@ -166,7 +166,11 @@ def stitch_found(listed: FoundImages, run: Run, outputs: Outputs, further: Seque
     with run.executor(len(sources)) as executor:
         accepted, run = _accepted(sources, [*unread, *listed.messages], run, executor)
         run.progress("laying out", 0, 1)
-        chosen = choose_layout(accepted, run.options, aligner_of(accepted, run.options, run.purpose))
+        try:
+            chosen = choose_layout(accepted, run.options, aligner_of(accepted, run.options, run.purpose))
+        except RefusedError as error:
+            report_refused(run, error.registration)
+            raise
         return compose_registration(chosen, run, outputs, executor)
 
 

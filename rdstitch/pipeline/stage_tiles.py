@@ -240,6 +240,8 @@ def _write_beside(
     outputs: Outputs, file: str | Path | None, options: TileOptions, registration: Registration, tiled: TileRegistration
 ) -> None:
     """The table of places, and the flat field, where they are wanted."""
+    if options.dry_run:
+        return
     if file is not None:
         names = [source.name for source in registration.sources]
         places = tiled.adjustment.places - tiled.adjustment.places.min(axis=0)

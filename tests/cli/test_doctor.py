@@ -63,6 +63,9 @@ def test_zooms_and_cameras_are_told_apart(frames: list[Path], tmp_path: Path) ->
     assert "by EXIF in 3 of 3" in found.focal
     assert any("2 cameras" in item for item in found.advice)
     assert any("zoomed" in item for item in found.advice)
+    with Image.open(frames[2]) as image:
+        image.save(tmp_path / "2.jpg", quality=95)
+    assert not any("cameras" in item for item in examine(tmp_path).advice)  # one says nothing of its camera
 
 
 def test_images_that_have_nothing_in_common(frames: list[Path], stranger: Path, rdstitch: Run) -> None:

@@ -95,6 +95,22 @@ def test_an_interrupt_ends_with_what_has_arrived(drive: list[Path], folder: Path
     assert len(output.read_text(encoding="utf-8").splitlines()) == 6
 
 
+def test_a_reader_of_poses_that_ends_costs_no_frame(drive: list[Path], folder: Path, tmp_path: Path) -> None:
+    output = tmp_path / "path.csv"
+    process = start("trajectory", folder, "-o", output, "--follow", "--idle", "4", *FAST)
+    for image in drive[:3]:
+        shutil.copy(image, folder)
+    _line(process)
+    process.stdout.close()
+    for image in drive[3:6]:
+        shutil.copy(image, folder)
+    said = process.stderr.read().decode()
+    process.stderr.close()
+    assert process.wait() == 141
+    assert said.count("nobody reads the poses any more") == 1
+    assert len(output.read_text(encoding="utf-8").splitlines()) == 7
+
+
 def test_names_on_standard_input_are_taken_as_they_come(drive: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "path.csv"
     process = start("trajectory", "-", "-o", output, "--follow", *FAST, stdin=subprocess.PIPE)

@@ -5,17 +5,22 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from examples.judging import alignment_error
+from rdstitch.errors import LimitError
 from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.find import FoundImages
 from rdstitch.io import read_image, write_image
 from rdstitch.matching import prescreen
 from rdstitch.matching.pair_estimator import PairEstimator
-from rdstitch.pipeline import accept
+from rdstitch.pipeline import accept, blocks
+from rdstitch.pipeline.recipes import stitch_found
 from rdstitch.results.messages import Message
+from rdstitch.results.stitch_result import StitchResult
 from rdstitch.synthetic import Sequence
 from rdstitch.verification.findings import Finding, Kind
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, flight, sidecar_of, start, transfers
@@ -112,6 +117,19 @@ def test_all_blocks_are_planned_first_and_published_together(rdstitch: Run, fold
     rdstitch(*how, told="z_broken.png")
     names = {"floor.png", "floor.png.json", "floor-2.png", "floor-2.png.json"}
     assert {file.name for file in tmp_path.iterdir()} == {"flight", *names}
+
+
+def test_a_block_that_cannot_be_laid_out_is_told_of(
+    rdstitch: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stitched(found: FoundImages, *arguments: Any) -> StitchResult:
+        if len(found.frames) < 4:
+            raise LimitError("the canvas is too large")
+        return stitch_found(found, *arguments)
+
+    monkeypatch.setattr(blocks, "stitch_found", stitched)
+    how = ("mosaic", folder, "-o", tmp_path / "floor.png", "--all-blocks", "--lambda", DISTORTION)
+    rdstitch(*how, *CACHED, told="no blocks after the 1 first: the canvas is too large")
 
 
 @pytest.fixture

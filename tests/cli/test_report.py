@@ -20,15 +20,17 @@ from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.io import Metadata, preview, write_image
 from rdstitch.io.opening import MAX_IMAGE_GB
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline import accept
+from rdstitch.pipeline import accept, recipes
 from rdstitch.pipeline.recipes import calibrate, pano
 from rdstitch.report import mosaic as report
 from rdstitch.report import report_page, write_report
 from rdstitch.report.mosaic import seam_dots
 from rdstitch.report.pairs import matched
 from rdstitch.results.messages import Message
+from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.verification.findings import Finding, Kind
+from rdstitch.verification.verdict import RefusedError
 from tests.cli.running import CACHED, OPTIONS, Run
 
 _VOID = {"meta", "img"}
@@ -137,6 +139,18 @@ def test_the_numbers_are_those_of_the_result(pair: StitchResult) -> None:
     # Outlines and the pair over them; nothing is drawn twice.
     graph = report_page(pair).split("<h2>Match graph</h2>")[1].split("</section>")[0]
     assert (graph.count("<path"), graph.count("<line"), graph.count("<circle")) == (2, 1, 2)
+
+
+def test_what_its_seams_refuse_is_shown(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(registration: Registration, *_: object) -> None:
+        raise RefusedError(registration.with_messages([Message("no more alike than anywhere", severity="failure")]))
+
+    monkeypatch.setattr(recipes, "choose_layout", refuse)
+    report = tmp_path / "report.html"
+    rdstitch("mosaic", *frames[:2], "-o", tmp_path / "out.png", "--report", report, *CACHED, status=4)
+    assert "no more alike than anywhere" in _checked(report.read_text(encoding="utf-8")).text
 
 
 @pytest.mark.parametrize(("command", "output"), [("mosaic", "out.png"), ("calibrate", "lens.json")])

@@ -228,6 +228,12 @@ def test_nobody_reads_the_output(place: Path) -> None:
     assert (place / "out.png").exists()
 
 
+def test_what_nohup_ignores_stays_ignored() -> None:
+    code = "import signal, sys; from rdstitch_cli import main; signal.signal(signal.SIGHUP, signal.SIG_IGN); "
+    code += "main.run = lambda _: print(signal.getsignal(signal.SIGHUP) is signal.SIG_IGN) or 0; main.main()"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout == b"True\n"
+
+
 @pytest.mark.parametrize("signal_number", sampled([signal.SIGTERM, signal.SIGINT]))
 def test_termination_leaves_nothing_behind(place: Path, signal_number: int) -> None:
     before = state_of(place)

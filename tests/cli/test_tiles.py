@@ -64,6 +64,10 @@ def test_places_from_a_mirrored_stage_are_found_too(rdstitch: Run, slide: Path, 
     rows = rows_of(table)
     assert float(rows[0]["x"]) < float(rows[2]["x"])
     assert not list(tmp_path.glob("*.json"))
+    rdstitch("tiles", slide, "--positions", stage, "--positions-only", table, "--dry-run", status=2, told="--output")
+    table.unlink()
+    rdstitch("tiles", slide, "--positions", stage, "--positions-only", table, "--dry-run", "-o", tmp_path / "o.tif")
+    assert {file.name for file in tmp_path.iterdir()} == {stage.name}
 
 
 def test_a_wrong_overlap_is_found_and_named(rdstitch: Run, slide: Path, tmp_path: Path) -> None:

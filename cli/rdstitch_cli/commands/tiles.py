@@ -67,8 +67,10 @@ def tiles(
 
     if output is None and positions_only is None:
         raise click.UsageError("nothing to write: give --output or --positions-only")
-    paths = resolve(inputs)
     beside = files_beside(given)
+    if output is None and (as_json or given["dry_run"] or beside.report is not None):
+        raise click.UsageError("--positions-only has neither --report, --json nor --dry-run without --output")
+    paths = resolve(inputs)
     composite = replace(measured_samples(), **values_of(CompositeOptions, given))
     chosen = TileOptions(**values_of(TileOptions, given), composite=composite)
     if output is None:

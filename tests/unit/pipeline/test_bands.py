@@ -132,6 +132,10 @@ def test_a_lost_image_and_one_from_elsewhere_move_no_other(rig: Path, tmp_path: 
     assert list(result.left_out) == [2]
     assert [Path(m.images[0]).name for m in result.messages if "no counterpart" in m.text] == [stranger.name]
     assert _shift_between(rig / "red.tif", tmp_path / "nir.tif") < 0.3
+    for file in files:
+        (tmp_path / file.name).write_bytes(file.read_bytes() if file is not files[3] else b"damaged")
+    result = apply(rig / "red.tif.json", [tmp_path / file.name for file in files], tmp_path / "rest.tif", workers=1)
+    assert list(result.left_out) == [3]
 
 
 def test_images_of_other_places_are_refused(rig: Path, tmp_path: Path) -> None:
