@@ -193,7 +193,8 @@ def test_never_writes_over_its_sidecar(rdstitch: Run, frames: list[Path], stitch
     _apply(rdstitch, _sidecar(stitched), frames[0].parent, own, status=6)
     mask = tmp_path / "mask.png"
     mask.write_bytes(frames[0].read_bytes())
-    _apply(rdstitch, _sidecar(stitched), frames[0].parent, mask, "--mask", str(mask), "--overwrite", status=6, told="read")
+    with_mask = ("--mask", str(mask), "--overwrite")
+    _apply(rdstitch, _sidecar(stitched), frames[0].parent, mask, *with_mask, status=6, told="read")
     _apply(rdstitch, _sidecar(stitched), frames[0].parent, own, "--overwrite")
 
 
