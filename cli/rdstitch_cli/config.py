@@ -17,7 +17,8 @@ def read_config(path: Path, commands: Mapping[str, click.Command], running: str)
     """The defaults that a file gives a command, by parameter name; all tables are checked."""
     tables = _parse(path)
     known = {name: _options(command) for name, command in commands.items()}
-    known[COMMON] = {key: option for options in known.values() for key, option in options.items()}
+    # Options of one name may take other values in other commands: those of the running one hold.
+    known[COMMON] = {key: option for options in known.values() for key, option in options.items()} | known[running]
     defaults: dict[str, Any] = {}
     for table in sorted(tables, key=lambda name: name != COMMON):  # the command's own table wins
         if not isinstance(tables[table], dict):
@@ -27,9 +28,11 @@ def read_config(path: Path, commands: Mapping[str, click.Command], running: str)
         for key, value in tables[table].items():
             if key not in known[table]:
                 raise InputError(f"{path}: {table}.{key}: there is no such option{_suggestion(key, known[table])}")
+            if table == COMMON and key not in known[running]:
+                continue
             option = known[table][key]
             converted = _converted(option, value, f"{path}: {table}.{key}")
-            if table in (COMMON, running) and key in known[running] and option.name is not None:
+            if table in (COMMON, running) and option.name is not None:
                 defaults[option.name] = converted
     return defaults
 

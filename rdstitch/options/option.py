@@ -108,6 +108,10 @@ def check_options(options: Any) -> None:
         if not option.fits(value):
             raise ArgumentError(f"{name} must be {option.expected}, not {value!r}")
         object.__setattr__(options, name, value)
+    for each in fields(options):
+        # Options within options.
+        if isinstance(kind := each.default_factory, type) and not isinstance(getattr(options, each.name), kind):
+            raise ArgumentError(f"{each.name} must be {kind.__name__}, not {getattr(options, each.name)!r}")
 
 
 def documented(kind: Class) -> Class:

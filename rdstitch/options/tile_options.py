@@ -66,6 +66,8 @@ class TileOptions:
         "Known λ (half-diagonal frame), or auto: estimate it; otherwise 0 unless all overlaps show it.",
         "L|auto",
         "--lambda",
+        above=-1.0,
+        below=1.0,
     )
     composite: CompositeOptions = field(default_factory=measured_samples)
     overwrite: Overwrite = False

@@ -5,12 +5,13 @@ import sys
 import weakref
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
 
-from rdstitch.errors import InputError
+from rdstitch.errors import InputError, RdstitchError
 from rdstitch.executors import ProcessExecutor
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
@@ -58,6 +59,7 @@ def follow(
     live_preview = None if preview is None else LivePreview(preview, refresh)
     numbers = count()
     unread: dict[Path, int] = {}  # numbers of frames that come again
+    of_preview: list[Message] = []  # told with the next frame
     for arrived in frames:
         number = unread.pop(arrived.path, -1)
         number = next(numbers) if number < 0 else number
@@ -69,14 +71,17 @@ def follow(
             unread[arrived.path] = number
             continue
         poses_of_frame = tracker.register(frame, source, image, reason)
+        poses_of_frame[-1] = replace(poses_of_frame[-1], messages=(*poses_of_frame[-1].messages, *of_preview))
         yield from poses_of_frame
+        of_preview = []
         if source is not None:
             if live_preview is not None:
-                live_preview.add(source, poses_of_frame[-1].tracked)
+                of_preview = live_preview.add(source, poses_of_frame[-1].tracked)
             source.decoded_images.clear()
     yield from tracker.finish()
     if live_preview is not None:
-        live_preview.write()
+        with suppress(RdstitchError):  # what it was a preview of comes now
+            live_preview.write()
 
 
 class Tracker:

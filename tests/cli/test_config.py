@@ -44,6 +44,14 @@ def test_the_documented_example_is_read(tmp_path: Path) -> None:
     assert read_config(file, cli.load_all(), "undistort") == {"camera": "camera.json", "overwrite": True}
 
 
+def test_a_common_option_is_that_of_the_command_that_runs(tmp_path: Path) -> None:
+    file = _written(tmp_path, '[common]\nlambda = "auto"\nformat = "tum"\n')
+    assert read_config(file, cli.load_all(), "tiles") == {"distortion": "auto"}
+    assert read_config(file, cli.load_all(), "doctor") == {}
+    with pytest.raises(InputError, match="lambda"):
+        read_config(file, cli.load_all(), "pano")
+
+
 def test_flags_win_then_the_command_then_common(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     file = _written(
         tmp_path,

@@ -161,6 +161,14 @@ def test_the_line_of_what_cannot_be_read(rdstitch: Run, drive: list[Path], folde
     assert lines[2]["x"] is None
 
 
+def test_a_preview_that_cannot_be_written_ends_nothing(drive: list[Path], tmp_path: Path) -> None:
+    arrivals = open_arrivals(drive[0].parent, frames_folder=Path, idle=0.5)
+    options, gone = StitchOptions(workers=1, distortion=DISTORTION), tmp_path / "gone" / "preview.jpg"
+    poses = list(follow(arrivals, options, preview=gone, refresh=0.0))
+    assert len({pose.name for pose in poses}) == len(drive)
+    assert [message.text[:14] for pose in poses for message in pose.messages] == ["no preview any"]
+
+
 def test_files_whose_writers_pause_are_read_when_they_are_whole(drive: list[Path], folder: Path) -> None:
     names = ["a.png", "b.jpg", "c.png", "d.tif", "e.png"]
     for name, image in zip(names, drive, strict=False):

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pytest
 
-from rdstitch import CompositeOptions, StitchOptions
+from rdstitch import CompositeOptions, StitchOptions, TileOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.options.option import Option, check_options, documented
 
@@ -69,6 +69,14 @@ def test_what_does_not_fit_is_refused_by_name(name: str, value: Any, expected: s
         _Options(**{name: value})
     assert str(caught.value).startswith(f"{name} must be {expected}")
     assert str(caught.value).endswith(f", not {value!r}") or isinstance(value, list)
+
+
+def test_options_within_options_are_of_their_class() -> None:
+    for name, given in (("features", "orb"), ("composite", {"scale": 2.0})):
+        with pytest.raises(ArgumentError, match=rf"{name} must be \w+Options, not "):
+            StitchOptions(**{name: given})  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError, match="distortion must be"):
+        TileOptions(distortion=3.0)
 
 
 def test_the_class_says_what_its_options_are() -> None:
