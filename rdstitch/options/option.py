@@ -7,7 +7,8 @@ large is imported here or by the modules of the options, so that ``--help`` is q
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
+from inspect import isclass
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
@@ -110,7 +111,8 @@ def check_options(options: Any) -> None:
         object.__setattr__(options, name, value)
     for each in fields(options):
         # Options within options.
-        if isinstance(kind := each.default_factory, type) and not isinstance(getattr(options, each.name), kind):
+        kind: Any = each.default_factory
+        if isclass(kind) and is_dataclass(kind) and not isinstance(getattr(options, each.name), kind):
             raise ArgumentError(f"{each.name} must be {kind.__name__}, not {getattr(options, each.name)!r}")
 
 
