@@ -185,7 +185,7 @@ class StitchOptions(RansacOptions):
         """The files that are read besides the images, none of which may be written over."""
         return files_in(
             self.mask,
-            self.attitude,
+            None if self.attitude == "xmp" else self.attitude,
             self.timestamps,
             self.odometry if isinstance(self.odometry, str | Path) else None,
             self.positions,

@@ -217,6 +217,7 @@ def local_alignment(result: StitchResult) -> str:
     field, name = max(moved, key=lambda image: image[0].largest)
     return section(
         "Local alignment",
-        f"The ground is not quite a plane, so that each image's content is moved a little, that of {name} by up to "
+        f"No {'turn' if result.registration.alignment.on_sphere else 'plane'} fits quite, so that each image's content "
+        f"is moved a little, that of {name} by up to "
         f"{field.largest:.1f} pixels; {local.reason}{spread}.",
     )

@@ -20,6 +20,8 @@ from rdstitch.system.file_access import read_text
 from rdstitch.system.outputs import Fingerprint, fingerprint, tiles_folder
 from rdstitch.system.records import convert, parse_json
 
+_OF_A_MACHINE = ("max_memory", "workers")  # options that the machine that wrote a sidecar had, not the picture
+
 
 def json_schema() -> dict[str, Any]:
     """The JSON Schema of sidecars of this version."""
@@ -85,6 +87,7 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
 
 def _composite_options(record: SidecarRecord, file: str) -> CompositeOptions:
     given = convert(record.options.get("composite"), dict[str, Any], file, "options.composite")
+    given = {name: value for name, value in given.items() if name not in _OF_A_MACHINE}
     unknown = [name for name in given if name not in CompositeOptions.__dataclass_fields__]
     if unknown:
         raise InputError(f"{file}: options.composite.{unknown[0]}: this rdstitch has no such option")

@@ -1,6 +1,7 @@
 """The fields of a sidecar with their types: what is written, what is read and checked, and the JSON Schema.
 
-docs/formats.md describes the fields. Fields may be added; a change that would mislead a reader raises the version. What
+docs/formats.md describes the fields. Fields may be added, but options of compositing, without which a reader would draw
+another picture: it refuses those that it does not know. A change that would mislead a reader raises the version. What
 earlier versions did not have has a default.
 """
 

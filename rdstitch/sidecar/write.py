@@ -265,12 +265,10 @@ def versions() -> dict[str, str]:
     """Versions of what has a say in the result."""
     from importlib.metadata import version
 
-    import scipy
-
     return {
         "rdstitch": version("rdstitch"),
         "numpy": np.__version__,
-        "scipy": scipy.__version__,
+        "scipy": version("scipy"),
         # Whichever of its wheels is installed.
         "opencv": cv2.__version__,
         "python": platform.python_version(),
@@ -278,7 +276,7 @@ def versions() -> dict[str, str]:
 
 
 def _plain(array: FloatArray | None) -> Any:
-    """An array as the tuples that a record has, which NumPy's types do not tell."""
+    """An array as the lists that JSON has of a record's tuples, for fields whose types NumPy's do not tell."""
     return None if array is None else array.tolist()
 
 

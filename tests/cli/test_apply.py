@@ -82,6 +82,11 @@ def test_given_options_win_over_the_sidecar(rdstitch: Run, frames: list[Path], s
     _apply(rdstitch, _sidecar(stitched), frames[0].parent, changed, *options)
     rdstitch("mosaic", *frames, "-o", direct, *options, *CACHED)
     assert changed.read_bytes() == direct.read_bytes()
+    record = sidecar_of(stitched)
+    record["options"]["composite"]["max_memory"] = 1000  # bytes of another machine
+    (tmp_path / "elsewhere.json").write_text(json.dumps(record), encoding="utf-8")
+    _apply(rdstitch, tmp_path / "elsewhere.json", frames[0].parent, changed, *options, "--overwrite")
+    assert changed.read_bytes() == direct.read_bytes()
 
 
 def _written(frames: list[Path], folder: Path, names: list[str], factor: float = 1.0, band: int | None = None) -> Path:
