@@ -265,10 +265,12 @@ def versions() -> dict[str, str]:
     """Versions of what has a say in the result."""
     from importlib.metadata import version
 
+    import scipy
+
     return {
         "rdstitch": version("rdstitch"),
         "numpy": np.__version__,
-        "scipy": version("scipy"),
+        "scipy": scipy.__version__,
         # Whichever of its wheels is installed.
         "opencv": cv2.__version__,
         "python": platform.python_version(),
