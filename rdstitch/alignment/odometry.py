@@ -129,7 +129,10 @@ def bridged(path: Trajectory, bodies: Mapping[int, BodyPose], fit: OdometryFit) 
             place = places[k] + cmath.exp(1j * path.yaw[k]) * fit.camera_motion(step.moved, step.turn)
             turned = fit.noise**2 * step.turn_variance
             spread = fit.noise**2 * step.variance + turned * abs(step.moved) ** 2
-            guesses.append((place, path.yaw[k] + step.turn, path.height[k], spread, turned, k))
+            yaw = path.yaw[k] + step.turn
+            if guesses:  # from the other end, by whole turns as near as can be
+                yaw = guesses[0][1] + math.remainder(yaw - guesses[0][1], math.tau)
+            guesses.append((place, yaw, path.height[k], spread, turned, k))
         if not guesses:
             continue
         weights = np.array([1.0 / max(guess[3], 1e-12) for guess in guesses])
@@ -146,7 +149,7 @@ def bridged(path: Trajectory, bodies: Mapping[int, BodyPose], fit: OdometryFit) 
         path,
         frame=np.array(frame, dtype=np.intp),
         position=np.stack([np.real(at), -np.imag(at)], axis=1),
-        yaw=np.array(yaw),
+        yaw=np.unwrap(yaw),
         height=np.array(height),
         covariance=None if path.covariance is None else np.array(covariance),
     )
