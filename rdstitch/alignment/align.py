@@ -269,7 +269,9 @@ def _drop_wrong_pairs(
             between_images.squared(model, adjusted.parameters), between_images.observations
         )
         if judged[inside].all():
-            raise RegistrationError("no pair agrees with the others on where the images lie; add images with more overlap")
+            raise RegistrationError(
+                "no pair agrees with the others on where the images lie; add images with more overlap"
+            )
         if (judged == wrong).all():
             break
         wrong = judged

@@ -1,5 +1,6 @@
 """What misleads matching: rough ground, one that stays with the camera, repeated patterns, the same pixels twice."""
 
+import tracemalloc
 from dataclasses import replace
 from functools import partial
 
@@ -214,6 +215,16 @@ def test_other_ground_has_no_such_matches(board: Sequence) -> None:
 
 
 @pytest.mark.slow
+def test_matching_many_keypoints_takes_memory_for_some_of_them_at_a_time(board: Sequence) -> None:
+    few = _features(board, 0)
+    many = few.take(np.resize(np.arange(len(few)), 3000))
+    tracemalloc.start()
+    match_pattern(many, many)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 60e6  # 108 MB of distances and their order
+
+
 def test_calibrate_matches_boards_so_and_mosaics_do_not(board: Sequence) -> None:
     """A mosaic could be off by whole squares."""
     stages: dict[bool, set[str]] = {True: set(), False: set()}
