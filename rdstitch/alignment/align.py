@@ -77,7 +77,7 @@ class AlignmentTask:
 
     @cached_property
     def draft(self) -> Alignment:
-        """Model, lens and poses by a few matches of each link; deviations are those of the normal equations, see uncertainty.py."""
+        """Model, lens and poses by a few matches of each link; deviations are those of the normal equations."""
         return build_alignment(self._selected)
 
     @cached_property
@@ -184,7 +184,7 @@ def from_another_start(problem: Problem, fit: Fit) -> Fit:
 
 
 def _with_checked_focal(adjusted: AdjustedImages, given: AlignmentOptions) -> Alignment:
-    """The alignment; without the focal length that was given, where it gave way and the images by themselves show another one."""
+    """The alignment; without a given focal length that gave way where the images by themselves show another one."""
     if adjusted.covariance is None or not is_strained(adjusted.all_links.camera_priors, adjusted.choice.fit):
         return build_alignment(adjusted)
     task = adjusted.given
@@ -269,9 +269,7 @@ def _drop_wrong_pairs(
             between_images.squared(model, adjusted.parameters), between_images.observations
         )
         if judged[inside].all():
-            raise RegistrationError(
-                "no pair agrees with the others on where the images lie; add images with more overlap"
-            )
+            raise RegistrationError("the pairs do not agree on where the images lie; add images with more overlap")
         if (judged == wrong).all():
             break
         wrong = judged

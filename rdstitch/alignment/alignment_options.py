@@ -38,9 +38,8 @@ class AlignmentOptions:
     lens: str = "auto"  # one of :data:`rdstitch.choices.LensName`; "auto": the simplest that the data allow
     purpose: Purpose = Purpose.MOSAIC
     pose_covariance: bool = False  # its time grows with the square of the number of images
-    max_matches_per_link: int = (
-        250  # correspondences used of each link; fewer of thousands of links, more of a turn with few
-    )
+    # correspondences used of each link; fewer of thousands of links, more of the few of a turn on the spot
+    max_matches_per_link: int = 250
 
     def __post_init__(self) -> None:
         for name, choices in (("model", get_args(ModelName)), ("lens", get_args(LensName))):

@@ -34,9 +34,9 @@ def levelled(matrices: FloatArray, reference: int, gravity: FloatArray | None = 
 
 
 def measured_down(rotations: FloatArray, gravity: FloatArray | None) -> FloatArray | None:
-    """Direction down (3,), in the frame that rotations (N, 3, 3) lead from, by gravity (N, 3), in any unit, in the cameras' axes.
+    """Direction down (3,), in the frame that rotations (N, 3, 3) lead from, by gravity (N, 3) in the cameras' axes.
 
-    None where no camera has measured it, or where the measurements contradict each other.
+    Gravity may be in any unit. None where no camera has measured it, or where the measurements contradict each other.
     """
     if gravity is None:
         return None

@@ -47,9 +47,7 @@ class ControlPoints:
             if not 0 <= one.image < len(cameras):
                 raise ArgumentError(f"control point {one.name} is in image {one.image}, of {len(cameras)}")
             if not (np.isfinite([*one.offset, *one.place]).all() and 0.0 <= (one.std or 0.0) < np.inf):
-                raise ArgumentError(
-                    f"control point {one.name}: its place, offset and standard deviation must be finite"
-                )
+                raise ArgumentError(f"control point {one.name}: place, offset and standard deviation must be finite")
         first = {one.name: one for one in reversed(sightings)}
         names = tuple(dict.fromkeys(one.name for one in sightings))
         number = {name: k for k, name in enumerate(names)}

@@ -334,7 +334,7 @@ def test_mistakes_of_the_caller() -> None:
         ({"gravity": np.zeros((1, 3))}, "gravity must have the shape"),
         ({"control": (Sighting(99, (0.0, 0.0), "P1", (0.0, 0.0)),)}, "P1 is in image 99"),
         ({"control": (Sighting(-1, (0.0, 0.0), "P1", (0.0, 0.0)),)}, "P1 is in image -1"),
-        ({"control": (Sighting(0, (math.nan, 0.0), "P1", (0.0, 0.0)),)}, "P1: its place, offset"),
+        ({"control": (Sighting(0, (math.nan, 0.0), "P1", (0.0, 0.0)),)}, "P1: place, offset"),
     ],
 )
 def test_what_cannot_be_of_the_images_is_refused(options: dict[str, object], named: str) -> None:

@@ -214,7 +214,6 @@ def test_other_ground_has_no_such_matches(board: Sequence) -> None:
     assert len(match_pattern(detect(board.frame(0), FeatureOptions("orb")), _features(board, 1))) == 0
 
 
-@pytest.mark.slow
 def test_matching_many_keypoints_takes_memory_for_some_of_them_at_a_time(board: Sequence) -> None:
     few = _features(board, 0)
     many = few.take(np.resize(np.arange(len(few)), 3000))
@@ -225,6 +224,7 @@ def test_matching_many_keypoints_takes_memory_for_some_of_them_at_a_time(board: 
     assert peak < 60e6  # 108 MB of distances and their order
 
 
+@pytest.mark.slow
 def test_calibrate_matches_boards_so_and_mosaics_do_not(board: Sequence) -> None:
     """A mosaic could be off by whole squares."""
     stages: dict[bool, set[str]] = {True: set(), False: set()}
