@@ -154,7 +154,8 @@ class _Control(_KnownPlaces):
 
     def __init__(self, problem: Problem, fit: Fit) -> None:
         given = problem.camera_priors.control
-        self.points = known = given.subset(np.isfinite(_sightings(given, fit)).all(axis=1))
+        shown = np.flatnonzero(np.isfinite(_sightings(given, fit)).all(axis=1))
+        self.points = known = given.subset(shown)
         self.metres = known.places @ np.array([1.0, -1.0j])
         self.count = np.bincount(known.point, minlength=len(known.names))
         self.std = known.std

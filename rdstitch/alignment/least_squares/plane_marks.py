@@ -63,11 +63,11 @@ class ControlPoints:
 
     def within(self, images: IntArray) -> Self:
         """In some of the images (N,), ascending, which get the numbers 0 to N - 1."""
-        shown = self.subset(np.isin(self.image, images))
+        shown = self.subset(np.flatnonzero(np.isin(self.image, images)))
         return replace(shown, image=np.searchsorted(images, shown.image).astype(np.intp))
 
-    def subset(self, shown: BoolArray) -> Self:
-        """In some of the sightings (M,) only."""
+    def subset(self, shown: IntArray) -> Self:
+        """Some of the sightings only."""
         known, point = np.unique(self.point[shown], return_inverse=True)
         return type(self)(
             tuple(self.names[k] for k in known.tolist()),
