@@ -11,7 +11,7 @@ import numpy as np
 
 from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel
 from rdstitch.arrays import FloatArray
-from rdstitch.geometry.planar_motion import nearest_rotation
+from rdstitch.geometry.planar_motion import ABOUT_X, ABOUT_Y, ABOUT_Z, nearest_rotation, rotation_about
 
 _FOCAL_STARTS = tuple(math.log(focal) for focal in (0.6, 0.9, 1.4, 2.2, 3.6, 6.0))
 """Logarithms of focal lengths in half diagonals: from fisheyes to long lenses, near enough to each other that the
@@ -20,9 +20,7 @@ adjustment of pairs converges from the nearest."""
 _MAX_STEP = 0.5  # radians; where the motion is no rotation, steps may diverge
 _LOG_FOCAL_LIMITS = math.log(0.2), math.log(50.0)
 
-_CROSS = np.zeros((3, 3, 3))
-_CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = 1.0
-_CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = -1.0
+_CROSS = np.stack([ABOUT_X, ABOUT_Y, ABOUT_Z])
 
 
 class RotationModel(MotionModel):
@@ -78,12 +76,7 @@ def rotation_from_vector(vectors: FloatArray) -> FloatArray:
     """Rotations (N, 3, 3) about axes (N, 3) by their length, radians (Rodrigues); long ones are shortened."""
     angle = np.linalg.norm(vectors, axis=1)
     vectors = vectors * np.minimum(1.0, _MAX_STEP / np.maximum(angle, 1e-300))[:, None]
-    angle = np.minimum(angle, _MAX_STEP)
-    cross = np.einsum("nk,kij->nij", vectors, _CROSS)
-    first = np.sinc(angle / np.pi)[:, None, None]
-    second = 0.5 * np.sinc(angle / (2.0 * np.pi))[:, None, None] ** 2
-    rotation: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
-    return rotation
+    return rotation_about(vectors, np.minimum(angle, _MAX_STEP))
 
 
 ROTATION = RotationModel()
