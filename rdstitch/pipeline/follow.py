@@ -25,13 +25,13 @@ from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import time_of, timestamps_of
 from rdstitch.io.opening import check_readable
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.aligner import alignment_options
-from rdstitch.pipeline.live_preview import LivePreview
-from rdstitch.pipeline.pose import FollowedPoses, Pose
+from rdstitch.pipeline.alignment_inputs import alignment_options
 from rdstitch.pipeline.read_inputs import read_frames, with_camera_read
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message
+from rdstitch.results.pose import FollowedPoses, Pose
 from rdstitch.tracking import FrameTracker, TrackingOptions, TrackingResult
+from rdstitch.tracking.live_preview import LivePreview
 
 _FEATURES = 600  # of a frame, that suffice to follow it
 _MEGAPIXELS = 0.1  # 10⁶ pixels in which they are detected: a frame of 640 x 480 pixels is halved once

@@ -139,3 +139,11 @@ def test_odometry_is_read_from_tum_and_refused_by_line(tmp_path: Path) -> None:
     file.write_text("1 0 0 0 0 0 0 1\n2 1 0.5 0 0 0 one 1\n", encoding="utf-8")
     with pytest.raises(InputError, match="line 2"):
         read_odometry(file)
+
+
+def test_turns_by_more_than_half_a_circle_are_bridged_the_way_they_were_made() -> None:
+    yaw = np.radians([0.0, 67.5, 135.0, 202.5, 270.0])
+    bodies = {k: BodyPose(0.0, 0.0, turn) for k, turn in enumerate(yaw.tolist())}
+    for last in (yaw[-1], yaw[-1] - 2.0 * np.pi):  # images alone know it up to whole turns
+        path = Trajectory(np.array([0, 4]), np.zeros((2, 2)), np.array([0.0, last]), np.ones(2))
+        np.testing.assert_allclose(bridged(path, bodies, OdometryFit(1.0, 0.0, 1.0, 0.01)).yaw, yaw)
