@@ -19,6 +19,8 @@ _APRON = 8
 _BEYOND = 4
 _EDGE_POINTS = 9  # at which a bent edge is measured
 _PROBES = 4  # of the steepness, along a side of a cell
+_INVERSIONS = 12  # steps of a fixed-point iteration; where the steepness is a half, each halves the error
+_LEVELLINGS = 200  # times that nodes of steep cells near their neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,14 @@ class DisplacementField:
         patches = np.lib.stride_tricks.sliding_window_view(self._coefficients, (4, 4), axis=(0, 1))
         patches = patches.reshape(*patches.shape[:3], 16)
         moved = np.einsum("...ck,...k->...c", patches[cell[..., 1] - 1, cell[..., 0] - 1], weights)
-        return np.asarray(moved, dtype=np.float64)
+        return np.where(np.isnan(points).any(axis=-1, keepdims=True), 0.0, moved)
+
+    def expected(self, points: FloatArray) -> FloatArray:
+        """Where the alignment expects what is at measured pixels (..., 2), for a field that folds nothing."""
+        expected = points
+        for _ in range(_INVERSIONS):
+            expected = points - self(expected)
+        return expected
 
     def resized(self, image_size: tuple[int, int]) -> "DisplacementField":
         """The same for an image of another size that shows the same."""
@@ -68,16 +77,39 @@ class DisplacementField:
         """Length of the largest displacement of a node, pixels."""
         return float(np.linalg.norm(self.values, axis=-1).max())
 
-    @cached_property
+    @property
     def steepest(self) -> float:
         """Largest change of the displacement per pixel in any direction; below 1 the image does not fold."""
+        return float(self._steepness.max())
+
+    def levelled(self, steepest: float) -> "DisplacementField":
+        """The same with changes of at most ``steepest`` per pixel: nodes of steeper cells near their neighbours.
+
+        Only a field that is too steep nearly everywhere becomes smaller everywhere.
+        """
+        field = self
+        for _ in range(_LEVELLINGS):
+            steep = np.pad(field._steepness > steepest, 1)
+            if not steep.any():
+                return field
+            chosen = (steep[:-1, :-1] | steep[:-1, 1:] | steep[1:, :-1] | steep[1:, 1:])[..., None]
+            near = np.pad(field.values, ((1, 1), (1, 1), (0, 0)), mode="edge")
+            mean = (near[:-2, 1:-1] + near[2:, 1:-1] + near[1:-1, :-2] + near[1:-1, 2:]) / 4.0
+            field = DisplacementField(self.image_size, np.where(chosen, (field.values + mean) / 2.0, field.values))
+        return DisplacementField(self.image_size, field.values * min(1.0, steepest / field.steepest))
+
+    @cached_property
+    def _steepness(self) -> FloatArray:
+        """Largest change of the displacement per pixel in any direction, of each cell (m - 1, n - 1)."""
         down, across = (_evaluation(n) for n in self.values.shape[:2])
         # Rows, then columns: (2, rows, columns).
         moved = down @ np.moveaxis(self.values, -1, 0) @ across.T
         spacing = _extent(self.image_size) / (moved.shape[2] - 1, moved.shape[1] - 1)
         (a, c), (b, d) = np.diff(moved, axis=2)[:, :-1] / spacing[0], np.diff(moved, axis=1)[:, :, :-1] / spacing[1]
         # The larger singular value of each matrix of two rows and columns.
-        return float((np.hypot(a + d, c - b) + np.hypot(a - d, c + b)).max()) / 2.0
+        steepness = (np.hypot(a + d, c - b) + np.hypot(a - d, c + b)) / 2.0
+        rows, columns = self.values.shape[0] - 1, self.values.shape[1] - 1
+        return np.asarray(steepness.reshape(rows, _PROBES, columns, _PROBES).max(axis=(1, 3)))
 
     def bends(self, edges: FloatArray) -> FloatArray:
         """How far straight edges with such ends (K, 2, 2) are bent, measured pixels (K,)."""

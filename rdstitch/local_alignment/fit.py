@@ -4,12 +4,13 @@ A match of the images i and j that the alignment puts ``r`` apart is explained b
 ``d_i(e_i) - d_j(e_j)``, where ``e`` is the pixel at which the alignment expects what is at the measured one: fields say
 for each place of the output where its content is, so ``e`` is found anew from round to round. Fields rise and bend
 little, and vanish where nothing supports them; that alone fixes what the matches leave open, a displacement of all
-images together, at zero. All coordinates have the same normal equations.
+images together, at zero. All coordinates have the same normal equations. Between nodes the fit is bilinear, which
+keeps its equations sparse; the field that is delivered, and judged, is a spline through the same nodes.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -69,17 +70,19 @@ class PlacedFields:
             expected = _expected(matches, self.images, design, values)
         return matches.residual - design @ values, expected
 
-    def of_image(self, k: int) -> DisplacementField:
-        """The displacement in measured pixels of an image, limited so that nothing folds."""
+    @cached_property
+    def delivered(self) -> tuple[DisplacementField, ...]:
+        """What each image is displaced by in the output."""
+        return tuple(map(self._of_image, range(len(self.shapes))))
+
+    def _of_image(self, k: int) -> DisplacementField:
+        """The displacement in measured pixels of an image, levelled where it is so steep that it might fold."""
         size = self.images.cameras[k].image_size
         points = node_points(size, self.shapes[k])
         with np.errstate(invalid="ignore"):
             shown = self.images.from_surface(k, self.images.to_surface(k, points) + self.values[k])
         displaced = np.where(np.isfinite(shown), shown - points, 0.0).reshape(*self.shapes[k], 2)
-        field = DisplacementField.of(size, displaced)
-        if field.steepest <= _MAX_GRADIENT:
-            return field
-        return DisplacementField.of(size, field.values * (_MAX_GRADIENT / field.steepest))
+        return DisplacementField.of(size, DisplacementField(size, displaced).levelled(_MAX_GRADIENT).values)
 
 
 def fit_fields(
