@@ -14,9 +14,8 @@ from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
 
-# Of a grid that finds what is far from the plane, and of the one that is used; and how many nodes the grids of all
-# images together may have: of more than some 70 images the finer one is coarser, of more than 800 both, to bound time
-# and memory.
+# Cells of a grid that finds what is far from the plane, and of the one that is used; nodes of all images together, by
+# which the finer one is coarser for more than some 70 images, and both for more than 800.
 _COARSE, _FINE = (12, 120_000), (24, 40_000)
 _SLOPES = (0.2, 0.06, 0.02)
 _HELD_OUT = 5  # every fifth match
@@ -76,29 +75,13 @@ def align_locally(
     on_sphere: bool = False,
     edges: Callable[[list[int]], Iterable[FloatArray]] = lambda images: [np.empty((0, 2, 2)) for _ in images],
 ) -> LocalAlignment:
-    """Smooth displacement fields that bring matches of overlapping images together.
+    """Smooth displacement fields that bring putative matches of all overlapping images together.
 
-    Parameters
-    ----------
-    matches : iterable of Match
-        Putative matches of all pairs, right and wrong; ``image1`` and ``image2`` count the cameras.
-    homographies : ndarray of shape (N, 3, 3)
-        Undistorted coordinates, in half diagonals, to the plane, or to directions.
-    choice : "auto" or int
-        "auto": only where matches that are held out of the fit come nearer by more than fields bend what is straight,
-        and by 15 % of their distance or more. A number: always, with so many cells along the longer side of an image.
-    pairs : int, optional
-        How many ``matches`` there are, where these come one by one.
-    on_sphere : bool
-        Whether the camera turned on the spot, so that ``homographies`` lead to directions.
-    edges : callable
-        Gives the ends of straight edges in each of some images, (K, 2, 2) measured pixels. It is called once, where
-        fields may be used.
-
-    Raises
-    ------
-    ArgumentError
-        When a number of cells is less than 1.
+    By ``choice`` "auto" only where matches that are held out of the fit come nearer by more than fields bend what is
+    straight, and by 15 % of their distance or more; a number: always, with so many cells along the longer side of an
+    image. ``homographies`` (N, 3, 3) are of undistorted coordinates, in half diagonals, to the plane, or to directions;
+    ``pairs``: how many ``matches`` there are, where these come one by one; ``edges`` gives the ends (K, 2, 2) of
+    straight edges in each of some images, measured pixels.
     """
     if choice != "auto" and choice < 1:
         raise ArgumentError(f"local alignment takes at least one cell, not {choice}")

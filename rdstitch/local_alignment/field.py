@@ -12,11 +12,8 @@ from rdstitch.arrays import FloatArray, read_only
 from rdstitch.errors import ArgumentError
 
 _DECIMALS = 3  # pixels; what a sidecar stores is what was used
-# Nodes by which a field goes on as it does at the border, so that a spline, which is level at its end, is so beyond it.
-_APRON = 8
-# Nodes beyond the border up to which it is evaluated: who interpolates across the border would find a kink there, and
-# take many times as many places for it.
-_BEYOND = 4
+_APRON = 8  # nodes by which a field goes on as at the border: a spline is level at its end
+_BEYOND = 4  # nodes beyond the border up to which it is evaluated: interpolating across it would find a kink there
 _EDGE_POINTS = 9  # at which a bent edge is measured
 _PROBES = 4  # of the steepness, along a side of a cell
 _INVERSIONS = 12  # steps of a fixed-point iteration; where the steepness is a half, each halves the error
@@ -31,15 +28,12 @@ class DisplacementField:
     """
 
     image_size: tuple[int, int]  # width and height of the image, pixels
-    # (m, n, 2): displacement, pixels, at nodes spread evenly from the first to the last pixel of each row and column, m
-    # rows of n
-    values: FloatArray
+    values: FloatArray  # (m, n, 2): pixels, at nodes spread evenly from the first to the last pixel, m rows of n
 
     def __post_init__(self) -> None:
-        if self.values.ndim != 3 or self.values.shape[2] != 2 or min(self.values.shape[:2]) < 2:
-            raise ArgumentError(
-                f"a displacement field has shape (m, n, 2), m and n at least 2, not {self.values.shape}"
-            )
+        shape = self.values.shape
+        if len(shape) != 3 or shape[2] != 2 or min(shape[:2]) < 2:
+            raise ArgumentError(f"a displacement field has shape (m, n, 2), m and n at least 2, not {shape}")
         if not np.isfinite(self.values).all():
             raise ArgumentError("displacements must be finite")
 
@@ -50,7 +44,9 @@ class DisplacementField:
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Displacement (..., 2) at measured pixels (..., 2), also beside the image; far out as there, 0 at NaN."""
-        place = self._grid_coordinates(points) + _APRON
+        last = np.array([self.values.shape[1] - 1, self.values.shape[0] - 1])
+        place = np.nan_to_num(np.asarray(points, dtype=np.float64) * (last / _extent(self.image_size)))
+        place = np.clip(place, -_BEYOND, last + _BEYOND) + _APRON
         cell = place.astype(np.intp)
         across, down = np.moveaxis(_cubic_weights(place - cell), -2, 0)
         weights = (down[..., :, None] * across[..., None, :]).reshape(*cell.shape[:-1], 16)
@@ -125,12 +121,6 @@ class DisplacementField:
         """Of the B-spline, with the apron around, (rows, columns, 2)."""
         down, across = (_prefilter(n) for n in self.values.shape[:2])
         return np.moveaxis(down @ np.moveaxis(self.values, -1, 0) @ across.T, 0, -1)
-
-    def _grid_coordinates(self, points: FloatArray) -> FloatArray:
-        """Column and row (..., 2) in units of the grid, within it or not far from it."""
-        last = np.array([self.values.shape[1] - 1, self.values.shape[0] - 1])
-        place = np.asarray(points, dtype=np.float64) * (last / _extent(self.image_size))
-        return np.clip(np.nan_to_num(place), -_BEYOND, last + _BEYOND)
 
 
 def _extent(image_size: tuple[int, int]) -> FloatArray:

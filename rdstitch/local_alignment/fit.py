@@ -28,21 +28,15 @@ from rdstitch.system.late_imports import sparse, sparse_linalg
 # many rounds at the end.
 _ROBUST, _MIN_SCALE = 2.0, 0.3
 _WIDEST, _SHARPENED, _SHARP_ROUNDS = 95.0, 0.5, 2
-# A field vanishes over about this share of an image where nothing supports it.
-_FADE = 0.2
-# Fixed-point iterations from where an image shows something to where the alignment expects it; each leaves the
-# gradient's share of the error.
-_STEPS = 4
-# Limit of the displacement's change per pixel: half of what would fold an image.
-_MAX_GRADIENT = 0.5
+_FADE = 0.2  # share of an image over which a field vanishes where nothing supports it
+_STEPS = 4  # of a fixed-point iteration to where the alignment expects something; each leaves the gradient's share
+_MAX_GRADIENT = 0.5  # change of the displacement per pixel: half of what would fold an image
 # Nodes of all images up to which equations are factorized as they are, cells of a grid from which on there is a coarser
 # one, and the residual of the equations that is left, as a share of their right side: a thousandth of a pixel.
 _FACTORIZED, _MIN_HALVED, _TOLERANCE = 5000, 8, 1e-6
-# A residual leads from the second image to the first.
-_SIGNS = np.array([1.0, -1.0])
+_SIGNS = np.array([1.0, -1.0])  # a residual leads from the second image to the first
 
-Shapes = tuple[tuple[int, int], ...]
-"""Rows and columns of the grid of each image."""
+Shapes = tuple[tuple[int, int], ...]  # rows and columns of the grid of each image
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,7 @@ class PlacedFields:
     shapes: Shapes  # rows and columns of nodes of each image
     values: tuple[FloatArray, ...]  # (m n, D): pixels of the median image
 
-    def explain(self, matches: PlacedMatches) -> tuple[FloatArray, FloatArray]:
+    def unexplained(self, matches: PlacedMatches) -> tuple[FloatArray, FloatArray]:
         """What they leave over at matches, (M, D), and pixels (2 M, 2) where the alignment expects these."""
         values, expected = np.concatenate(self.values), matches.points.reshape(-1, 2)
         for _ in range(_STEPS):
@@ -102,7 +96,7 @@ def fit_fields(
         left, expected = matches.residual, matches.points.reshape(-1, 2)
         scale = float(np.percentile(np.linalg.norm(left, axis=1), _WIDEST))
     else:
-        left, expected, scale = *start.explain(matches), 0.0
+        left, expected, scale = *start.unexplained(matches), 0.0
     sharp = 0 if start is None else 1
     while sharp < _SHARP_ROUNDS:
         length = np.linalg.norm(left, axis=1)

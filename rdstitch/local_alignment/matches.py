@@ -15,9 +15,8 @@ from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
 from rdstitch.local_alignment.field import DisplacementField
 
-# Matches that the alignment expects farther away than this share of the image's diagonal are taken to be wrong; where
-# the ground rises by a tenth of the camera's height, and the alignment is that of the valleys, right ones are nearly as
-# far apart.
+# Share of the image's diagonal: matches farther off are taken to be wrong. Where the ground rises by a tenth of the
+# camera's height, and the alignment is that of the valleys, right ones are nearly as far off.
 _SEARCH_RADIUS = 0.15
 _MIN_MATCHES = 8
 
