@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from examples.worlds.alignment_scenes import Scene, aligned, fitted, grid, scene
-from rdstitch.alignment.align import from_another_start
 from rdstitch.alignment.motion_models import SIMILARITY
+from rdstitch.alignment.recipe import from_another_start
 from rdstitch.alignment.relief_field import _spectrum
 from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
 from rdstitch.alignment.select import ModelChoice, best_of
