@@ -174,11 +174,11 @@ def select_model(
     wide = replace(problem, free_lens=np.logical_or.reduce([problem.free_lens, *lenses]))
     turns = [_TurnTrial.of(posterior, wide, model) for model in models if model.on_sphere]
     bar = posterior.lower_bound(planar[0], posterior.floor) if planar else math.inf
-    tried = [turn.scored(posterior) for turn in turns if turn.bound < bar]
-    _try_planar(posterior, tried, planar, one_camera=all(model.one_camera for model in models))
-    for turn in turns:
+    early = [turn.scored(posterior) for turn in turns if turn.bound < bar]
+    tried = _with_planar(posterior, early, planar, free=not all(model.one_camera for model in models))
+    for turn in (turn for turn in turns if turn.bound >= bar):
         best = min((one for one in tried if one.fit.model.one_camera), key=_score)
-        if turn.bound >= bar and (best.implausible or turn.bound < best.score):
+        if best.implausible or turn.bound < best.score:
             tried.insert(0, turn.scored(posterior))
     tried = _with_wider_lenses(posterior, tried, lenses)
     return _choice(tried, _best(posterior, tried), requested=len(names) == 1)
@@ -204,17 +204,19 @@ class _TurnTrial:
         return posterior.scored(fit_model(posterior.problem, self.model, shared=self.shared))
 
 
-def _try_planar(
-    posterior: Posterior, tried: list[Hypothesis], models: Sequence[MotionModel], *, one_camera: bool
-) -> None:
-    """Add planar models to those tried, from the least free one, until a freer one cannot be better."""
+def _with_planar(
+    posterior: Posterior, tried: Sequence[Hypothesis], models: Sequence[MotionModel], *, free: bool
+) -> list[Hypothesis]:
+    """With planar models, from the least to the most free, which are ``free`` homographies or not."""
+    tried = list(tried)
     for model in models:
-        if posterior.problem.count == 2 and model.free_tilts and not one_camera:
+        if posterior.problem.count == 2 and model.free_tilts and free:
             continue  # with two images, one camera that tilts is a homography
         if tried and posterior.suffices(min(tried, key=_score), model):
-            return
+            break
         planes = [one.fit for one in tried if not one.fit.model.on_sphere]
         tried.append(posterior.scored(fit_model(posterior.problem, model, planes[-1:])))
+    return tried
 
 
 def best_of(problem: Problem, fits: Sequence[Fit], purpose: Purpose, *, requested: bool) -> ModelChoice | None:
