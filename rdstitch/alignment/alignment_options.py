@@ -1,7 +1,6 @@
 """What the caller of the alignment decides, and what is given of the camera and the images."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
@@ -15,6 +14,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
+from rdstitch.system.dataclasses import dataclass
 
 
 @dataclass(frozen=True, eq=False)

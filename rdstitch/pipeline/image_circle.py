@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -17,6 +16,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.pipeline.run_on_sources import run_on_sources
 from rdstitch.system.cache import Cache
+from rdstitch.system.dataclasses import dataclass, replace
 
 _IMAGES = 5  # looked at, from all parts of the sequence: what is dark in their mean is dark in each
 _DARK = 0.1  # of the brightest twentieth, up to which a pixel is dark: a surround has stray light, and noise

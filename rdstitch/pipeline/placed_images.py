@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Self
 
@@ -29,6 +28,7 @@ from rdstitch.io.reduction import fitting_reduction
 from rdstitch.local_alignment import LocalAlignment, Match, align_locally, no_local_alignment
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
+from rdstitch.system.dataclasses import dataclass, field, replace
 
 _COMPARED, _COMPARED_SIDE = 8, 400
 """Images, and pixels of their longer side, that are compared to find what is static in them."""

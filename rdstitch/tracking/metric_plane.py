@@ -1,13 +1,13 @@
 """Frames of a camera whose focal length and tilt are known: where they lie on a metric plane, and how surely."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
+from rdstitch.system.dataclasses import dataclass
 from rdstitch.tracking.placement import Placement, PlaneSimilarity
 
 _CELLS = 8
