@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rdstitch.camera_files import load_camera as load_camera
     from rdstitch.camera_files import save_camera as save_camera
     from rdstitch.errors import RdstitchError as RdstitchError
+    from rdstitch.export.layers import write_layers as write_layers
     from rdstitch.geometry.camera import Camera as Camera
     from rdstitch.geometry.radial_homography import RadialHomography as RadialHomography
     from rdstitch.options.apply_options import ApplyOptions as ApplyOptions
@@ -30,22 +31,21 @@ if TYPE_CHECKING:
     from rdstitch.pipeline.doctor import Examination as Examination
     from rdstitch.pipeline.doctor import examine as examine
     from rdstitch.pipeline.follow import Tracker as Tracker
-    from rdstitch.pipeline.pose import FollowedPoses as FollowedPoses
-    from rdstitch.pipeline.pose import Pose as Pose
     from rdstitch.pipeline.recipes import calibrate as calibrate
     from rdstitch.pipeline.recipes import mosaic as mosaic
     from rdstitch.pipeline.recipes import pano as pano
     from rdstitch.pipeline.recipes import trajectory as trajectory
-    from rdstitch.pipeline.recomposition import Recomposition as Recomposition
-    from rdstitch.pipeline.result_files import write_layers as write_layers
     from rdstitch.pipeline.stage_tiles import place_tiles as place_tiles
     from rdstitch.pipeline.stage_tiles import tiles as tiles
     from rdstitch.pipeline.undistort_images import undistort as undistort
     from rdstitch.report import write_report as write_report
     from rdstitch.results.messages import Message as Message
+    from rdstitch.results.pose import FollowedPoses as FollowedPoses
+    from rdstitch.results.pose import Pose as Pose
     from rdstitch.results.registration import Registration as Registration
     from rdstitch.results.stitch_result import StitchResult as StitchResult
     from rdstitch.robust import estimate_radial_homography as estimate_radial_homography
+    from rdstitch.sidecar.recomposition import Recomposition as Recomposition
 
     __version__: str
 
@@ -64,12 +64,12 @@ _HOMES = {
         "rdstitch.results.messages": "Message",
         "rdstitch.options.stitch_options": "StitchOptions",
         "rdstitch.pipeline.apply_sidecar": "apply",
-        "rdstitch.pipeline.recomposition": "Recomposition",
+        "rdstitch.sidecar.recomposition": "Recomposition",
         "rdstitch.pipeline.composer": "Composer",
         "rdstitch.pipeline.follow": "Tracker",
-        "rdstitch.pipeline.pose": "FollowedPoses Pose",
+        "rdstitch.results.pose": "FollowedPoses Pose",
         "rdstitch.options.files_beside": "FilesBeside",
-        "rdstitch.pipeline.result_files": "write_layers",
+        "rdstitch.export.layers": "write_layers",
         "rdstitch.pipeline.blocks": "mosaic_blocks",
         "rdstitch.pipeline.recipes": "calibrate mosaic pano trajectory",
         "rdstitch.pipeline.stage_tiles": "place_tiles tiles",

@@ -19,7 +19,7 @@ from rdstitch_cli.terminal import Reporter
 if TYPE_CHECKING:
     from rdstitch.inputs.arrivals import Arrivals
     from rdstitch.inputs.frame import Named
-    from rdstitch.pipeline.pose import FollowedPoses
+    from rdstitch.results.pose import FollowedPoses
     from rdstitch.results.registration import Registration
 
 FOLLOWING = flags(

@@ -22,9 +22,9 @@ from rdstitch_cli.terminal import Reporter
 if TYPE_CHECKING:
     from rdstitch.compositing import CompositePlan
     from rdstitch.geometry.camera import Camera
-    from rdstitch.pipeline.recomposition import Recomposition
     from rdstitch.results.registration import Registration
     from rdstitch.results.stitch_result import StitchResult
+    from rdstitch.sidecar.recomposition import Recomposition
 
 STITCHING = [
     *flags_of(StitchOptions, without="odometry"),

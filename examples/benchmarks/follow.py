@@ -24,7 +24,7 @@ from rdstitch.inputs.arrivals import open_arrivals
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.follow import follow
-from rdstitch.pipeline.pose import Pose
+from rdstitch.results.pose import Pose
 from rdstitch.system.process_memory import peak_memory
 
 

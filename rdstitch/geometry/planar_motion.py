@@ -28,6 +28,15 @@ def nearest_rotation(matrices: FloatArray) -> FloatArray:
     return rotation
 
 
+def rotation_about(vectors: FloatArray, angles: FloatArray) -> FloatArray:
+    """Rotations (N, 3, 3) about vectors (N, 3) by angles (N,), their lengths, radians (Rodrigues)."""
+    cross = np.einsum("nk,kij->nij", vectors, np.stack([ABOUT_X, ABOUT_Y, ABOUT_Z]))
+    first = np.sinc(angles / np.pi)[:, None, None]
+    second = 0.5 * np.sinc(angles / (2.0 * np.pi))[:, None, None] ** 2
+    rotation: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
+    return rotation
+
+
 def rotation_from_tilt(tilt: ArrayLike) -> FloatArray:
     """``R = Rx(ψ) Ry(θ)`` for tilts (ψ, θ) of shape (..., 2), radians; shape (..., 3, 3)."""
     angles = np.asarray(tilt, dtype=np.float64)

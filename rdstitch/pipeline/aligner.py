@@ -1,6 +1,5 @@
 """Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Self
@@ -10,12 +9,9 @@ import numpy as np
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, GivenImages, most_matches_read
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
-from rdstitch.alignment.least_squares.plane_marks import Sighting
-from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
-from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
+from rdstitch.errors import ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.measurements import metres_around_median, positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import loop_closures
 from rdstitch.matching.copies import copies_of, distinct
@@ -23,12 +19,12 @@ from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.pipeline.alignment_inputs import alignment_options, sightings
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.robust.loss import sigma_of
 from rdstitch.system.cache import Cache
 from rdstitch.system.dataclasses import dataclass, replace
-from rdstitch.system.file_access import canonical_name
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.verification.limits import Limits
 
@@ -96,7 +92,7 @@ class Aligner:
         paths = tuple(str(source.path) for source in sources)
         megapixels = options.features.for_images(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
-        control = _sightings(sources, cameras)
+        control = sightings(sources, cameras)
         decided = replace(alignment_options(sources, options), purpose=purpose, control=control)
         return cls(paths, cameras, decided, cache, options.threshold, quarters=QuarterTurns.of(sources))
 
@@ -256,63 +252,6 @@ def reselect_inliers(
         if inliers.sum() >= _MIN_KEPT * relation.inliers.sum():
             result[k] = replace(pairs[k], relation=replace(relation, inliers=inliers))
     return result
-
-
-def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
-    """What is decided or known beforehand of images as the camera stored them.
-
-    Measured attitudes that are not exact leave the mount's tilt open.
-    """
-    quarters = QuarterTurns.of(sources)
-    measured = [source.attitude for source in sources if source.attitude is not None]
-    attitudes = [attitude.tilt for attitude in measured]
-    delayed = [attitude.by_delay for attitude in measured if attitude.by_delay is not None]
-    timed = delayed and len(delayed) == len(sources) and set(quarters.back) == {1}
-    exact = bool(attitudes) and options.attitude_std == 0.0
-    places = [source.metadata.gps for source in sources]
-    return AlignmentOptions(
-        reference=_reference(sources, options.reference),
-        model=options.model,
-        lens=options.lens,
-        lens_known=options.known_distortion is not None,
-        tilt=options.tilt or ((0.0, 0.0) if exact else None),
-        attitudes=quarters.stored_tilts(np.array(attitudes)) if attitudes else None,
-        delayed_attitudes=np.array(delayed) if timed else None,
-        attitudes_std=options.attitude_std,
-        gravity=_gravity(sources, quarters),
-        positions=positions_of(sources) if sources else None,
-        positions_std=[math.nan if p is None or p.std is None else p.std[0] for p in places] or None,
-        pose_covariance=options.pose_covariance,
-    )
-
-
-def _sightings(sources: Sequence[Source], cameras: Sequence[Camera]) -> tuple[Sighting, ...]:
-    """Ground control points in the images as the camera stored them, of the size that features are detected at."""
-    shown = [(k, point) for k, source in enumerate(sources) for point in source.control if not point.check]
-    metres = metres_around_median([point.place for _, point in shown])
-    sightings, quarters = [], QuarterTurns.of(sources)
-    for (k, point), (east, north) in zip(shown, metres.tolist(), strict=True):
-        x, y = quarters.stored_point(sources[k].camera.normalize(point.pixel) * cameras[k].scale, k).tolist()
-        sightings.append(Sighting(k, (x, y), point.name, (east, north), point.std))
-    return tuple(sightings)
-
-
-def _gravity(sources: Sequence[Source], quarters: QuarterTurns) -> FloatArray | None:
-    """Direction down in the axes of each camera, (N, 3), by its attitude or its XMP; None where all lack both."""
-    known = [source.down for source in sources]
-    if all(down is None for down in known):
-        return None
-    directions = np.array([(np.nan,) * 3 if down is None else down for down in known])
-    return quarters.stored_directions(directions)
-
-
-def _reference(sources: Sequence[Source], name: str | None) -> int | None:
-    if name is None:
-        return None
-    for index, source in enumerate(sources):
-        if canonical_name(name) in (source.name, canonical_name(source.path)):
-            return index
-    raise ArgumentError(f"the reference image {name!r} is not among the input images")
 
 
 def _no_overlap(paths: Sequence[str], pairs: Sequence[PairRegistration]) -> str:

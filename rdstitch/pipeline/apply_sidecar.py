@@ -14,19 +14,19 @@ from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.matching.band_lens import BandLens, band_lens
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.band_lens import BandLens, band_lens
 from rdstitch.pipeline.compose import Layout, check_world_files, compose_images, image_files
-from rdstitch.pipeline.counterparts import registered_files
 from rdstitch.pipeline.deep_zoom_page import plainly_viewed, write_page
-from rdstitch.pipeline.placed_images import PlacedImages, SavedGrid
-from rdstitch.pipeline.recomposition import Recomposition
 from rdstitch.pipeline.replacements import Replacements, read_replacements
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.straighten import reoriented
 from rdstitch.results.messages import Message
+from rdstitch.results.placed_images import PlacedImages, SavedGrid
+from rdstitch.sidecar.counterparts import registered_files
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
+from rdstitch.sidecar.recomposition import Recomposition
 from rdstitch.sidecar.write_applied import applied_sidecar
 from rdstitch.stage.tile_frames import with_position_folders
 from rdstitch.system.native_threads import one_native_thread
@@ -146,7 +146,6 @@ def apply_found(
         sources=tuple(map(sources.get, range(len(saved.images)))),
         matched=given.matched,
         left_out=given.left_out,
-        placed=layout.placed,
         messages=(*given.messages, *of_layout, *listed.messages, *run.guard.messages, *of_output),
         **composed.fields,
     )

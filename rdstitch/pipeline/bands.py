@@ -24,11 +24,11 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply_found, apply_run
 from rdstitch.pipeline.read_inputs import with_camera_read
 from rdstitch.pipeline.recipes import stitch_found
-from rdstitch.pipeline.recomposition import Recomposition
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.read import read_sidecar
+from rdstitch.sidecar.recomposition import Recomposition
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_outputs
 from rdstitch.system.progress import Progress, StageTimer, silent

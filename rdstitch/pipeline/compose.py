@@ -29,21 +29,21 @@ from rdstitch.io.formats import check_memory, check_size
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.options.upright_options import Corners
-from rdstitch.pipeline.compose_messages import (
+from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
+from rdstitch.pipeline.run import Run
+from rdstitch.results.messages import Message
+from rdstitch.results.placed_images import PlacedImages
+from rdstitch.results.stitch_result import OutputImage
+from rdstitch.system.dataclasses import dataclass, replace
+from rdstitch.system.outputs import Outputs, check_outputs, text_bytes
+from rdstitch.system.process_memory import return_freed_memory
+from rdstitch.verification.output_messages import (
     cut_away_messages,
     differing_profile_messages,
     lost_profile_messages,
     masked_messages,
     seam_messages,
 )
-from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
-from rdstitch.pipeline.placed_images import PlacedImages
-from rdstitch.pipeline.run import Run
-from rdstitch.results.messages import Message
-from rdstitch.results.stitch_result import OutputImage
-from rdstitch.system.dataclasses import dataclass, replace
-from rdstitch.system.outputs import Outputs, check_outputs, text_bytes
-from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.viewer.page import viewer_path
 
 
@@ -99,6 +99,7 @@ def compose_images(
         check_size(output, canvas.size)
         check_memory(output, canvas.size, options.max_memory)
     composed = OutputImage(
+        placed=placed,
         canvas=canvas,
         options=run.options,
         output=None if output is None else Path(output),

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +10,8 @@ from numpy.typing import NDArray
 from rdstitch.compositing.tables import CompositeTables
 from rdstitch.inputs.frame import to_channel_order
 from rdstitch.options.composite_options import Interpolation
-from rdstitch.pipeline.placed_images import PlacedImages
-from rdstitch.results.stitch_result import StitchResult
+from rdstitch.results.stitch_result import OutputImage
 from rdstitch.system.native_threads import one_native_thread
-
-if TYPE_CHECKING:
-    from rdstitch.pipeline.recomposition import Recomposition
 
 
 class Composer:
@@ -54,8 +50,8 @@ class Composer:
     """
 
     @one_native_thread()
-    def __init__(self, result: "StitchResult | Recomposition", interpolation: Interpolation = "linear") -> None:
-        placed, options = placed_by(result), replace(result.options.composite, interpolation=interpolation)
+    def __init__(self, result: OutputImage, interpolation: Interpolation = "linear") -> None:
+        placed, options = result.placed, replace(result.options.composite, interpolation=interpolation)
         images = placed.images(result.canvas.near)
         self.names = tuple(source.name for source in placed.sources)
         self._tables, self._order = CompositeTables.of(images, result.canvas, options), result.options.channel_order
@@ -81,10 +77,3 @@ class Composer:
         return to_channel_order(
             self._tables.compose([to_channel_order(image, self._order) for image in given]), self._order
         )
-
-
-def placed_by(result: "StitchResult | Recomposition") -> PlacedImages:
-    """The images of a result in their places."""
-    if isinstance(result, StitchResult):
-        return PlacedImages.of(result.registration, result.local_alignment.fields or None)
-    return result.placed

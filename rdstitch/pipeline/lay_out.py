@@ -6,9 +6,9 @@ from rdstitch.compositing.projection import PLANE
 from rdstitch.local_alignment import LocalAlignment
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.pipeline.compose import Layout
-from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.straighten import oriented
 from rdstitch.results.messages import Message
+from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration
 from rdstitch.system.dataclasses import dataclass, replace
 

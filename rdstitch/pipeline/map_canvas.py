@@ -14,8 +14,8 @@ from rdstitch.export.map_grid import MapGrid, grid_of_extent, read_grid
 from rdstitch.export.place_on_map import MIN_POSITIONS, has_place, place_on_map
 from rdstitch.geometry.crs import Crs
 from rdstitch.inputs.source import Source
-from rdstitch.pipeline.placed_images import PlacedImages, plan
 from rdstitch.results.messages import MAX_NAMED, Message
+from rdstitch.results.placed_images import PlacedImages, plan
 
 
 def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:

@@ -4,10 +4,11 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
+from rdstitch.export.layers import layer_files, make_folder, write_layers
+from rdstitch.export.map_server import check_map_server, map_files, write_map
+from rdstitch.export.poses_of_result import poses_file
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.pipeline.compose import image_files
-from rdstitch.pipeline.map_server import check_map_server, map_files, write_map
-from rdstitch.pipeline.result_files import layer_files, make_folder, poses_file, write_layers
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration

@@ -6,14 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray, evenly_spaced
-from rdstitch.errors import ArgumentError, LimitError
-from rdstitch.features.line_segments import MEGAPIXELS, line_segments
-from rdstitch.geometry.planar_motion import nearest_rotation
-from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.options.upright_options import UprightOptions
-from rdstitch.pipeline.placed_images import PlacedImages, plan
-from rdstitch.pipeline.vanishing_points import (
+from rdstitch.alignment.frames.vanishing_points import (
     Edges,
     Focal,
     Upright,
@@ -24,7 +17,14 @@ from rdstitch.pipeline.vanishing_points import (
     rotation,
     to_axes,
 )
+from rdstitch.arrays import FloatArray, evenly_spaced
+from rdstitch.errors import ArgumentError, LimitError
+from rdstitch.features.line_segments import MEGAPIXELS, line_segments
+from rdstitch.geometry.planar_motion import nearest_rotation
+from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.options.upright_options import UprightOptions
 from rdstitch.results.messages import Message
+from rdstitch.results.placed_images import PlacedImages, plan
 
 _MAX_IMAGES = 40
 _MIN_LENGTH = 0.03  # of an edge, half diagonals

@@ -13,6 +13,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import ChannelOrder, Framing, ImageFormat
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedImage, compose
 from rdstitch.errors import ArgumentError, OutputError
+from rdstitch.export.layers import make_folder
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Images, as_inputs, to_channel_order
@@ -20,7 +21,6 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
-from rdstitch.pipeline.result_files import make_folder
 from rdstitch.results.messages import Message, ignored
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import WRITABLE_SUFFIXES, check_outputs, file_name

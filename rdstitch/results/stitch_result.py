@@ -18,6 +18,7 @@ from rdstitch.io.read import read_image
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message
+from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration, Verdict
 from rdstitch.system.outputs import Fingerprint
 
@@ -30,8 +31,10 @@ class OutputImage:
 
     Attributes
     ----------
+    placed : PlacedImages
+        The images that are in the output.
     canvas : Canvas
-        Where the images lie in the output.
+        Where they lie in it.
     options : StitchOptions
     output : Path or None
         File that the image was written to.
@@ -49,6 +52,7 @@ class OutputImage:
         Where seams hold and where they break; empty without seams.
     """
 
+    placed: PlacedImages
     canvas: Canvas
     options: StitchOptions
     output: Path | None = None

@@ -66,8 +66,8 @@ def trajectory(
     """
     from rdstitch.export.trajectory_files import frame_of
     from rdstitch.pipeline.along_odometry import with_odometry_of_bag
-    from rdstitch.pipeline.pose import FollowedPoses
     from rdstitch.pipeline.recipes import trajectory as recipe
+    from rdstitch.results.pose import FollowedPoses
 
     options = stitch_options(reporter, given)
     with ExitStack() as stack:

@@ -11,7 +11,7 @@ import numpy as np
 
 from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel
 from rdstitch.arrays import FloatArray
-from rdstitch.geometry.planar_motion import nearest_rotation
+from rdstitch.geometry.planar_motion import ABOUT_X, ABOUT_Y, ABOUT_Z, nearest_rotation, rotation_about
 
 _FOCAL_STARTS = tuple(math.log(focal) for focal in (0.6, 0.9, 1.4, 2.2, 3.6, 6.0))
 """Logarithms of focal lengths in half diagonals: from fisheyes to long lenses, near enough to each other that the
@@ -20,9 +20,7 @@ adjustment of pairs converges from the nearest."""
 _MAX_STEP = 0.5  # radians; where the motion is no rotation, steps may diverge
 _LOG_FOCAL_LIMITS = math.log(0.2), math.log(50.0)
 
-_CROSS = np.zeros((3, 3, 3))
-_CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = 1.0
-_CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = -1.0
+_CROSS = np.stack([ABOUT_X, ABOUT_Y, ABOUT_Z])
 
 
 class RotationModel(MotionModel):
@@ -37,7 +35,7 @@ class RotationModel(MotionModel):
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
         """Matrices from directions to the images, with derivatives."""
         rotations = poses.reshape(-1, 3, 3)
-        focal = _focal(shared)
+        focal = self.focal(shared)
         scale = np.array([[focal], [focal], [1.0]])
         matrices = scale * rotations
         by_pose = scale * (_CROSS @ rotations[:, None])
@@ -48,6 +46,10 @@ class RotationModel(MotionModel):
         """The focal length that is known, and a range of others."""
         return [np.array([each]) for each in (log_focal, *_FOCAL_STARTS)]
 
+    def focal(self, shared: FloatArray) -> float:
+        """Focal length, half diagonals, within what a lens can have."""
+        return float(np.exp(np.clip(shared[0], *_LOG_FOCAL_LIMITS)))
+
     def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, 3), radians."""
         turned: FloatArray = rotation_from_vector(step) @ poses.reshape(-1, 3, 3)
@@ -55,12 +57,12 @@ class RotationModel(MotionModel):
 
     def nominal_homographies(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """``diag(f, f, 1)``."""
-        focal = _focal(shared)
+        focal = self.focal(shared)
         return np.tile(np.diag([focal, focal, 1.0]), (len(attitudes), 1, 1))
 
     def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The nearest rotations."""
-        focal = _focal(shared)
+        focal = self.focal(shared)
         matrices = homographies / np.array([[focal], [focal], [1.0]])
         matrices = matrices * np.sign(np.linalg.det(matrices))[:, None, None]
         return nearest_rotation(matrices).reshape(-1, 9)
@@ -70,21 +72,11 @@ class RotationModel(MotionModel):
         return "the camera turned on the spot"
 
 
-def _focal(shared: FloatArray) -> float:
-    """Focal length, half diagonals, within what a lens can have."""
-    return float(np.exp(np.clip(shared[0], *_LOG_FOCAL_LIMITS)))
-
-
 def rotation_from_vector(vectors: FloatArray) -> FloatArray:
     """Rotations (N, 3, 3) about axes (N, 3) by their length, radians (Rodrigues); long ones are shortened."""
     angle = np.linalg.norm(vectors, axis=1)
     vectors = vectors * np.minimum(1.0, _MAX_STEP / np.maximum(angle, 1e-300))[:, None]
-    angle = np.minimum(angle, _MAX_STEP)
-    cross = np.einsum("nk,kij->nij", vectors, _CROSS)
-    first = np.sinc(angle / np.pi)[:, None, None]
-    second = 0.5 * np.sinc(angle / (2.0 * np.pi))[:, None, None] ** 2
-    rotation: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
-    return rotation
+    return rotation_about(vectors, np.minimum(angle, _MAX_STEP))
 
 
 ROTATION = RotationModel()

@@ -17,6 +17,7 @@ from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.export.georeference import Georeference, world_file_paths
 from rdstitch.export.georeference_text import map_summary
 from rdstitch.export.place_on_map import Located, place_on_map
+from rdstitch.export.poses_of_result import poses_file, poses_table
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.places import GpsPosition, GroundControl
@@ -26,7 +27,6 @@ from rdstitch.io import ImageSpec, write_strips
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.pipeline.result_files import poses_file, poses_table
 from rdstitch.report import report_page
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.robust.similarity_fit import fit_similarity

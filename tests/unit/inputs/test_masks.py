@@ -13,6 +13,7 @@ from PIL import Image
 import rdstitch
 from examples.judging import registration_error
 from rdstitch.errors import InputError
+from rdstitch.features.image_circle import find_circle
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import SIDEWAYS, turned, turned_size
 from rdstitch.inputs.find import find_images
@@ -22,7 +23,7 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import DecodedImage, read_image
 from rdstitch.io.mask import Mask, mask_frame, read_mask
 from rdstitch.io.metadata import Metadata
-from rdstitch.pipeline.image_circle import find_circle, with_image_circle
+from rdstitch.pipeline.image_circle import with_image_circle
 from rdstitch.synthetic import FisheyeLens, grid_poses, ground, sequence_over
 from rdstitch.system.cache import Cache
 

@@ -16,14 +16,14 @@ from rdstitch.io import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.choose_layout import _error, choose_layout
 from rdstitch.pipeline.compose import Layout
-from rdstitch.pipeline.compose_messages import seam_messages
 from rdstitch.pipeline.lay_out import is_stretched
-from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.realign import aligner_of, by_second_motions
 from rdstitch.pipeline.recipes import mosaic, pano
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.run import Run
+from rdstitch.results.placed_images import PlacedImages
 from rdstitch.synthetic.textures import ground
+from rdstitch.verification.output_messages import seam_messages
 from tests.registrations import CAMERA, source
 
 

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rdstitch.inputs.source import Source
-from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.sidecar.read import SavedRegistration
@@ -24,8 +23,6 @@ class Recomposition(OutputImage):
         "name", "time", "position" or "order".
     left_out : dict of int to Message
         Images that the registration used and that are not in the output, by their number, with the reason.
-    placed : PlacedImages
-        Those that are in the output.
     messages : tuple of Message
         What the user should know of the compositing, and of the sidecar.
     """
@@ -34,7 +31,6 @@ class Recomposition(OutputImage):
     sources: tuple[Source | None, ...]
     matched: MatchedBy
     left_out: Mapping[int, Message]
-    placed: PlacedImages
     messages: tuple[Message, ...] = ()
 
     @property

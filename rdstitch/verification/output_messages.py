@@ -8,8 +8,8 @@ from rdstitch.compositing.projection import PLANE
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
-from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened
+from rdstitch.results.placed_images import PlacedImages
 
 _VISIBLE_CUT = 0.02  # share of the images that is cut away, from which on a note says so
 

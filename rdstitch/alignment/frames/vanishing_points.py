@@ -11,13 +11,12 @@ length in half diagonals, ``diag(1, 1, f) x`` is the direction in those axes. Li
 import math
 from typing import Self
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
-from rdstitch.geometry.planar_motion import nearest_rotation
+from rdstitch.geometry.planar_motion import nearest_rotation, rotation_about
 from rdstitch.robust.chance import binomial_tail
 from rdstitch.system.dataclasses import dataclass, replace
 
@@ -193,7 +192,9 @@ def of_edges(edges: Edges, axis: IntArray, start: FloatArray, focal: Focal, firs
 
 def rotation(vector: ArrayLike) -> FloatArray:
     """Rotation (3, 3) about an axis (3,), by its length in radians."""
-    return np.asarray(cv2.Rodrigues(np.asarray(vector, dtype=np.float64))[0], dtype=np.float64)
+    about = np.atleast_2d(np.asarray(vector, dtype=np.float64))
+    matrix: FloatArray = rotation_about(about, np.linalg.norm(about, axis=1))[0]
+    return matrix
 
 
 def nearest_axis(edges: Edges, axes: FloatArray, focal: float) -> IntArray:

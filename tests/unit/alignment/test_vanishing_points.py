@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from examples.worlds.turns import camera_rotations
+from rdstitch.alignment.frames.vanishing_points import Edges, Focal, nearest_axis, of_edges, of_rectangle, of_scene
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.pipeline import straighten
-from rdstitch.pipeline.placed_images import PlacedImages
-from rdstitch.pipeline.vanishing_points import Edges, Focal, nearest_axis, of_edges, of_rectangle, of_scene
+from rdstitch.results.placed_images import PlacedImages
 from tests.registrations import source
 
 FOCAL, PIXEL = 1.3, 1.0 / 600.0

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from typing import Self
 
@@ -10,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, evenly_spaced
-from rdstitch.choices import LocalAlignmentMode
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.compositing.near_part import NearPart
 from rdstitch.compositing.source_images import Displacement, PlacedImage
@@ -18,67 +16,17 @@ from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference
 from rdstitch.export.place_on_map import Located, has_place
-from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.source import Source
 from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
-from rdstitch.local_alignment import LocalAlignment, Match, align_locally, no_local_alignment
-from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.system.dataclasses import dataclass, field, replace
 
 _COMPARED, _COMPARED_SIDE = 8, 400
 """Images, and pixels of their longer side, that are compared to find what is static in them."""
-
-
-def straight_edges(source: Source) -> FloatArray:
-    """Ends (N, 2, 2) of the straight edges in an image, pixels."""
-    return line_segments(source.view(MEGAPIXELS))[0]
-
-
-def align_registration_locally(
-    registration: Registration,
-    choice: LocalAlignmentMode,
-    edges: Callable[[int], FloatArray] | None = None,
-    threads: int = 1,
-) -> LocalAlignment:
-    """Displacement fields of the images that are used, in their order, from the matches of all their pairs.
-
-    The registration is in pixels of the images; ``edges`` are those of an image that fields should not bend, looked for
-    in so many images at a time.
-    """
-    if choice == "off":
-        return no_local_alignment("switched off")
-    alignment = registration.alignment
-    position = np.cumsum(alignment.used) - 1
-    pairs = [
-        pair
-        for pair in registration.pairs
-        if pair.relation and alignment.used[pair.image1] and alignment.used[pair.image2]
-    ]
-
-    def match(pair: PairRegistration) -> Match:
-        found = pair.correspondences
-        return Match(int(position[pair.image1]), int(position[pair.image2]), found.points1, found.points2)
-
-    def edges_of(images: list[int]) -> list[FloatArray]:
-        with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(edges or (lambda k: straight_edges(registration.sources[k])), used[images].tolist()))
-
-    cameras = [camera for camera, used in zip(alignment.cameras, alignment.used, strict=True) if used]
-    used = np.flatnonzero(alignment.used)
-    return align_locally(
-        map(match, pairs),
-        cameras,
-        alignment.homographies[alignment.used],
-        choice,
-        pairs=len(pairs),
-        on_sphere=alignment.on_sphere,
-        edges=edges_of,
-    )
 
 
 @dataclass(frozen=True, eq=False)
