@@ -1,7 +1,6 @@
 """What all stages of one run have in common."""
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from rdstitch.choices import Purpose
@@ -9,6 +8,7 @@ from rdstitch.executors import open_executor
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.system.dataclasses import dataclass, field
 from rdstitch.system.progress import StageTimer
 
 
