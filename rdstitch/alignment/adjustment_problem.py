@@ -41,7 +41,7 @@ class Fit:
     model: MotionModel
     adjusted: BundleAdjustmentResult
     free_lens: BoolArray  # (5,): lens parameters that were estimated
-    tilt_spread: float = 0.0  # standard deviation of the images' own tilts, radians; 0 where the model has none
+    tilt_spread: float | None = None  # standard deviation of the images' own tilts, radians; None without such
     # of the errors that it leaves, at least that of the problem; see BundleAdjuster
     overdispersion: float = 1.0
 
@@ -112,7 +112,7 @@ class Problem:
         """
         measured = self.camera_priors.attitudes_std
         if self._estimates_tilt_spread(model):
-            spread = tilt_spread or _TILT_SPREAD_START
+            spread = _TILT_SPREAD_START if tilt_spread is None else tilt_spread
         else:
             spread = POSE_TILT_SPREAD if model.any_tilt and measured is None else measured or 0.0
         scales, at = _Scales(spread, self.overdispersion), start
@@ -120,7 +120,7 @@ class Problem:
             adjusted = self.adjuster(model, scales.tilt_spread, at.shared, scales.overdispersion).run(at, rough=True)
             scales, changed = self._rescaled(scales, adjusted, rounds)
             if not changed:
-                own_tilts = scales.tilt_spread if model.free_tilts else 0.0
+                own_tilts = scales.tilt_spread if model.free_tilts else None
                 return Fit(model, adjusted, self.free_lens, own_tilts, scales.overdispersion)
             at = adjusted.parameters
         raise AssertionError("scales settle")
@@ -158,16 +158,17 @@ class Problem:
 
     def adjuster_of(self, fit: Fit) -> BundleAdjuster:
         """Of a fit, with the priors on it."""
-        return self.adjuster(fit.model, fit.tilt_spread or 1.0, fit.adjusted.parameters.shared, fit.overdispersion)
+        return self.adjuster(fit.model, fit.tilt_spread, fit.adjusted.parameters.shared, fit.overdispersion)
 
     def adjuster(
         self,
         model: MotionModel,
-        tilt_spread: float = _TILT_SPREAD_START,
+        tilt_spread: float | None = None,
         shared: FloatArray | None = None,
         overdispersion: float | None = None,
     ) -> BundleAdjuster:
         """Of one model, with the priors on it; those of tilts as they show with the ``shared`` parameters."""
+        tilt_spread = _TILT_SPREAD_START if tilt_spread is None else tilt_spread
         references = [self.reference] if self.camera_priors.fix_frame else []
         freedom = FreeParameters.fixing(model, self.count, references, self.free_lens)
         log_focal = None if shared is None or not len(shared) else float(shared[-1])

@@ -45,6 +45,8 @@ _MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 500_000, 40
 _ROUNDS = 3
 """Rounds of rejecting wrong pairs and adjusting again."""
 
+_REFERENCE_LEFT_OUT = Message("the reference image that was named is not among those aligned; another one is taken")
+
 
 def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions | None = None) -> Alignment:
     """Align all images over one plane.
@@ -75,13 +77,13 @@ class AlignmentTask:
 
     @cached_property
     def draft(self) -> Alignment:
-        """Model, lens and poses by a few matches of each link; deviations are those of independent errors."""
+        """Model, lens and poses by a few matches of each link; deviations are those of the normal equations."""
         return build_alignment(self._selected)
 
     @cached_property
     def result(self) -> Alignment:
         """Adjusted to all matches."""
-        return build_alignment(_checked_focal(_adjusted(self._selected), self.given.options))
+        return _with_checked_focal(_adjusted(self._selected), self.given.options)
 
     @cached_property
     def _selected(self) -> AdjustedImages:
@@ -111,7 +113,7 @@ def _lens_and_model(task: GivenImages) -> AdjustedImages:
     problem, images = all_links.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
-    problem = replace(problem, overdispersion=shared)
+    all_links, problem = (replace(one, overdispersion=shared) for one in (all_links, problem))
     if (contradiction := check_attitudes(problem, options)) is not None:
         better_options, message = contradiction
         without = _lens_and_model(replace(task, options=better_options))
@@ -123,7 +125,8 @@ def _lens_and_model(task: GivenImages) -> AdjustedImages:
     free = choice.fit.free_lens
     all_links = replace(all_links, observations=all_matches, free_lens=free, min_gain=MIN_GAIN)
     problem, refined = replace(problem, free_lens=free), lens.refined(free)
-    return AdjustedImages(task, images, ~wrong, all_links, problem, choice, refined)
+    unused = () if options.reference is None or options.reference in images else (_REFERENCE_LEFT_OUT,)
+    return AdjustedImages(task, images, ~wrong, all_links, problem, choice, refined, messages=unused)
 
 
 def _problem_of_all_links(
@@ -180,10 +183,10 @@ def from_another_start(problem: Problem, fit: Fit) -> Fit:
     return min((fit, fit_model(problem, fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
 
 
-def _checked_focal(adjusted: AdjustedImages, given: AlignmentOptions) -> AdjustedImages:
-    """Without the focal length that was given, where it gave way and the images by themselves show another one."""
+def _with_checked_focal(adjusted: AdjustedImages, given: AlignmentOptions) -> Alignment:
+    """The alignment; without a given focal length that gave way where the images by themselves show another one."""
     if adjusted.covariance is None or not is_strained(adjusted.all_links.camera_priors, adjusted.choice.fit):
-        return adjusted
+        return build_alignment(adjusted)
     task = adjusted.given
     cameras = [camera.without_focal().with_focal() for camera in task.cameras]
     # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
@@ -199,9 +202,11 @@ def _checked_focal(adjusted: AdjustedImages, given: AlignmentOptions) -> Adjuste
         # What seemed to be wrong may have been so with the wrong focal length only.
         if contradiction is not None and options is not given:
             free, contradiction = by_themselves(given)
+        if contradiction is not None:
+            return build_alignment(replace(free, messages=(*free.messages, contradiction)))
     except (RegistrationError, ImpossibleCameraError, np.linalg.LinAlgError):
-        return adjusted  # by themselves the images determine nothing
-    return adjusted if contradiction is None else replace(free, messages=(*free.messages, contradiction))
+        pass  # by themselves the images determine nothing
+    return build_alignment(adjusted)
 
 
 def most_matches_read(links: int, options: AlignmentOptions) -> int | None:
@@ -263,6 +268,8 @@ def _drop_wrong_pairs(
         judged[inside] = misfitting_links(
             between_images.squared(model, adjusted.parameters), between_images.observations
         )
+        if judged[inside].all():
+            raise RegistrationError("the pairs do not agree on where the images lie; add images with more overlap")
         if (judged == wrong).all():
             break
         wrong = judged

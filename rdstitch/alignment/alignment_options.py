@@ -1,5 +1,6 @@
 """What the caller of the alignment decides, and what is given of the camera and the images."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args
@@ -37,14 +38,17 @@ class AlignmentOptions:
     lens: str = "auto"  # one of :data:`rdstitch.choices.LensName`; "auto": the simplest that the data allow
     purpose: Purpose = Purpose.MOSAIC
     pose_covariance: bool = False  # its time grows with the square of the number of images
-    max_matches_per_link: int = 250  # correspondences used of each link; fewer where there are thousands of links
+    # correspondences used of each link; fewer of thousands of links, more of the few of a turn on the spot
+    max_matches_per_link: int = 250
 
     def __post_init__(self) -> None:
         for name, choices in (("model", get_args(ModelName)), ("lens", get_args(LensName))):
             if getattr(self, name) not in choices:
                 raise ArgumentError(f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}")
-        if self.attitudes_std < 0:
-            raise ArgumentError("a standard deviation cannot be negative")
+        if not 0.0 <= self.attitudes_std < math.inf:
+            raise ArgumentError(f"attitudes_std must be a standard deviation in radians, not {self.attitudes_std}")
+        if self.max_matches_per_link < 1:
+            raise ArgumentError("max_matches_per_link must be at least 1")
 
     def exact_tilts(self, count: int) -> list[tuple[float, float]] | None:
         """(ψ, θ), radians, of each of ``count`` images, where they are known exactly; None where not."""
@@ -56,23 +60,22 @@ class AlignmentOptions:
     def camera_priors(self, cameras: Sequence[Camera]) -> CameraPriors:
         """As the adjustment needs it."""
         count = len(cameras)
-        attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
-        if attitudes.shape != (count, 2) or not np.isfinite(attitudes).all():
-            raise ArgumentError(f"expected one attitude (psi, theta) for each of the {count} images")
-        positions = (
-            np.full((count, 2), np.nan) if self.positions is None else np.asarray(self.positions, dtype=np.float64)
-        )
-        if positions.shape != (count, 2):
-            raise ArgumentError(f"expected one position (east, north) for each of the {count} images")
+        attitudes = _of_images("attitudes", self.attitudes, (count, 2), missing=0.0)
+        if not np.isfinite([*attitudes.ravel(), *(self.tilt or ())]).all():
+            raise ArgumentError("expected finite angles (psi, theta) of every image, and as tilt")
+        _of_images("gravity", self.gravity, (count, 3))
+        positions_std = _of_images("positions_std", self.positions_std, (count,))
+        if (positions_std <= 0.0).any():
+            raise ArgumentError("a standard deviation of a position must be positive, or NaN where it is not known")
         return CameraPriors(
             *known_focal(cameras),
             tilt=self.tilt or (0.0, 0.0),
             tilt_known=self.tilt is not None,
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
-            positions=positions,
+            positions=_of_images("positions", self.positions, (count, 2)),
             delayed_attitudes=self.delayed_attitudes,
-            positions_std=np.full(count, np.nan) if self.positions_std is None else np.asarray(self.positions_std),
+            positions_std=positions_std,
             control=ControlPoints.of(self.control, cameras),
         )
 
@@ -93,3 +96,11 @@ class AlignmentOptions:
         inexact = measured and not exact
         without = {"rigid": inexact, "similarity": inexact, "tilting": exact, "pose": measured}
         return [name for name in MODELS if not without.get(name, False)]
+
+
+def _of_images(name: str, given: ArrayLike | None, shape: tuple[int, ...], missing: float = math.nan) -> FloatArray:
+    """What is given of each image, of this shape; ``missing`` where nothing is."""
+    values = np.full(shape, missing) if given is None else np.asarray(given, dtype=np.float64)
+    if values.shape != shape:
+        raise ArgumentError(f"{name} must have the shape {shape}, one row for each image, not {values.shape}")
+    return values

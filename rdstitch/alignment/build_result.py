@@ -45,7 +45,7 @@ _CONFIDENT = 2.0
 def build_alignment(adjustment: AdjustedImages) -> Alignment:
     """The alignment, in the frame of the reference image.
 
-    A draft, which has no covariances, has the deviations of independent errors.
+    A draft, which has no covariances, has the deviations of the normal equations.
     """
     problem, fit, given = adjustment.problem, adjustment.choice.fit, adjustment.given
     agreement = _Agreement.of(adjustment)
@@ -65,7 +65,7 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
         model=fit.model.name,
         model_reason=adjustment.choice.reason,
         poses=poses,
-        tilt_spread=fit.tilt_spread,
+        tilt_spread=fit.tilt_spread or 0.0,
         lens=adjustment.lens.name,
         lens_reason=adjustment.lens.reason,
         parameters=uncertainty.names,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster
-from rdstitch.alignment.least_squares.plane_marks import PlaneMarks
+from rdstitch.alignment.least_squares.plane_marks import ControlPoints, PlaneMarks
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.motion_models import X, Y
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
@@ -153,31 +153,27 @@ class _Control(_KnownPlaces):
     least, name = _MIN_CONTROL, "ground control points"
 
     def __init__(self, problem: Problem, fit: Fit) -> None:
-        self.points = known = problem.camera_priors.control
+        given = problem.camera_priors.control
+        shown = np.flatnonzero(np.isfinite(_sightings(given, fit)).all(axis=1))
+        self.points = known = given.subset(shown)
         self.metres = known.places @ np.array([1.0, -1.0j])
         self.count = np.bincount(known.point, minlength=len(known.names))
         self.std = known.std
         if len(self.metres) >= self.least:
             places = self.estimated(fit)
-            usable = np.isfinite(places)
-            pixel = np.bincount(known.point, known.pixel) / np.maximum(self.count, 1)
-            scale = abs(fit_similarity(places[usable], self.metres[usable], 0.0).scale) if usable.sum() > 1 else 1.0
-            self.std = np.hypot(known.std, _CLICK * pixel * scale)
+            pixel = np.bincount(known.point, known.pixel) / self.count
+            self.std = np.hypot(known.std, _CLICK * pixel * abs(fit_similarity(places, self.metres, 0.0).scale))
 
     def marks(self, target: FloatArray, precision: FloatArray) -> PlaneMarks:
         known = self.points
         # What a point is off by is the same in all images that show it.
-        shared = (precision / np.maximum(self.count, 1))[known.point]
+        shared = (precision / self.count)[known.point]
         return PlaneMarks(known.image, known.points, target[known.point], shared)
 
     def estimated(self, fit: Fit) -> ComplexArray:
-        adjusted = fit.adjusted
         sums = np.zeros((len(self.metres), 2))
-        focal = fit.model.focal(adjusted.parameters.shared)
-        marks = self.marks(sums, np.zeros(len(sums)))
-        sightings = marks.places(adjusted.matrices.matrices, adjusted.parameters.lens, focal)
-        np.add.at(sums, self.points.point, sightings)
-        means: ComplexArray = (sums / np.maximum(self.count, 1)[:, None]) @ _COMPLEX
+        np.add.at(sums, self.points.point, _sightings(self.points, fit))
+        means: ComplexArray = (sums / self.count[:, None]) @ _COMPLEX
         return means
 
     def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
@@ -194,6 +190,13 @@ class _Control(_KnownPlaces):
         return self.points.point, self.points.names
 
 
+def _sightings(known: ControlPoints, fit: Fit) -> FloatArray:
+    """Where a fit has each sighting of control points, (M, 2); not finite where no place looks like that."""
+    adjusted, marks = fit.adjusted, PlaneMarks(known.image, known.points, known.points, np.zeros(len(known.image)))
+    focal = fit.model.focal(adjusted.parameters.shared)
+    return marks.places(adjusted.matrices.matrices, adjusted.parameters.lens, focal)
+
+
 def _adjusted(problem: Problem, fit: Fit, known: list[_KnownPlaces]) -> MapFit:
     """The fit with all known places; without them and why, where the images contradict the first kind of them."""
     refined, free_frame = fit, replace(problem.camera_priors, fix_frame=False)
@@ -204,7 +207,7 @@ def _adjusted(problem: Problem, fit: Fit, known: list[_KnownPlaces]) -> MapFit:
             priors, similarity, excess = places.prior_from_map(priors, refined)
             on_map.append((similarity, excess))
         with_map = replace(problem, camera_priors=priors)
-        refined = with_map.refine(fit.model, refined.adjusted.parameters, fit.tilt_spread or None)
+        refined = with_map.refine(fit.model, refined.adjusted.parameters, fit.tilt_spread)
         moved = [
             np.abs(places.estimated(refined) - former).max() * abs(similarity.scale) / (np.median(places.std) * excess)
             for places, former, (similarity, excess) in zip(known, before, on_map, strict=True)

@@ -114,6 +114,17 @@ def _with_length(covariance: FloatArray, place: FloatArray, relative_std: float)
     return covariance if spread <= known else covariance - np.outer(moved, moved) * (1.0 - known / spread) / spread
 
 
+class _Prediction(NamedTuple):
+    """A pose that the odometry predicts from that of another frame."""
+
+    place: complex
+    yaw: float
+    height: float
+    variance: float  # of a coordinate of the place
+    yaw_variance: float
+    row: int  # of the other frame in the path
+
+
 def bridged(path: Trajectory, bodies: Mapping[int, BodyPose], fit: OdometryFit) -> Trajectory:
     """The path with the frames, of these numbers, that have no pose by images, by the odometry from those that have."""
     known = {int(frame): k for k, frame in enumerate(path.frame)}
@@ -121,32 +132,37 @@ def bridged(path: Trajectory, bodies: Mapping[int, BodyPose], fit: OdometryFit) 
     covariances = np.zeros((len(path), 4, 4)) if path.covariance is None else path.covariance
     rows = {n: (places[k], path.yaw[k], path.height[k], covariances[k]) for n, k in known.items()}
     seen = sorted(known.keys() & bodies.keys())
+
+    def prediction(start: int, number: int) -> _Prediction:
+        k, step = known[start], motion_between(bodies[start], bodies[number])
+        place = places[k] + cmath.exp(1j * path.yaw[k]) * fit.camera_motion(step.moved, step.turn)
+        yaw_variance = fit.noise**2 * step.turn_variance
+        variance = fit.noise**2 * step.variance + yaw_variance * abs(step.moved) ** 2
+        return _Prediction(place, path.yaw[k] + step.turn, path.height[k], variance, yaw_variance, k)
+
     for number in bodies.keys() - known.keys():
         ends = [*[n for n in seen if n < number][-1:], *[n for n in seen if n > number][:1]]
-        guesses = []
-        for end in ends:
-            k, step = known[end], motion_between(bodies[end], bodies[number])
-            place = places[k] + cmath.exp(1j * path.yaw[k]) * fit.camera_motion(step.moved, step.turn)
-            turned = fit.noise**2 * step.turn_variance
-            spread = fit.noise**2 * step.variance + turned * abs(step.moved) ** 2
-            guesses.append((place, path.yaw[k] + step.turn, path.height[k], spread, turned, k))
-        if not guesses:
-            continue
-        weights = np.array([1.0 / max(guess[3], 1e-12) for guess in guesses])
-        weights /= weights.sum()
-        place, yaw, height = (
-            sum(weight * guess[j] for weight, guess in zip(weights, guesses, strict=True)) for j in range(3)
-        )
-        nearest, share = guesses[int(np.argmax(weights))], float(weights.max())
-        more = share * np.array([nearest[3], nearest[3], 0.0, nearest[4]])
-        rows[number] = place, yaw, height, covariances[nearest[5]] + np.diag(more)
+        if ends:
+            rows[number] = _combined([prediction(end, number) for end in ends], covariances)
     frame = sorted(rows)
     at, yaw, height, covariance = zip(*(rows[number] for number in frame), strict=True)
     return replace(
         path,
         frame=np.array(frame, dtype=np.intp),
         position=np.stack([np.real(at), -np.imag(at)], axis=1),
-        yaw=np.array(yaw),
+        yaw=np.unwrap(yaw),
         height=np.array(height),
         covariance=None if path.covariance is None else np.array(covariance),
     )
+
+
+def _combined(predictions: Sequence[_Prediction], covariances: FloatArray) -> tuple[complex, float, float, FloatArray]:
+    """Place, yaw, height and covariance (4, 4) by predictions of one frame, whose yaws differ by whole turns."""
+    weights = np.array([1.0 / max(one.variance, 1e-12) for one in predictions])
+    weights /= weights.sum()
+    yaws = np.unwrap([one.yaw for one in predictions])
+    place = complex(weights @ np.array([one.place for one in predictions]))
+    height = float(weights @ np.array([one.height for one in predictions]))
+    best, weight = predictions[int(np.argmax(weights))], float(weights.max())
+    own = weight * np.diag([best.variance, best.variance, 0.0, best.yaw_variance])
+    return place, float(weights @ yaws), height, covariances[best.row] + own

@@ -138,9 +138,8 @@ class Posterior:
         """Score a fit."""
         errors = self.cost(fit.adjusted)
         layout = stretch(fit) if self.purpose.picture else 1.0
-        wide = 0.0
-        if fit.tilt_spread > 0.0:
-            wide = 4.0 * self.problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
+        spread = (fit.tilt_spread or 0.0) / _TYPICAL_TILT_SPREAD
+        wide = 4.0 * self.problem.count * math.log(max(spread, 1.0))
         priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
         score = self.bound(fit.model, errors, fit.free_lens) + wide + priors
         return Hypothesis(fit, score, float(errors.field[0]), layout)

@@ -86,8 +86,7 @@ def prepare(
 ) -> PreparedImage:
     """Make an image ready for detection; see :func:`rdstitch.features.detect.detect` for what it may be."""
     image, mask = view.image, view.mask
-    if image.ndim not in (2, 3) or image.size == 0:
-        raise ArgumentError(f"expected an image of shape (height, width[, bands]), not {image.shape}")
+    _check(image)
     usable = _usable(image, mask)
     if image.ndim == 3 and image.shape[2] > 4:
         image = _grey(image)
@@ -109,6 +108,13 @@ def prepare(
     return PreparedImage(grey, clearance, shrink, view.full_size)
 
 
+def _check(image: PixelArray) -> None:
+    if image.ndim not in (2, 3) or image.size == 0:
+        raise ArgumentError(f"expected an image of shape (height, width[, bands]), not {image.shape}")
+    if image.dtype.kind != "f" and image.dtype not in (np.uint8, np.uint16):
+        raise ArgumentError(f"expected an image of uint8, uint16 or float, not {image.dtype}")
+
+
 def _usable(image: PixelArray, mask: Mask | None) -> NDArray[np.bool_] | None:
     """Combine mask, alpha and finiteness into where features are allowed; None for everywhere."""
     parts: list[NDArray[np.bool_]] = []
@@ -128,8 +134,6 @@ def _grey(image: PixelArray) -> PixelArray:
     """Luminance of grey, grey with alpha, RGB and RGB with alpha; the mean of more bands. float64 counts as float32."""
     if image.dtype.kind == "f":
         image = image.astype(np.float32)
-    elif image.dtype not in (np.uint8, np.uint16):
-        raise ArgumentError(f"expected an image of uint8, uint16 or float, not {image.dtype}")
     if image.ndim == 2:
         return image
     if image.shape[2] < 3:
@@ -142,6 +146,7 @@ def _grey(image: PixelArray) -> PixelArray:
 
 def usual_stretch(view: View) -> Stretch | None:
     """The stretch that uses 8 bits best for one image; None where all of it is masked."""
+    _check(view.image)
     return _stretch(_grey(view.image), _usable(view.image, view.mask))
 
 

@@ -25,6 +25,7 @@ _SIMILAR_DISTANCE = 0.45  # of the median distance between descriptors of an ima
 _MIN_REPETITIONS = 4  # keypoints elsewhere that look the same, of one that repeats itself
 _MAX_KEYPOINTS = 1000  # keypoints that are looked at for that
 _PARTNERS = 6  # likely partners of each keypoint
+_DISTANCES = 2_000_000  # between descriptors, that are computed at a time
 _HYPOTHESES = 400  # motions that are tried, each by one keypoint and one partner
 _REFINED = 4  # of them, the best, that are refined
 _MAX_SCALE = 2.5  # of one image in the other
@@ -137,10 +138,14 @@ def _squared_distances(features1: Features, features2: Features) -> NDArray[np.f
 
 def _partners(features1: Features, features2: Features) -> tuple[IntArray, IntArray, FloatArray]:
     """Keypoints of the first image, each with its likely partners in the second, and how unlike they are."""
-    squared = _squared_distances(features1, features2)
-    nearest = np.argpartition(squared, _PARTNERS, axis=1)[:, :_PARTNERS]
-    distance = np.sqrt(np.take_along_axis(squared, nearest, axis=1).astype(np.float64)).ravel()
-    keypoint, partner = np.repeat(np.arange(len(features1)), _PARTNERS), nearest.ravel()
+    shape, rows = (len(features1), _PARTNERS), max(1, _DISTANCES // len(features2))
+    nearest, distances = np.empty(shape, np.intp), np.empty(shape)
+    for start in range(0, len(features1), rows):
+        part = np.arange(start, min(start + rows, len(features1)))
+        squared = _squared_distances(features1.take(part), features2)
+        nearest[part] = np.argpartition(squared, _PARTNERS, axis=1)[:, :_PARTNERS]
+        distances[part] = np.sqrt(np.take_along_axis(squared, nearest[part], axis=1))
+    keypoint, partner, distance = np.repeat(np.arange(len(features1)), _PARTNERS), nearest.ravel(), distances.ravel()
     scale = np.abs(np.log(features2.scale[partner] / features1.scale[keypoint]))
     kept = scale < np.log(_MAX_SCALE)
     return keypoint[kept], partner[kept], distance[kept]

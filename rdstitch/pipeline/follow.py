@@ -31,7 +31,7 @@ from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message
 from rdstitch.results.pose import FollowedPoses, Pose
-from rdstitch.tracking import FrameTracker, Tracked, TrackingOptions
+from rdstitch.tracking import FrameTracker, TrackingOptions, TrackingResult
 from rdstitch.tracking.live_preview import LivePreview
 
 _FEATURES = 600  # of a frame, that suffice to follow it
@@ -212,7 +212,7 @@ class Tracker:
         body: BodyPose | None = None,
     ) -> list[Pose]:
         """Register a frame that was read; it comes last, after those before it whose place is new."""
-        label = Pose(frame.path.name, frame.number or 0, math.nan, Tracked(), reason, self._poses)
+        label = Pose(frame.path.name, frame.number or 0, math.nan, TrackingResult(), reason, self._poses)
         if source is None or image is None:
             return [label]
         label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))
@@ -229,7 +229,7 @@ class Tracker:
         """Poses of frames that find their place, or another one, when no other frame comes."""
         return tuple(self._poses_of(self._frames.finish()))
 
-    def _poses_of(self, results: Sequence[Tracked]) -> list[Pose]:
+    def _poses_of(self, results: Sequence[TrackingResult]) -> list[Pose]:
         poses = [replace(self._labels[result.number], tracked=result, reason=result.reason) for result in results]
         if poses:
             poses[-1] = replace(poses[-1], messages=self.messages[self._reported :])

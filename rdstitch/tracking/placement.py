@@ -16,6 +16,10 @@ from rdstitch.geometry.radial_homography import to_plane
 _SAMPLES = 5  # points of an image's outline, a side, by which two planes are brought together
 
 
+# Rows of a pose's covariance (4, 4).
+X, Y, HEIGHT, YAW = range(4)
+
+
 @dataclass(frozen=True)
 class CameraPose:
     """The place and heading of the camera."""

@@ -36,14 +36,16 @@ def levelled(matrices: FloatArray, reference: int, gravity: FloatArray | None = 
 def measured_down(rotations: FloatArray, gravity: FloatArray | None) -> FloatArray | None:
     """Direction down (3,), in the frame that rotations (N, 3, 3) lead from, by gravity (N, 3) in the cameras' axes.
 
-    None where no camera has measured it, or where the measurements contradict each other.
+    Gravity may be in any unit. None where no camera has measured it, or where the measurements contradict each other.
     """
     if gravity is None:
         return None
     down = np.einsum("nij,ni->nj", rotations, gravity)
-    down = down[np.isfinite(down).all(axis=1)]
-    if not len(down):
+    length = np.linalg.norm(down, axis=1)
+    known = np.isfinite(length) & (length > 0.0)
+    if not known.any():
         return None
+    down = down[known] / length[known, None]
     mean = _unit(down.mean(axis=0))
     spread = float(np.median(np.arccos(np.clip(down @ mean, -1.0, 1.0))))
     return mean if spread < _MAX_GRAVITY_SPREAD else None

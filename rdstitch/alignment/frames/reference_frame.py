@@ -17,10 +17,10 @@ _MAX_STRETCH = 10.0
 def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
     """The same alignment with the undistorted image ``reference`` as its plane, and its height as unit of poses."""
     homographies = np.linalg.inv(alignment.homographies[reference]) @ alignment.homographies
-    poses = alignment.poses
+    poses, lever = alignment.poses, alignment.lever_std
     if poses is not None and reference != alignment.reference:
-        poses = poses.relative_to(reference)
-    return replace(alignment, homographies=homographies, reference=reference, poses=poses)
+        poses, lever = poses.relative_to(reference), lever / float(poses.height[reference])
+    return replace(alignment, homographies=homographies, reference=reference, poses=poses, lever_std=lever)
 
 
 def frontal_reference(alignment: Alignment) -> int:

@@ -1,7 +1,7 @@
 """Marks on the plane, as ground control points are: where images show them, and where they are."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from rdstitch.alignment.least_squares.link_equations import split_lens
 from rdstitch.alignment.motion_models import ModelMatrices
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import inverses
@@ -42,6 +43,11 @@ class ControlPoints:
     @classmethod
     def of(cls, sightings: Sequence[Sighting], cameras: Sequence[Camera]) -> Self:
         """In images of these cameras."""
+        for one in sightings:
+            if not 0 <= one.image < len(cameras):
+                raise ArgumentError(f"control point {one.name} is in image {one.image}, of {len(cameras)}")
+            if not (np.isfinite([*one.offset, *one.place]).all() and 0.0 <= (one.std or 0.0) < np.inf):
+                raise ArgumentError(f"control point {one.name}: place, offset and standard deviation must be finite")
         first = {one.name: one for one in reversed(sightings)}
         names = tuple(dict.fromkeys(one.name for one in sightings))
         number = {name: k for k, name in enumerate(names)}
@@ -57,14 +63,18 @@ class ControlPoints:
 
     def within(self, images: IntArray) -> Self:
         """In some of the images (N,), ascending, which get the numbers 0 to N - 1."""
-        shown = np.isin(self.image, images)
+        shown = self.subset(np.flatnonzero(np.isin(self.image, images)))
+        return replace(shown, image=np.searchsorted(images, shown.image).astype(np.intp))
+
+    def subset(self, shown: IntArray) -> Self:
+        """Some of the sightings only."""
         known, point = np.unique(self.point[shown], return_inverse=True)
         return type(self)(
             tuple(self.names[k] for k in known.tolist()),
             self.places[known],
             self.std[known],
             point.astype(np.intp),
-            np.searchsorted(images, self.image[shown]).astype(np.intp),
+            self.image[shown],
             self.points[shown],
             self.pixel[shown],
         )

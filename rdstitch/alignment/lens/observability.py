@@ -46,8 +46,10 @@ def choose_observable_lens(
         depth = observable and _is_depth(pairwise, with_given_lens)
         if depth or not observable:
             pairwise, observable = with_given_lens, False
-    choice = choose_lens(sample, pairwise, options.lenses if observable else (), known)
-    return replace(choice, observable=observable, depth=depth)
+    if not observable:
+        choice = choose_lens(sample, pairwise, (), known)
+        return replace(choice, reason="λ is not observable", observable=False, depth=depth)
+    return choose_lens(sample, pairwise, options.lenses, known)
 
 
 def _is_depth(free_lens: BundleAdjustmentResult, given_lens: BundleAdjustmentResult) -> bool:

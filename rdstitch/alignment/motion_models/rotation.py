@@ -35,7 +35,7 @@ class RotationModel(MotionModel):
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
         """Matrices from directions to the images, with derivatives."""
         rotations = poses.reshape(-1, 3, 3)
-        focal = _focal(shared)
+        focal = self.focal(shared)
         scale = np.array([[focal], [focal], [1.0]])
         matrices = scale * rotations
         by_pose = scale * (_CROSS @ rotations[:, None])
@@ -46,6 +46,10 @@ class RotationModel(MotionModel):
         """The focal length that is known, and a range of others."""
         return [np.array([each]) for each in (log_focal, *_FOCAL_STARTS)]
 
+    def focal(self, shared: FloatArray) -> float:
+        """Focal length, half diagonals, within what a lens can have."""
+        return float(np.exp(np.clip(shared[0], *_LOG_FOCAL_LIMITS)))
+
     def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, 3), radians."""
         turned: FloatArray = rotation_from_vector(step) @ poses.reshape(-1, 3, 3)
@@ -53,12 +57,12 @@ class RotationModel(MotionModel):
 
     def nominal_homographies(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """``diag(f, f, 1)``."""
-        focal = _focal(shared)
+        focal = self.focal(shared)
         return np.tile(np.diag([focal, focal, 1.0]), (len(attitudes), 1, 1))
 
     def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The nearest rotations."""
-        focal = _focal(shared)
+        focal = self.focal(shared)
         matrices = homographies / np.array([[focal], [focal], [1.0]])
         matrices = matrices * np.sign(np.linalg.det(matrices))[:, None, None]
         return nearest_rotation(matrices).reshape(-1, 9)
@@ -66,11 +70,6 @@ class RotationModel(MotionModel):
     def description(self, poses: FloatArray, shared: FloatArray) -> str:
         """What a turn says of the camera."""
         return "the camera turned on the spot"
-
-
-def _focal(shared: FloatArray) -> float:
-    """Focal length, half diagonals, within what a lens can have."""
-    return float(np.exp(np.clip(shared[0], *_LOG_FOCAL_LIMITS)))
 
 
 def rotation_from_vector(vectors: FloatArray) -> FloatArray:

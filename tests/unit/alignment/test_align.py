@@ -9,9 +9,11 @@ import pytest
 
 from examples.judging.trajectories import compare_trajectories
 from examples.worlds.alignment_scenes import Scene, aligned, grid, jittered, robot_path, scene
-from rdstitch.alignment import AlignmentOptions, align, most_matches_read
+from rdstitch.alignment import AlignmentOptions, AlignmentTask, GivenImages, align, most_matches_read
 from rdstitch.alignment.adjusted_images import AdjustedImages
 from rdstitch.alignment.build_result import build_alignment
+from rdstitch.alignment.frames.reference_frame import in_frame_of
+from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import Alignment, PlanarPoses, Unused
 from rdstitch.alignment.trajectory import Trajectory
@@ -175,6 +177,7 @@ def test_turning_on_the_spot_says_nothing_of_the_lens() -> None:
     for purpose, severity in wanted.items():
         found = aligned(given, purpose=purpose)
         assert math.isinf(found.distortion_std)
+        assert found.lens_reason == "λ is not observable"
         assert {m.severity for m in found.messages if m.code == "lambda-not-observable"} == {severity}
 
 
@@ -257,6 +260,8 @@ def test_any_image_can_become_the_frame_after_the_adjustment(monkeypatch: pytest
         np.testing.assert_allclose(found.poses.position, expected, atol=0.01)
         np.testing.assert_allclose(found.poses.height, np.exp(poses[:, LOG_HEIGHT]) / height, rtol=0.01)
         assert found.poses.yaw[reference] == 0.0
+        lower = in_frame_of(replace(found, lever_std=0.3), (reference + 1) % len(poses))
+        assert lower.lever_std == pytest.approx(0.3 / found.poses.height[lower.reference])
         # Where images lie to one another stays as it is.
         assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.3
 
@@ -317,6 +322,60 @@ def test_mistakes_of_the_caller() -> None:
     failed = RadialHomography.failed("none", Camera((4, 3)), Camera((4, 3)), 0)
     with pytest.raises(ArgumentError, match="failed fit"):
         replace(given.links[0], relation=failed)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"attitudes_std": math.nan}, "attitudes_std"),
+        ({"attitudes": np.full((2, 2), np.nan)}, "finite angles"),
+        ({"positions": np.zeros((2, 2)), "positions_std": np.zeros(2)}, "must be positive"),
+        ({"positions": np.zeros((2, 2)), "positions_std": np.ones(1)}, "positions_std must have the shape"),
+        ({"gravity": np.zeros((1, 3))}, "gravity must have the shape"),
+        ({"control": (Sighting(99, (0.0, 0.0), "P1", (0.0, 0.0)),)}, "P1 is in image 99"),
+        ({"control": (Sighting(-1, (0.0, 0.0), "P1", (0.0, 0.0)),)}, "P1 is in image -1"),
+        ({"control": (Sighting(0, (math.nan, 0.0), "P1", (0.0, 0.0)),)}, "P1: place, offset"),
+    ],
+)
+def test_what_cannot_be_of_the_images_is_refused(options: dict[str, object], named: str) -> None:
+    rng = np.random.default_rng(15)
+    with pytest.raises(ArgumentError, match=named):
+        aligned(scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng), **options)
+
+
+def test_a_named_reference_in_another_group_is_missed_aloud() -> None:
+    rng = np.random.default_rng(9)
+    given = scene(grid(7, 1, (0.4, 0.3), 0.1, rng), rng=rng)
+    split = [link for link in given.links if (link.image1 < 5) == (link.image2 < 5)]
+    for reference, missed in ((6, True), (2, False)):
+        found = align(given.cameras, split, AlignmentOptions(reference=reference, lens="division"))
+        assert (found.reference == reference) is not missed
+        assert any("reference image" in message.text for message in found.messages) is missed
+
+
+def test_errors_that_neighbours_share_weigh_the_same_with_and_without_a_wrong_pair() -> None:
+    rng = np.random.default_rng(4)
+    given = scene(robot_path(10, 0.15), reach=3, rng=rng)
+    task = AlignmentTask(GivenImages(given.cameras, given.links, AlignmentOptions(model="rigid", lens="division")))
+    links = [*given.links, _wrong_link(given, 0, 9, rng)]
+    with_wrong = replace(task, given=replace(task.given, links=links))
+    selected, without = with_wrong._selected, task._selected
+    assert without.problem.overdispersion > 1.2
+    assert selected.kept_links.tolist() == [*[True] * len(given.links), False]
+    assert selected.problem.overdispersion == pytest.approx(without.problem.overdispersion, rel=0.3)
+    assert selected.choice.fit.overdispersion >= selected.problem.overdispersion
+
+
+def test_attitudes_known_exactly_determine_no_less_than_almost_exact_ones() -> None:
+    rng = np.random.default_rng(12)
+    poses = jittered(grid(4, 3, (0.4, 0.3), 0.2, rng), 0.1, 0.05, rng)
+    given, attitudes = scene(poses, tilt=(0.03, 0.02), rng=rng, per_link=80), poses[:, [PSI, THETA]]
+    std = [
+        aligned(given, model="tilting", lens="division", attitudes=attitudes, attitudes_std=scatter).distortion_std
+        for scatter in (0.0, 1e-6, 1e-4, 1e-2)
+    ]
+    assert std[0] == pytest.approx(std[1], rel=1e-3)
+    assert (np.diff(std) > -1e-3 * std[0]).all()
 
 
 def test_an_image_that_contradicts_the_others_names_them() -> None:

@@ -1,15 +1,19 @@
 """Attitudes and tilts that the images contradict are not used, and the message says which would fit."""
 
 import math
+from importlib import import_module
 
 import numpy as np
 import pytest
 
 from examples.worlds.alignment_scenes import Scene, aligned, grid, jittered, scene
-from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment import AlignmentOptions, AlignmentTask, align
+from rdstitch.alignment.adjusted_images import AdjustedImages
+from rdstitch.alignment.build_result import build_alignment
 from rdstitch.alignment.motion_models import PSI, THETA
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
+from rdstitch.errors import ImpossibleCameraError
 from rdstitch.inputs.delays import DELAYS
 
 _ONE = math.radians(1.0)
@@ -106,6 +110,22 @@ def test_a_focal_length_that_the_images_contradict_is_not_used(factor: float, ri
     assert abs(math.log(alignment.cameras[0].focal / true)) < 4.0 * alignment.length_std
     if tilt_given or right:
         assert alignment.length_std < 0.012
+
+
+def test_a_focal_length_stays_given_where_no_camera_is_possible_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    given = scene(grid(4, 3, (0.4, 0.3), 0.25, rng), tilt=(0.14, -0.09), rng=rng, per_link=80)
+    told = [camera.with_focal(1.15 * camera.with_focal().focal, "option") for camera in given.cameras]
+    recipe = import_module(AlignmentTask.__module__)
+
+    def build(adjusted: AdjustedImages) -> Alignment:
+        if any(message.code == "focal-contradicted" for message in adjusted.messages):
+            raise ImpossibleCameraError("the corners would see behind the camera")
+        return build_alignment(adjusted)
+
+    monkeypatch.setattr(recipe, "build_alignment", build)
+    found = align(told, given.links, AlignmentOptions(lens="division"))
+    assert not any(message.code == "focal-contradicted" for message in found.messages)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.odometry import BodyPose, read_odometry
 from rdstitch.synthetic import Sequence
-from rdstitch.tracking import Tracked
+from rdstitch.tracking import TrackingResult
 
 HEIGHT, LEVER, MOUNT = 0.42, 0.15 - 0.06j, np.exp(0.5j * np.pi)  # metres; the top of the image is ahead
 
@@ -123,7 +123,7 @@ def test_offline_and_live_give_metres_and_bridge_what_shows_nothing(drive: Seque
 
 
 def test_a_height_of_one_is_a_height() -> None:
-    known = Tracked(0, None, DISTORTION, 0.0, True, 0, True, 0, length_std=0.01, unit=0.3, unit_std=0.05)
+    known = TrackingResult(0, None, DISTORTION, 0.0, True, 0, True, 0, length_std=0.01, unit=0.3, unit_std=0.05)
     for given, length, std in ((None, 0.3, 0.05), (1.0, 1.0, 0.01)):
         pose = rdstitch.Pose("", 0, 0.0, known, poses=rdstitch.FollowedPoses(given))
         assert (pose.unit, pose.length_std) == (length, std)
@@ -139,3 +139,11 @@ def test_odometry_is_read_from_tum_and_refused_by_line(tmp_path: Path) -> None:
     file.write_text("1 0 0 0 0 0 0 1\n2 1 0.5 0 0 0 one 1\n", encoding="utf-8")
     with pytest.raises(InputError, match="line 2"):
         read_odometry(file)
+
+
+def test_turns_by_more_than_half_a_circle_are_bridged_the_way_they_were_made() -> None:
+    yaw = np.radians([0.0, 67.5, 135.0, 202.5, 270.0])
+    bodies = {k: BodyPose(0.0, 0.0, turn) for k, turn in enumerate(yaw.tolist())}
+    for last in (yaw[-1], yaw[-1] - 2.0 * np.pi):  # images alone know it up to whole turns
+        path = Trajectory(np.array([0, 4]), np.zeros((2, 2)), np.array([0.0, last]), np.ones(2))
+        np.testing.assert_allclose(bridged(path, bodies, OdometryFit(1.0, 0.0, 1.0, 0.01)).yaw, yaw)

@@ -8,7 +8,7 @@ import pytest
 from examples.worlds.alignment_scenes import aligned, scene
 from examples.worlds.turns import camera_rotations, panorama_rotations
 from rdstitch.alignment import Alignment, align
-from rdstitch.alignment.frames.level_frame import level_frame
+from rdstitch.alignment.frames.level_frame import level_frame, measured_down
 from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.motion_models import POSE, PSI, X
 from rdstitch.alignment.motion_models.rotation import ROTATION, rotation_from_vector
@@ -85,6 +85,22 @@ def test_neither_a_roll_of_hands_nor_a_camera_on_its_side_tips_the_horizon() -> 
     rotations = camera_rotations(np.arange(12) * np.pi / 6)
     ahead = (rotations @ level_frame(rotations, 5).T)[5, 2]
     np.testing.assert_allclose(ahead, (0.0, 0.0, 1.0), atol=1e-9)
+
+
+def test_gravity_that_contradicts_itself_levels_nothing_in_any_unit() -> None:
+    turns = rotation_from_vector(np.array([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.4, 0.0]]))
+    down = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [np.nan] * 3])
+    scattered = np.array([[0.5, 1.0, 0.0], [-0.5, 1.0, 0.0], [0.0, 1.0, 0.9]])
+    for unit in (1.0, 9.81, 0.01):
+        np.testing.assert_allclose(measured_down(turns, unit * down), [0.0, 1.0, 0.0], atol=1e-12)
+        assert measured_down(turns, unit * scattered) is None
+    assert measured_down(turns, np.zeros((3, 3))) is None
+
+
+def test_the_focal_length_of_a_turn_is_that_of_its_matrices_beyond_the_limits_of_lenses() -> None:
+    for shared in (np.log([100.0]), np.log([0.1]), np.log([1.3])):
+        (matrix,) = ROTATION.matrices(np.eye(3).reshape(1, 9), shared).matrices
+        np.testing.assert_allclose(matrix[0, 0] / matrix[2, 2], ROTATION.focal(shared))
 
 
 def test_a_full_turn_closes_and_gives_lens_and_focal_length() -> None:

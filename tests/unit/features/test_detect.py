@@ -198,6 +198,8 @@ def test_bad_arguments_are_refused(image: NDArray[np.uint8]) -> None:
             detect(bad)
     with pytest.raises(ArgumentError, match="int32"):
         detect(np.zeros((50, 50), np.int32))
+    with pytest.raises(ArgumentError, match="int32"):
+        detect(np.zeros((50, 50), np.int32), FeatureOptions(work_megapixels=0.001))
 
 
 def test_spreading_serves_every_cell_before_any_twice() -> None:

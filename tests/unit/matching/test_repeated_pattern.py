@@ -1,5 +1,6 @@
 """What misleads matching: rough ground, one that stays with the camera, repeated patterns, the same pixels twice."""
 
+import tracemalloc
 from dataclasses import replace
 from functools import partial
 
@@ -211,6 +212,16 @@ def test_other_ground_has_no_such_matches(board: Sequence) -> None:
     plain = sequence_over(partial(ground, seed=3), _LENS, board.poses)
     assert len(match_pattern(_features(board, 0), _features(plain, 0))) < 30
     assert len(match_pattern(detect(board.frame(0), FeatureOptions("orb")), _features(board, 1))) == 0
+
+
+def test_matching_many_keypoints_takes_memory_for_some_of_them_at_a_time(board: Sequence) -> None:
+    few = _features(board, 0)
+    many = few.take(np.resize(np.arange(len(few)), 3000))
+    tracemalloc.start()
+    match_pattern(many, many)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 60e6  # 108 MB of distances and their order
 
 
 @pytest.mark.slow
