@@ -235,7 +235,7 @@ def trajectory(
     output: str | Path | None = None,
     options: StitchOptions | None = None,
     *,
-    file_format: TrajectoryFormat = "csv",
+    layout: TrajectoryFormat = "csv",
     plot: str | Path | None = None,
     height: float | None = None,
     frame: TrajectoryFrame | None = None,
@@ -250,7 +250,7 @@ def trajectory(
         As for :func:`mosaic`, but that every frame of a video is used unless ``every`` says otherwise.
     output : path, optional
         File to write.
-    file_format : str
+    layout : str
         "csv", "tum" or "kitti", see :mod:`rdstitch.export.trajectory_files`; "bag": ``nav_msgs/Odometry``, see
         :mod:`rdstitch.export.odometry_bag`.
     plot : path, optional
@@ -274,16 +274,16 @@ def trajectory(
         found_images(given, every=every, topic=options.topic) as listed,
         Outputs(options.overwrite) as outputs,
     ):
-        RunFiles.of_path(run, listed.files, output, plot, file_format).check(outputs)
+        RunFiles.of_path(run, listed.files, output, plot, layout).check(outputs)
         # Numbered as they were named: what is left out leaves a gap.
         numbered = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
         registration = _registered(replace(listed, frames=numbered), run)
         path, of_path = camera_path(registration, options.odometry, height)
         messages = [*scale_uncertainty(registration.alignment), *of_path]
-        if file_format in ("tum", "bag") and not has_times(path):
+        if layout in ("tum", "bag") and not has_times(path):
             messages.append(_NO_TIMES)
         if output is not None:
-            write_trajectory(path, Path(output), file_format, frame, outputs)
+            write_trajectory(path, Path(output), layout, frame, outputs)
         if plot is not None:
             drawn = text_bytes(path_as_svg(path, "heights" if height is None else "m"))
             messages += outputs.attempt(plot, partial(outputs.write, plot, drawn))

@@ -85,7 +85,7 @@ def trajectory(
             paths,
             output,
             options,
-            file_format=file_format,
+            layout=file_format,
             plot=plot,
             height=height,
             frame=frame,
