@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -25,6 +24,7 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.results.messages import Message, Severity
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 from rdstitch.robust.posterior import MODEL_ERROR
+from rdstitch.system.dataclasses import dataclass, replace
 
 _STEP = 1e-5
 """Of differences of λ, μ and ν."""

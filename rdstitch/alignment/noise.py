@@ -6,7 +6,6 @@ correlation gives the number of independent observations, which is smaller than 
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.robust.posterior import Evidence, overlap_cells
+from rdstitch.system.dataclasses import dataclass
 
 _CELLS = (2, 3, 4)
 """Cells per side of a link's overlap within which errors are added up; the worst counts."""

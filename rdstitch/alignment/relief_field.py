@@ -9,7 +9,6 @@ Mandelbrot 1975).
 """
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
 
@@ -23,6 +22,7 @@ from rdstitch.alignment.noise import apart, neighbours
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.division_model import distort, undistort
 from rdstitch.geometry.radial_homography import inverses, project
+from rdstitch.system.dataclasses import dataclass
 
 _STEP = 1e-4
 """Heights, of differences."""

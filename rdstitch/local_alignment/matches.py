@@ -1,7 +1,6 @@
 """Matches of overlapping images on their plane or sphere, and what the alignment leaves over at each of them."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Self
@@ -13,6 +12,7 @@ from rdstitch.arrays import FloatArray, Rows
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
+from rdstitch.system.dataclasses import dataclass, replace
 
 # Matches that the alignment expects farther away than this share of the image's diagonal are taken to be wrong; where
 # the ground rises by a tenth of the camera's height, and the alignment is that of the valleys, right ones are nearly as

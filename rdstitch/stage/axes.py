@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -11,6 +10,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.stage.correlation import CoarseTile, wide_peaks
 from rdstitch.stage.evidence_limits import HUNDRED_TO_ONE, MIN_AXES_EVIDENCE
 from rdstitch.stage.grid import TileGrid
+from rdstitch.system.dataclasses import dataclass, replace
 
 _TRIED, _ENOUGH = 48, 8  # pairs of an axis that are compared at most, and those with evidence that are enough
 # factor of evidence that other axes must have: of two where one is right, the pairs along it agree in both

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.io.reduction import block_mean
 from rdstitch.robust.loss import normal_std
+from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import fft
 
 Image = NDArray[np.float32]

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -23,6 +22,7 @@ from rdstitch.stage.correlation import (
 )
 from rdstitch.stage.evidence_limits import HUNDRED_TO_ONE, WRONG_PEAK
 from rdstitch.stage.grid import TileGrid
+from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.progress import Progress
 
 Reader = Callable[[int], NDArray[Any]]

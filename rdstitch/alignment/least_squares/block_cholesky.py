@@ -6,7 +6,6 @@ images. What is eliminated at a time is a dense front of a few images with those
 multifrontal method; Duff and Reid 1983). The order depends on the links alone, and is found once.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from typing import Self
@@ -14,6 +13,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import csgraph, sparse
 
 _UNDIVIDED = 20

@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -12,6 +11,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import Link, spread_choice
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, sigma_of
+from rdstitch.system.dataclasses import dataclass, replace
 
 _CHUNK = 4096
 """Correspondences linearized at a time: what stays in cache."""
