@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
+from rdstitch.system.dataclasses import dataclass
 
 # Cells of a grid that finds what is far from the plane, and of the one that is used; nodes of all images together, by
 # which the finer one is coarser for more than some 70 images, and both for more than 800.

@@ -7,7 +7,6 @@ the model of the stage gives it.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.stage.equations import StageEquations, Variances
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.linked_points import LinkedPoints
+from rdstitch.system.dataclasses import dataclass
 
 _ROUNDS = 12
 _GENEROUS = 20.0  # widths of the robust loss in the first round; it is halved until it is 1

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -17,6 +16,7 @@ from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
+from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.tracking.metric_plane import MetricPlane
 from rdstitch.tracking.placement import YAW, CameraPose, Placement
 from rdstitch.tracking.tracked_frame import Frame, TrackedFrame

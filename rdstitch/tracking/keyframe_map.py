@@ -2,12 +2,12 @@
 
 from collections import deque
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.matching.links import Link
+from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.frame_links import MATCH_ERROR, fitted_homography
 from rdstitch.tracking.metric_plane import chained
