@@ -19,7 +19,7 @@ from rdstitch.results.registration import Registration
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification import rival_planes
 from rdstitch.verification.overlap_check import ComparedImages
-from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey
+from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey, overlap_agreement
 from rdstitch.verification.rival_planes import _least_needed, fills_at_most, planes_of_pairs
 from tests.registrations import registration, source
 
@@ -85,11 +85,11 @@ def test_every_pair_is_moved_as_its_plane_does(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_pairs_are_compared_by_threads_and_each_image_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    together, compare, reads = Barrier(2), rival_planes.overlap_agreement, list[str]()
+    together, reads = Barrier(2), list[str]()
 
     def compared(first: ComparedImage, second: ComparedImage) -> Agreement:
         together.wait(10.0)
-        return compare(first, second)
+        return overlap_agreement(first, second)
 
     def read(own: Source, *_: object, **__: object) -> DecodedImage:
         reads.append(own.name)
