@@ -49,7 +49,7 @@ def align_registration_locally(
             return list(pool.map(edges or (lambda k: straight_edges(registration.sources[k])), used[images].tolist()))
 
     cameras = [camera for camera, used in zip(alignment.cameras, alignment.used, strict=True) if used]
-    used = np.flatnonzero(alignment.used)
+    used, poses = np.flatnonzero(alignment.used), alignment.poses
     return align_locally(
         map(match, pairs),
         cameras,
@@ -57,5 +57,6 @@ def align_registration_locally(
         choice,
         pairs=len(pairs),
         on_sphere=alignment.on_sphere,
+        centers=None if poses is None or alignment.on_sphere else np.column_stack([poses.position, poses.height])[used],
         edges=edges_of,
     )
