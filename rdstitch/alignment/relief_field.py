@@ -1,4 +1,4 @@
-"""What relief does to a lens: hills are laid under the images, and the adjustment answers them.
+"""What relief and a rolling shutter do to a lens: they are laid under the images, and the adjustment answers them.
 
 Relief moves all points of a place together, in every image that shows it, and a part of that the parameters absorb:
 hills as wide as an overlap are fitted by its homography and by λ. What is left over shows how high and how wide the
@@ -63,6 +63,13 @@ class Parallax:
     def size(self) -> float:
         """Of half a diagonal of most images on the plane, or between directions."""
         return float(np.median(self._sizes))
+
+    def from_middle(self, place: FloatArray) -> FloatArray:
+        """Places (m, 2) from the middle of the images, in sizes of one; far beyond them (at a horizon), less far."""
+        middle = np.median(self._centres, axis=0)
+        reach = self.size + 2.0 * np.median(np.linalg.norm(self._centres - middle, axis=1))
+        near: FloatArray = np.clip(place - middle, -reach, reach) / self.size
+        return near
 
     @cached_property
     def _back(self) -> FloatArray:
@@ -138,6 +145,12 @@ _FEWEST = 20
 _NOISE_FIELDS = 16
 """Fields of independent errors that show what their absorption leaves of agreement between neighbours."""
 
+_CURVATURES, _SHEARS = 3, 2
+"""Of a plane that is curved alike everywhere; of images by a rolling shutter."""
+
+_UNSEEN, _NEWTON_STEPS = 1e-9, 50
+"""Share of the largest information that none is; steps to the variance of curvatures at most."""
+
 
 @dataclass(frozen=True)
 class ReliefField:
@@ -148,13 +161,19 @@ class ReliefField:
     def steps(self) -> tuple[FloatArray, FloatArray]:
         """Steps of the poses (N, D, K) and the shared parameters (S, K) by relief; ``x x'`` is its covariance.
 
-        By relief of the heights at which it leaves the agreement of errors that was found, at every distance, beyond
-        that of independent errors. These agree less than not at all, since the parameters absorb what they have in
-        common.
+        Also by what is alike in all images, whose errors do not cancel out.
         """
-        normal, (agreement, std) = self.response.normal, self._agreement()
-        if not len(agreement) or agreement[0] <= 0.0:
-            return np.zeros((*normal.gradient_poses.shape, 0)), np.zeros((len(normal.gradient_shared), 0))
+        steps = [self._steps_by_estimate(self._sheared, _SHEARS)]
+        if not self._parallax.is_turn:
+            steps.append(self._steps_by_estimate(self._curved, _CURVATURES))
+        agreement, std = self._agreement()
+        if len(agreement) and agreement[0] > 0.0:
+            steps.append(self._steps_by_waves(agreement, std))
+        poses, shared = zip(*steps, strict=True)
+        return np.concatenate(poses, axis=-1), np.concatenate(shared, axis=-1)
+
+    def _steps_by_waves(self, agreement: FloatArray, std: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """By relief of the heights at which it leaves the agreement of errors that was found, at every distance."""
         step = _WAVES // _BANDS
         answers = [self._answers(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
         power = _spectrum(np.stack([left for left, *_ in answers], axis=1), agreement, std)
@@ -162,9 +181,36 @@ class ReliefField:
         poses, shared = (np.concatenate([answer[k] for answer in answers], axis=-1) for k in (1, 2))
         return poses * scale, shared * scale
 
+    def _steps_by_estimate(self, fields: Fields, count: int) -> tuple[FloatArray, FloatArray]:
+        """By ``count`` fields; how large they are shows what the parameters do not absorb of them, beyond noise."""
+        poses, shared = self.response.steps_of(fields, count)
+        information, score = np.zeros((count, count)), np.zeros(count)
+        for part in self.response.parts():
+            left = fields(part) + self.response.changes(part, poses, shared)
+            weight = self.response.weight[part.rows]
+            information += self.response.curvature * np.einsum("m,mic,mid->cd", weight, left, left)
+            score += np.einsum("m,mic,mi->c", weight, left, part.errors)
+        std = math.sqrt(_variance_between(information, score))
+        return poses * std, shared * std
+
+    def _curved(self, part: LinearizedErrors) -> FloatArray:
+        """Errors (m, 2, 3) by a plane that is curved alike everywhere, as a wall may be: along x, aslant, along y."""
+        place, parallax = self._parallax.of(part)
+        x, y = self._parallax.from_middle(place).T
+        heights = np.column_stack([x * x, math.sqrt(2.0) * x * y, y * y])
+        field: FloatArray = parallax[:, :, None] * heights[:, None, :]
+        return field
+
+    def _sheared(self, part: LinearizedErrors) -> FloatArray:
+        """Errors (m, 2, 2) by rows that are read one after the other while the camera moves along x, or y."""
+        o = self.response.adjuster.observations
+        rows = (o.points1[part.rows, 1], o.points2[part.rows, 1])
+        field: FloatArray = part.by_point1 * rows[0][:, None, None] + part.by_point2 * rows[1][:, None, None]
+        return field
+
     def _agreement(self) -> tuple[FloatArray, FloatArray]:
         """Mean products (D,) of the errors at each distance, px², beyond what the absorption of independent errors
-        leaves, and their standard deviations.
+        leaves (less than none, since the parameters absorb what they have in common), and their standard deviations.
         """
         pairs = self._pairs
         if not pairs:
@@ -261,6 +307,24 @@ def _spectrum(left: FloatArray, agreement: FloatArray, std: FloatArray) -> Float
     power = _nonnegative_solution(equations, np.concatenate([agreement * weight, np.ones(bands)]))
     scaled: FloatArray = power * (steep / bands)
     return scaled
+
+
+def _variance_between(information: FloatArray, score: FloatArray) -> float:
+    """Variance of parameters about 0, by the information (P, P) of noisy estimates of them and their score (P,).
+
+    That with which the squares of the estimates over their variances add up to their number (Paule and Mandel 1982).
+    """
+    values, vectors = np.linalg.eigh(information)
+    seen = values > _UNSEEN * values[-1]
+    precision, squared = values[seen], (vectors.T @ score)[seen] ** 2 / values[seen]
+    variance = 0.0
+    for _ in range(_NEWTON_STEPS):  # from below to the root of a convex function
+        grown = 1.0 + variance * precision
+        step = ((squared / grown).sum() - len(squared)) / (squared * precision / grown**2).sum()
+        if not step > 0.0:
+            break
+        variance += float(step)
+    return variance
 
 
 def _nonnegative_solution(equations: FloatArray, right: FloatArray) -> FloatArray:
