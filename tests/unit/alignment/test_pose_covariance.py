@@ -93,7 +93,7 @@ def test_the_table_has_them_in_its_own_axes_and_units(frame: TrajectoryFrame, si
 
 @pytest.mark.parametrize(("kind", "seed"), [("relief", 2), ("plane", 15), ("cylinder", 99106)])
 def test_what_the_model_does_not_describe_is_in_the_uncertainty(kind: str, seed: int) -> None:
-    """Else the height is 4 deviations away over hills, 8 with a lens that was held too simple, λ 17 at a curved wall."""
+    """Else the height is 4 deviations off over hills, 8 with a lens that was held too simple, λ 17 at a curved wall."""
     sequence = adverse_set(kind, seed) if kind == "cylinder" else rendered(kind, seed)
     options = replace(OPTIONS, pose_covariance=True)
     stitched = rdstitch.mosaic([sequence.frame(k) for k in range(len(sequence))], None, options)
