@@ -320,10 +320,10 @@ def _variance_between(information: FloatArray, score: FloatArray) -> float:
     variance = 0.0
     for _ in range(_NEWTON_STEPS):  # from below to the root of a convex function
         grown = 1.0 + variance * precision
-        step = ((squared / grown).sum() - len(squared)) / (squared * precision / grown**2).sum()
-        if not step > 0.0:
+        excess = float((squared / grown).sum()) - len(squared)
+        if excess <= 0.0:
             break
-        variance += float(step)
+        variance += excess / float((squared * precision / grown**2).sum())
     return variance
 
 
