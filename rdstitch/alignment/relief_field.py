@@ -1,4 +1,4 @@
-"""What relief and a rolling shutter do to a lens: they are laid under the images, and the adjustment answers them.
+"""What relief does to a lens: hills are laid under the images, and the adjustment answers them.
 
 Relief moves all points of a place together, in every image that shows it, and a part of that the parameters absorb:
 hills as wide as an overlap are fitted by its homography and by λ. What is left over shows how high and how wide the
@@ -145,8 +145,8 @@ _FEWEST = 20
 _NOISE_FIELDS = 16
 """Fields of independent errors that show what their absorption leaves of agreement between neighbours."""
 
-_CURVATURES, _SHEARS = 3, 2
-"""Of a plane that is curved alike everywhere; of images by a rolling shutter."""
+_CURVATURES = 3
+"""Of a plane: along x, aslant, and along y."""
 
 _UNSEEN, _NEWTON_STEPS = 1e-9, 50
 """Share of the largest information that none is; steps to the variance of curvatures at most."""
@@ -159,16 +159,14 @@ class ReliefField:
     response: LinearResponse
 
     def steps(self) -> tuple[FloatArray, FloatArray]:
-        """Steps of the poses (N, D, K) and the shared parameters (S, K) by relief; ``x x'`` is its covariance.
-
-        Also by what is alike in all images, whose errors do not cancel out.
-        """
-        steps = [self._steps_by_estimate(self._sheared, _SHEARS)]
-        if not self._parallax.is_turn:
-            steps.append(self._steps_by_estimate(self._curved, _CURVATURES))
+        """Steps of the poses (N, D, K) and the shared parameters (S, K) by relief; ``x x'`` is its covariance."""
+        normal = self.response.normal
+        steps = [(np.zeros((*normal.gradient_poses.shape, 0)), np.zeros((len(normal.gradient_shared), 0)))]
         agreement, std = self._agreement()
         if len(agreement) and agreement[0] > 0.0:
             steps.append(self._steps_by_waves(agreement, std))
+        if not self._parallax.is_turn and len(self.response.adjuster.observations) > 1:
+            steps.append(self._steps_by_curvature())
         poses, shared = zip(*steps, strict=True)
         return np.concatenate(poses, axis=-1), np.concatenate(shared, axis=-1)
 
@@ -181,12 +179,15 @@ class ReliefField:
         poses, shared = (np.concatenate([answer[k] for answer in answers], axis=-1) for k in (1, 2))
         return poses * scale, shared * scale
 
-    def _steps_by_estimate(self, fields: Fields, count: int) -> tuple[FloatArray, FloatArray]:
-        """By ``count`` fields; how large they are shows what the parameters do not absorb of them, beyond noise."""
-        poses, shared = self.response.steps_of(fields, count)
-        information, score = np.zeros((count, count)), np.zeros(count)
+    def _steps_by_curvature(self) -> tuple[FloatArray, FloatArray]:
+        """By a plane that is curved alike everywhere, as a wall may be: what pairs absorb of it does not cancel out.
+
+        How much curvature there is shows what they do not absorb of it, beyond noise; of one pair next to nothing.
+        """
+        poses, shared = self.response.steps_of(self._curved, _CURVATURES)
+        information, score = np.zeros((_CURVATURES, _CURVATURES)), np.zeros(_CURVATURES)
         for part in self.response.parts():
-            left = fields(part) + self.response.changes(part, poses, shared)
+            left = self._curved(part) + self.response.changes(part, poses, shared)
             weight = self.response.weight[part.rows]
             information += self.response.curvature * np.einsum("m,mic,mid->cd", weight, left, left)
             score += np.einsum("m,mic,mi->c", weight, left, part.errors)
@@ -194,18 +195,11 @@ class ReliefField:
         return poses * std, shared * std
 
     def _curved(self, part: LinearizedErrors) -> FloatArray:
-        """Errors (m, 2, 3) by a plane that is curved alike everywhere, as a wall may be: along x, aslant, along y."""
+        """Errors (m, 2, C) by curvature along x, aslant, and along y."""
         place, parallax = self._parallax.of(part)
         x, y = self._parallax.from_middle(place).T
         heights = np.column_stack([x * x, math.sqrt(2.0) * x * y, y * y])
         field: FloatArray = parallax[:, :, None] * heights[:, None, :]
-        return field
-
-    def _sheared(self, part: LinearizedErrors) -> FloatArray:
-        """Errors (m, 2, 2) by rows that are read one after the other while the camera moves along x, or y."""
-        o = self.response.adjuster.observations
-        rows = (o.points1[part.rows, 1], o.points2[part.rows, 1])
-        field: FloatArray = part.by_point1 * rows[0][:, None, None] + part.by_point2 * rows[1][:, None, None]
         return field
 
     def _agreement(self) -> tuple[FloatArray, FloatArray]:
@@ -312,15 +306,17 @@ def _spectrum(left: FloatArray, agreement: FloatArray, std: FloatArray) -> Float
 def _variance_between(information: FloatArray, score: FloatArray) -> float:
     """Variance of parameters about 0, by the information (P, P) of noisy estimates of them and their score (P,).
 
-    That with which the squares of the estimates over their variances add up to their number (Paule and Mandel 1982).
+    That with which the squares of the estimates over their variances add up to their number (Paule and Mandel 1982),
+    less what chance makes of it: the positive part of James and Stein's estimate.
     """
     values, vectors = np.linalg.eigh(information)
     seen = values > _UNSEEN * values[-1]
     precision, squared = values[seen], (vectors.T @ score)[seen] ** 2 / values[seen]
-    variance = 0.0
+    excess = float(squared.sum()) - len(squared)
+    expected, variance = len(squared) * (1.0 + 2.0 / max(excess, 1e-300)), 0.0
     for _ in range(_NEWTON_STEPS):  # from below to the root of a convex function
         grown = 1.0 + variance * precision
-        excess = float((squared / grown).sum()) - len(squared)
+        excess = float((squared / grown).sum()) - expected
         if excess <= 0.0:
             break
         variance += excess / float((squared * precision / grown**2).sum())
