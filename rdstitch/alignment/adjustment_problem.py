@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,6 +20,7 @@ from rdstitch.alignment.motion_models import PSI, THETA, MotionModel
 from rdstitch.alignment.noise import shared_variance
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.matching.match_graph import connected_components, spanning_tree
+from rdstitch.system.dataclasses import dataclass, replace
 
 POSE_TILT_SPREAD = math.radians(35.0)
 """Of images of which nothing is known: half of the tilts lie below 40 degrees."""
@@ -117,7 +117,8 @@ class Problem:
             spread = POSE_TILT_SPREAD if model.any_tilt and measured is None else measured or 0.0
         scales, at = _Scales(spread, self.overdispersion), start
         for rounds in itertools.count(1):
-            adjusted = self.adjuster(model, scales.tilt_spread, at.shared, scales.overdispersion).run(at, rough=True)
+            adjuster = self.adjuster(model, scales.tilt_spread, at.shared, scales.overdispersion)
+            adjusted = adjuster.run(at, wide_start=True)
             scales, changed = self._rescaled(scales, adjusted, rounds)
             if not changed:
                 own_tilts = scales.tilt_spread if model.free_tilts else None

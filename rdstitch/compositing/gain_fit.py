@@ -1,7 +1,6 @@
 """Gain and vignetting of each image that explain what overlaps show, in the logarithm of the samples."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -11,6 +10,7 @@ from rdstitch.compositing.cell_least_squares import VISIBLE, Prior, fit_robustly
 from rdstitch.compositing.overlap_cells import Cells
 from rdstitch.compositing.photometric import Exposure, squared_radius
 from rdstitch.compositing.source_images import PlacedImage
+from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.late_imports import sparse
 
 MIN_RELATIVE_GAIN = 0.05

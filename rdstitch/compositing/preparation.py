@@ -2,7 +2,6 @@
 
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Self
 
@@ -25,6 +24,7 @@ from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.results.messages import Message
+from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.system.progress import ShareProgress, unheard
 

@@ -1,7 +1,6 @@
 """One tile of the output: which images contribute where, and their samples blended."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
@@ -16,6 +15,7 @@ from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
 from rdstitch.compositing.warp import Geometry, Warp, border_weight, locate, sample, sample_opacity
 from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.system.dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

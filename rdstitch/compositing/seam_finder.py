@@ -7,7 +7,6 @@ other, so that memory is that of one label per pixel of the reduced canvas.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -19,6 +18,7 @@ from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import border_weight, locate
 from rdstitch.io.reduction import block_mean
+from rdstitch.system.dataclasses import dataclass, replace
 
 NO_OWNER = -1
 

@@ -8,7 +8,6 @@ surroundings: gravel and leaves hide it.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection
+from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.system.late_imports import csgraph, sparse, spatial
 
 DIAGONAL = 1000.0

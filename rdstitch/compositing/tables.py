@@ -5,7 +5,6 @@ image, one product and one sum.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import cv2
@@ -21,6 +20,7 @@ from rdstitch.compositing.source_images import LoadedImage, PlacedImage, smoothe
 from rdstitch.compositing.warp import INTERPOLATION, remap, sample_places
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
+from rdstitch.system.dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ Coordinates are computed on a lattice of the canvas, and interpolated linearly b
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -21,6 +20,7 @@ from rdstitch.compositing.source_images import Displacement, LoadedImage, Placed
 from rdstitch.compositing.transparency import OPAQUE
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
+from rdstitch.system.dataclasses import dataclass, replace
 
 LATTICE_STEPS = (32, 16, 8, 4, 2, 1)
 """Spacings of lattices, canvas pixels; all have the nodes of the first."""

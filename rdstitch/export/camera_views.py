@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
+from rdstitch.system.dataclasses import dataclass, replace
 
 ComplexArray = NDArray[np.complex128]
 

@@ -1,7 +1,6 @@
 """Results of detection and matching: keypoints and descriptors of an image, and corresponding points of two."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, Rows
 from rdstitch.errors import ArgumentError
+from rdstitch.system.dataclasses import dataclass, replace
 
 Descriptors = NDArray[np.float32] | NDArray[np.uint8]
 
@@ -36,10 +36,10 @@ class Features:
     image_size: tuple[int, int] | None = None  # width and height of the image, pixels
     # keypoints that the image shows at its working size, before any were chosen, or a larger image was used for want of
     # them; None where that is not known
-    shown: int | None = None
+    detected_count: int | None = None
     # whether these are few, and most of them only just strong enough: they are not seen at the contrast divided by what
     # equalizing it locally multiplies it by at most
-    faint: bool = False
+    low_contrast: bool = False
 
     def __post_init__(self) -> None:
         count = len(self.points)

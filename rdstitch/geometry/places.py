@@ -1,6 +1,6 @@
 """Places on the Earth, of cameras and of points that images show."""
 
-from dataclasses import dataclass
+from rdstitch.system.dataclasses import dataclass
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -18,6 +17,7 @@ from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.keyframes import Wanted, wanted_frames
 from rdstitch.inputs.odometry import Odometry, odometry_of, yaw_of
 from rdstitch.io.video import write_frame
+from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.file_access import read_beginning
 
 if TYPE_CHECKING:

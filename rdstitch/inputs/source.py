@@ -1,7 +1,6 @@
 """The input images: which files, what their headers say, and the camera each was taken with."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -28,6 +27,7 @@ from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
 from rdstitch.options.feature_options import WORK_MEGAPIXELS
 from rdstitch.results.messages import Message, left_out
 from rdstitch.system.cache import Cache
+from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.system.file_access import held_in_memory, is_url
 
 _HELD_UPRIGHT = 6  # EXIF orientation

@@ -1,7 +1,6 @@
 """Features and matches of a whole set, on disk: between stages, processes and machines travel their names."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -11,6 +10,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features import Correspondences, Features, PackedFeatures
 from rdstitch.geometry.camera import Camera
 from rdstitch.system.cache import Cache, Stored
+from rdstitch.system.dataclasses import dataclass, replace
 
 Size = tuple[int, int]
 
@@ -24,8 +24,10 @@ class StoredFeatures:
     # width and height of the image in whose pixels they are wanted; None: as they are stored
     image_size: Size | None = None
     chosen: NDArray[np.intp] | None = None  # (N,), intp: those that are wanted, in their order; None: all
-    shown: int = 0  # keypoints that the image shows at its working size, see :class:`rdstitch.features.Features`
-    faint: bool = False  # whether these are few and weak
+    detected_count: int = (
+        0  # keypoints that the image shows at its working size, see :class:`rdstitch.features.Features`
+    )
+    low_contrast: bool = False
 
     @classmethod
     def of(cls, features: Features) -> Self:
@@ -36,8 +38,8 @@ class StoredFeatures:
     def at(cls, stored: Stored[PackedFeatures]) -> Self:
         """Features wherever they lie; they are read once."""
         features = stored.load().features
-        shown = len(features) if features.shown is None else features.shown
-        return cls(stored, len(features), shown=shown, faint=features.faint)
+        detected_count = len(features) if features.detected_count is None else features.detected_count
+        return cls(stored, len(features), detected_count=detected_count, low_contrast=features.low_contrast)
 
     def __len__(self) -> int:
         """Number of features."""

@@ -1,7 +1,6 @@
 """What pairs of images see of λ, of each of their two images on its own."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -12,6 +11,7 @@ from rdstitch.matching.links import spread_choice
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.per_image_distortion import PerImageDistortion, estimate_per_image_distortion
+from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import sparse, sparse_linalg
 
 _MAX_DISTANCE = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two
@@ -111,7 +111,7 @@ def _per_image_distortions(pairs: Sequence[PairRegistration], threshold: float) 
 def _matches_near_one_lens(pair: PairRegistration, threshold: float) -> tuple[FloatArray, FloatArray]:
     """Matches not too far from where one λ puts them, evenly spread, pixels."""
     matched = pair.correspondences
-    apart = np.linalg.norm(pair.relation.transfer(matched.points1) - matched.points2, axis=1)
-    near = np.flatnonzero(apart < _MAX_DISTANCE * threshold)
+    error = np.linalg.norm(pair.relation.transfer(matched.points1) - matched.points2, axis=1)
+    near = np.flatnonzero(error < _MAX_DISTANCE * threshold)
     near = near[spread_choice(matched.points1[near], _MAX_MATCHES)]
     return matched.points1[near], matched.points2[near]

@@ -5,7 +5,6 @@ and matches, which lie in the cache of the run, and give names back.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from threading import Lock
 from typing import NamedTuple
@@ -20,6 +19,7 @@ from rdstitch.matching.feature_store import StoredFeatures, StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.system.cache import Cache
+from rdstitch.system.dataclasses import dataclass, replace
 
 Pair = tuple[int, int]
 

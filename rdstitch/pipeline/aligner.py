@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -25,6 +24,7 @@ from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.robust.loss import sigma_of
 from rdstitch.system.cache import Cache
+from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.verification.limits import Limits
 
@@ -119,7 +119,7 @@ class Aligner:
         ground = over_rough_ground(pairs, self.threshold)
         if ground is not pairs and not self._explains(aligned.alignment, pairs, ground):
             over = self._drafted(ground)
-            if over.alignment.rms <= Limits.rough_error.value * self.threshold:  # else it is not one ground
+            if over.alignment.rms <= Limits.max_rough_rms.value * self.threshold:  # else it is not one ground
                 aligned = replace(over, pairs=tuple(pairs), rough=True)
         return self.metric(aligned) if self.needs_poses else aligned
 

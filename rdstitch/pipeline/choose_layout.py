@@ -9,7 +9,6 @@ homographies, and, where something fills a good part of the images and moves of 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
@@ -31,6 +30,7 @@ from rdstitch.pipeline.whole_pixels import on_whole_pixels
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
+from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.verification.verdict import RefusedError
 
 _MODELS = ("rotation", "pose", "homography")
@@ -117,7 +117,7 @@ def _plane_behind(
     registration: Registration, first: LaidOut | LimitError, trials: _Trials, aligner: Aligner
 ) -> tuple[Registration, LaidOut | LimitError]:
     """The plane behind what moves of its own, with its layout, where its images look more alike; else what is given."""
-    plane = plane_of_most(registration, aligner)
+    plane = plane_of_most(registration, aligner, trials.options.threads)
     if plane is None or not _joins(plane, registration, aligner.threshold):
         return registration, first
     behind = trials.attempt(plane)

@@ -7,7 +7,6 @@ a stretch and with local contrast equalized. Where fewer do, or show few for the
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -23,6 +22,7 @@ from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
 from rdstitch.options.feature_options import CLOSER
 from rdstitch.pipeline.run_on_sources import run_on_sources
 from rdstitch.system.cache import Cache
+from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.process_memory import reuse_freed_memory
 from rdstitch.system.progress import Progress
 
@@ -164,14 +164,14 @@ def _show_little(sources: Sequence[Source], detected: DetectedFeatures, options:
     for index, (source, count) in enumerate(zip(sources, counts.tolist(), strict=True)):
         size = np.prod(source.metadata.size) / source.reduction(megapixels) ** 2 / 1e6
         few = count < _LOW_SHARE * min(most, max(_USUAL_DENSITY * size, usual))
-        if few and detected.features.items[index].faint and index not in detected.damaged:
+        if few and detected.features.items[index].low_contrast and index not in detected.damaged:
             poor.append(index)
     return poor
 
 
 def _shown(features: Sequence[StoredFeatures]) -> IntArray:
     """Keypoints that each image shows at its working size, (N,)."""
-    return np.array([item.shown for item in features], dtype=np.intp)
+    return np.array([item.detected_count for item in features], dtype=np.intp)
 
 
 def _stretch_of(

@@ -10,7 +10,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import TrajectoryFrame
 from rdstitch.export.trajectory_files import covariance_in_frame, in_frame, ros_covariance
 from rdstitch.results.messages import Message
-from rdstitch.tracking import Tracked
+from rdstitch.tracking import TrackingResult
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Pose:
         In the video, camera or stream that it comes from, else in the order of arrival.
     timestamp : float
         s; NaN where not known.
-    tracked : Tracked
+    tracked : TrackingResult
         Its place and λ, as far as they are known.
     reason : str
         Why there is no place; empty where there is one.
@@ -53,7 +53,7 @@ class Pose:
     name: str
     number: int
     timestamp: float
-    tracked: Tracked = field(default_factory=Tracked)
+    tracked: TrackingResult = field(default_factory=TrackingResult)
     reason: str = ""
     poses: FollowedPoses = FollowedPoses()
     messages: tuple[Message, ...] = ()

@@ -1,12 +1,11 @@
 """A similarity of the plane between two sets of points of which some, fewer than half, are wrong."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.robust.loss import robust_weight
+from rdstitch.system.dataclasses import dataclass
 
 OUTLYING = 3.0
 """Standard deviations from which on a point is an outlier."""
@@ -39,8 +38,8 @@ def fit_similarity(source: Points, target: Points, std: float) -> SimilarityFit:
     count = len(source)
     anchors = evenly_spaced(count, _ANCHORS)
     one, two = (anchors[side] for side in np.triu_indices(len(anchors), 1))
-    apart = source[two] - source[one]
-    scale = np.divide(target[two] - target[one], apart, out=np.zeros_like(apart), where=apart != 0)
+    offset = source[two] - source[one]
+    scale = np.divide(target[two] - target[one], offset, out=np.zeros_like(offset), where=offset != 0)
     residuals = np.abs(target - scale[:, None] * (source - source[one][:, None]) - target[one][:, None])
     # Two points always agree: the quantile is one of all that are not needed to fit.
     quantile = np.sort(residuals, axis=1)[:, (count + 3) // 2 - 1]

@@ -1,12 +1,12 @@
 """What pairs of tiles show: matches of the blocks of their overlaps."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.stage.refinement import BlockMatches
+from rdstitch.system.dataclasses import dataclass
 
 
 @dataclass(frozen=True, eq=False)

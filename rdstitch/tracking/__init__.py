@@ -6,7 +6,7 @@ steering; loops are closed and every pair is used when the whole sequence is reg
 
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 from rdstitch.tracking.preview import Preview
-from rdstitch.tracking.tracked_frame import Tracked
+from rdstitch.tracking.tracked_frame import TrackingResult
 from rdstitch.tracking.tracker import FrameTracker, TrackingOptions
 
-__all__ = ["CameraPose", "FrameTracker", "Placement", "PlaneSimilarity", "Preview", "Tracked", "TrackingOptions"]
+__all__ = ["CameraPose", "FrameTracker", "Placement", "PlaneSimilarity", "Preview", "TrackingOptions", "TrackingResult"]

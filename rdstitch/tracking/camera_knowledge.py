@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -17,9 +16,10 @@ from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
+from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.tracking.metric_plane import MetricPlane
-from rdstitch.tracking.placement import CameraPose
-from rdstitch.tracking.tracked_frame import Frame, PlacedFrame
+from rdstitch.tracking.placement import YAW, CameraPose, Placement
+from rdstitch.tracking.tracked_frame import Frame, TrackedFrame
 
 _KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of an image of 640 x 480 pixels, over half of it
 _MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
@@ -34,8 +34,8 @@ class CameraRevision:
     plane: MetricPlane | None
     delay: float  # delay, delay_std: s
     delay_std: float
-    longer: float | None = None  # all keyframes are placed anew, with lengths so many times as long; None: none are
-    given_again: bool = False  # whether the places of earlier frames are given again, as lengths are far surer
+    length_factor: float | None = None  # by which lengths change as all keyframes are placed again; None: none are
+    report_again: bool = False  # whether earlier frames are reported again, as their lengths are far surer
     messages: tuple[Message, ...] = ()
 
 
@@ -70,34 +70,32 @@ class CameraKnowledge:
         """True where λ was given, or is known well enough to be kept."""
         return self.pair.distortion is not None
 
-    @property
-    def lens_given(self) -> bool:
-        """Whether the cameras of the frames have their lens."""
-        return self.given.lens_known
-
-    def camera_of(self, camera: Camera) -> Camera:
+    def camera_of(self, frame: Frame) -> Camera:
         """That of a frame with the lens as it is known so far."""
-        if self.lens_given:
-            return camera
-        return camera.with_coefficients(self.distortion if math.isfinite(self.distortion_std) else 0.0)
+        if self.given.lens_known:
+            return frame.camera
+        return frame.camera.with_coefficients(self.distortion if math.isfinite(self.distortion_std) else 0.0)
 
-    def given_plane(self, camera: Camera) -> MetricPlane | None:
-        """What is given of the camera, where that suffices for metric poses from the second frame on."""
+    def camera_with_lens_of(self, other: Placement, frame: Frame) -> Camera:
+        """That of a frame with the lens that another one was placed with."""
+        return frame.camera if self.given.lens_known else frame.camera.with_coefficients(*other.camera.coefficients)
+
+    def adopt_given(self, camera: Camera) -> None:
+        """Adopt the given focal length and tilt: with both, poses are metric from the second frame on."""
         tilt, rigid = self.given.tilt, self.model in ("auto", "rigid")
         if self.focal_contradicted or not self.is_metric(camera) or not (rigid or self.model == "similarity"):
-            return None
+            return
         assert camera.focal is not None
         self.focal, self.stated_std = camera.focal / camera.scale, camera.focal_log_std
         self.length_std, _ = judged_focal(self.stated_std, 0.0, math.inf)
         self.given_length_std = self.length_std
-        if tilt is None:
-            return None
-        self.model = "rigid" if rigid else "similarity"
-        return MetricPlane(self.focal, tilt, rigid)
+        if tilt is not None:
+            self.model = "rigid" if rigid else "similarity"
+            self.plane = MetricPlane(self.focal, tilt, rigid)
 
     def is_metric(self, camera: Camera) -> bool:
         """Whether lens and focal length of a camera are given."""
-        return self.lens_given and camera.focal is not None and camera.focal_source in ("option", "file")
+        return self.given.lens_known and camera.focal is not None and camera.focal_source in ("option", "file")
 
     def attitude(self, frame: Frame) -> tuple[float, float] | None:
         """(ψ, θ), radians, as measured when the frame was taken."""
@@ -117,7 +115,7 @@ class CameraKnowledge:
         self.delay, self.delay_std = revision.delay, revision.delay_std
         self.focal_contradicted |= revision.focal != self.focal
         self.focal, self.length_std, self.plane = revision.focal, revision.length_std, revision.plane
-        if revision.given_again:
+        if revision.report_again:
             self.given_length_std = self.length_std
 
     def vote(self, links: Sequence[Link]) -> None:
@@ -130,24 +128,29 @@ class CameraKnowledge:
     def cameras_for(self, keyframes: Sequence[Frame], focal_std: float | None) -> list[Camera]:
         """Those of keyframes that are aligned, with the focal length of the map if it is to be kept so closely."""
         cameras = [keyframe.camera.with_focal() for keyframe in keyframes]
-        if self.pair.distortion is not None and not self.lens_given:
+        if self.pair.distortion is not None and not self.given.lens_known:
             cameras = [camera.with_coefficients(self.pair.distortion) for camera in cameras]
         if self.focal is None or focal_std is None:
             return cameras
         focal = self.focal
         return [c.with_focal(focal * c.scale, "file", focal_std * focal * c.scale) for c in cameras]
 
+    def _attitudes(self, keyframes: Sequence[Frame]) -> FloatArray | None:
+        """(ψ, θ) of each, (N, 2), radians; None unless all were measured."""
+        attitudes = [attitude for keyframe in keyframes if (attitude := self.attitude(keyframe)) is not None]
+        return np.array(attitudes) if len(attitudes) == len(keyframes) else None
+
     def options_for(self, keyframes: Sequence[Frame]) -> AlignmentOptions:
         """Of an alignment of keyframes."""
-        attitudes = [attitude for keyframe in keyframes if (attitude := self.attitude(keyframe)) is not None]
-        measured, known = len(attitudes) == len(keyframes), self.distortion_known
-        std = max(self.attitude_std(keyframe) for keyframe in keyframes) if measured else self.given.attitudes_std
+        attitudes, known, std = self._attitudes(keyframes), self.distortion_known, self.given.attitudes_std
+        if attitudes is not None:
+            std = max(self.attitude_std(keyframe) for keyframe in keyframes)
         return replace(
             self.given,
             model=self.model,
             lens="auto" if known else "division",
             lens_known=known,
-            attitudes=np.array(attitudes) if measured else None,
+            attitudes=attitudes,
             delayed_attitudes=None,
             attitudes_std=std,
             pose_covariance=not known,
@@ -159,42 +162,33 @@ class CameraKnowledge:
             self.distortion, self.distortion_std = alignment.distortion, alignment.distortion_std
         if not keeps_focal:
             self.focal, self.length_std = alignment.focal, alignment.length_std
-        poses, tilt = alignment.poses, alignment.tilt
-        self.shape_std = (0.0, 0.0)
-        if poses is not None and poses.covariance is not None:
-            path = Trajectory.from_poses(poses)
-            far = np.linalg.norm(path.position, axis=1)
-            last = int(np.argmax(far))
-            if path.covariance is not None and far[last] > 0.0:
-                # Across: along it is what all lengths share.
-                variance = float(np.linalg.eigvalsh(path.covariance[last, :2, :2])[0]) / far[last] ** 2
-                self.shape_std = math.sqrt(max(variance, 0.0)), math.sqrt(float(path.covariance[:, 3, 3].max()))
-        measured = [attitude for keyframe in keyframes if (attitude := self.attitude(keyframe)) is not None]
-        tilts_known = len(measured) == len(keyframes)
-        known = ("rigid", "similarity", *(("tilting",) if tilts_known else ()))
-        if alignment.model in known and poses is not None and tilt and self.focal:
-            mount = np.array(tilt)
-            if tilts_known:
-                mount = np.nanmedian(poses.tilt - np.array(measured), axis=0)
-            given = self.given.tilt is not None
-            tilt_std = None if given else math.sqrt(float(np.trace(alignment.covariance[:2, :2])))
-            rigid = alignment.model == "rigid"
-            self.plane = MetricPlane(self.focal, (float(mount[0]), float(mount[1])), rigid, tilt_std)
-        else:
-            self.plane = None
+        self.shape_std = _shape_std(alignment)
+        self.plane = self._metric_plane(alignment, self._attitudes(keyframes))
         if self.distortion_known:
             self.model = alignment.model
         elif self.distortion_std <= _KNOWN_STD and len(keyframes) >= _MIN_KEYFRAMES_FOR_LENS:
             self.pair = replace(self.pair, distortion=self.distortion, solver="auto")
             self.model = alignment.model
 
-    def covariance(self, placed: PlacedFrame, pose: CameraPose) -> FloatArray | None:
+    def _metric_plane(self, alignment: Alignment, attitudes: FloatArray | None) -> MetricPlane | None:
+        """The plane that an alignment shows a camera to move over, by its attitudes (N, 2) where these are known."""
+        poses, tilt = alignment.poses, alignment.tilt
+        known_tilts = ("rigid", "similarity", *(() if attitudes is None else ("tilting",)))
+        if alignment.model not in known_tilts or poses is None or not tilt or not self.focal:
+            return None
+        if attitudes is not None:
+            tilt = np.nanmedian(poses.tilt - attitudes, axis=0).tolist()
+        given = self.given.tilt is not None
+        tilt_std = None if given else math.sqrt(float(np.trace(alignment.covariance[:2, :2])))
+        return MetricPlane(self.focal, (tilt[0], tilt[1]), alignment.model == "rigid", tilt_std)
+
+    def covariance(self, placed: TrackedFrame, pose: CameraPose) -> FloatArray | None:
         """Of a frame's pose, with what all frames have in common but for the unit of lengths."""
-        known, (relative, yaw_std) = placed.place.covariance, self.shape_std
-        if known is None:
+        covariance, (relative, yaw_std) = placed.place.covariance, self.shape_std
+        if covariance is None:
             if not relative:
                 return None
-            known = np.zeros((4, 4))
+            covariance = np.zeros((4, 4))
         far = math.hypot(pose.x, pose.y)
         if self.plane is not None and not relative:
             relative = yaw_std = self.plane.bend_std(self.length_std)
@@ -202,4 +196,18 @@ class CameraKnowledge:
         if placed.frame.attitude is not None:
             # The foot of the camera is off by the error of its tilt, and so is that of the first frame.
             place += 2.0 * (pose.height * self.attitude_std(placed.frame)) ** 2
-        return np.asarray(known + np.diag([place, place, 0.0, yaw_std**2]))
+        return np.asarray(covariance + np.diag([place, place, 0.0, yaw_std**2]))
+
+
+def _shape_std(alignment: Alignment) -> tuple[float, float]:
+    """Standard deviation of a path's shape: across, relative to its length, and of its yaw, radians; 0 if not known."""
+    if alignment.poses is None or alignment.poses.covariance is None:
+        return 0.0, 0.0
+    path = Trajectory.from_poses(alignment.poses)
+    distance = np.linalg.norm(path.position, axis=1)
+    farthest = int(np.argmax(distance))
+    if path.covariance is None or not distance[farthest] > 0.0:
+        return 0.0, 0.0
+    # Across: along it is what all lengths share.
+    variance = float(np.linalg.eigvalsh(path.covariance[farthest, :2, :2])[0]) / distance[farthest] ** 2
+    return math.sqrt(max(variance, 0.0)), math.sqrt(float(path.covariance[:, YAW, YAW].max()))

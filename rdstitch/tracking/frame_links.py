@@ -15,25 +15,19 @@ from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
 from rdstitch.robust import PairMatches, estimate_radial_homographies
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
-from rdstitch.tracking.placement import Placement
-from rdstitch.tracking.tracked_frame import MIN_INLIERS, Frame, PlacedFrame
+from rdstitch.tracking.tracked_frame import MIN_INLIERS, Frame, TrackedFrame
 
 MATCH_ERROR = 1.5  # pixels by which a corner that was followed may be off the motion of the plane
 _AGREEING = 0.5  # share of the corners that must agree on it
 _WRONG = 0.05  # share of the matches that agree by chance
 
-Matched = tuple[PlacedFrame, FloatArray, FloatArray, FloatArray | None]
+Matched = tuple[TrackedFrame, FloatArray, FloatArray, FloatArray | None]
 """A keyframe, its points (N, 2), those of the frame, and their quality (N,)."""
 
 
 def agree(inliers: BoolArray) -> bool:
     """Whether so many of the corners (N,) agree that they show where a frame lies."""
     return bool(inliers.sum() >= max(MIN_INLIERS, _AGREEING * len(inliers)))
-
-
-def camera_beside(frame: Frame, beside: Placement, *, lens_given: bool) -> Camera:
-    """The camera of a frame with the lens of another one."""
-    return frame.camera if lens_given else frame.camera.with_coefficients(*beside.camera.coefficients)
 
 
 def fitted_homography(
@@ -55,26 +49,26 @@ def fitted_homography(
     return np.asarray(homography, dtype=np.float64), inliers
 
 
-def links_by_corners(placed: PlacedFrame, others: Sequence[PlacedFrame], known: CameraKnowledge) -> list[Link]:
+def links_by_corners(placed: TrackedFrame, others: Sequence[TrackedFrame], knowledge: CameraKnowledge) -> list[Link]:
     """Links of keyframes with a frame whose place is about known."""
     frame = placed.frame
     matched: list[Matched] = [
         (other, *matched_corners(other.frame.image, frame.image, frame.corners, partial(placed.points_in, other)), None)
         for other in others
     ]
-    return _registered(frame, matched, known)
+    return _registered(frame, matched, knowledge)
 
 
 def links_by_features(
-    frame: Frame, others: Sequence[PlacedFrame], match: Matcher, known: CameraKnowledge
+    frame: Frame, others: Sequence[TrackedFrame], match: Matcher, knowledge: CameraKnowledge
 ) -> list[Link]:
     """The same where nothing is known of its place."""
     found = [(other, match(other.frame.features, frame.features)) for other in others]
-    return _registered(frame, [(other, m.points1, m.points2, -m.ratio) for other, m in found], known)
+    return _registered(frame, [(other, m.points1, m.points2, -m.ratio) for other, m in found], knowledge)
 
 
-def _registered(frame: Frame, matched: Sequence[Matched], known: CameraKnowledge) -> list[Link]:
-    if not known.distortion_known:
+def _registered(frame: Frame, matched: Sequence[Matched], knowledge: CameraKnowledge) -> list[Link]:
+    if not knowledge.distortion_known:
         pairs = [
             PairMatches(points1, points2, other.frame.camera.with_focal(), frame.camera.with_focal(), quality)
             for other, points1, points2, quality in matched
@@ -82,14 +76,13 @@ def _registered(frame: Frame, matched: Sequence[Matched], known: CameraKnowledge
         return [
             Link(other.number, frame.number, points1[fit.inliers], points2[fit.inliers], fit)
             for (other, points1, points2, _), fit in zip(
-                matched, estimate_radial_homographies(pairs, known.pair), strict=True
+                matched, estimate_radial_homographies(pairs, knowledge.pair), strict=True
             )
             if fit and fit.inliers.sum() >= MIN_INLIERS
         ]
     links = []  # where the lens is known, a homography of undistorted points
     for other, points1, points2, _ in matched:
-        beside = other.place.placement
-        camera, camera2 = (camera_beside(one, beside, lens_given=known.lens_given) for one in (other.frame, frame))
+        camera, camera2 = (knowledge.camera_with_lens_of(other.place.placement, one) for one in (other.frame, frame))
         homography, inliers = fitted_homography(camera2, camera, points2, points1, MATCH_ERROR)
         # A few wrong matches do not make a link: a homography takes four of any.
         if homography is None or inliers.sum() < MIN_INLIERS + _WRONG * len(points1):

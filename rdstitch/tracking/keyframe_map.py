@@ -1,19 +1,19 @@
 """The map: the last keyframes, which are aligned together, older ones, and the frames placed by them."""
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.matching.links import Link
+from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
-from rdstitch.tracking.frame_links import MATCH_ERROR, camera_beside, fitted_homography
+from rdstitch.tracking.frame_links import MATCH_ERROR, fitted_homography
 from rdstitch.tracking.metric_plane import chained
-from rdstitch.tracking.placement import PlaneSimilarity
+from rdstitch.tracking.placement import Placement, PlaneSimilarity
 from rdstitch.tracking.state import TrackState
-from rdstitch.tracking.tracked_frame import Frame, MapPlace, PlacedFrame
+from rdstitch.tracking.tracked_frame import Frame, FramePlace, TrackedFrame
 
 _WINDOW = 48  # last keyframes, that are aligned together
 _KEPT = 200  # older keyframes at the most, among which a lost frame looks for its place
@@ -27,19 +27,19 @@ _ROUGH = 0.02  # sides: how far a corner may be off from frame to frame, or whil
 class KeyframeMap:
     """Keyframes in the order in which they came, or were found again, and what is known of their camera."""
 
-    known: CameraKnowledge
+    knowledge: CameraKnowledge
     state: TrackState
-    keyframes: list[PlacedFrame]  # the last ones
-    older: list[PlacedFrame] = field(default_factory=list)
+    keyframes: list[TrackedFrame]  # the last ones
+    older: list[TrackedFrame] = field(default_factory=list)
     links: list[Link] = field(default_factory=list)  # between the last ones
     # frames between keyframes, and the points of a keyframe that they show: before and now
-    between: deque[tuple[PlacedFrame, PlacedFrame, FloatArray, FloatArray]] = field(
+    between: deque[tuple[TrackedFrame, TrackedFrame, FloatArray, FloatArray]] = field(
         default_factory=lambda: deque(maxlen=_REVISED)
     )
     seen: int = 0  # keyframes after the first
     searched: int = 0  # keyframes among which a lost frame has looked for its place
 
-    def add(self, frame: PlacedFrame, links: Sequence[Link]) -> None:
+    def add(self, frame: TrackedFrame, links: Sequence[Link]) -> None:
         """The next keyframe."""
         if self.between and self.between[-1][0].number == frame.number:
             self.between.pop()
@@ -50,7 +50,7 @@ class KeyframeMap:
         kept = {keyframe.number for keyframe in self.keyframes}
         self.links = [link for link in (*self.links, *links) if link.image1 in kept and link.image2 in kept]
 
-    def keep_between(self, frame: PlacedFrame, before: FloatArray, now: FloatArray) -> None:
+    def keep_between(self, frame: TrackedFrame, before: FloatArray, now: FloatArray) -> None:
         """Keep what a frame between keyframes shows of the last one, instead of what was kept of it."""
         if self.between and self.between[-1][0].number == frame.number:
             self.between.pop()
@@ -62,26 +62,26 @@ class KeyframeMap:
         return not self.older
 
     @property
-    def by_number(self) -> dict[int, PlacedFrame]:
+    def by_number(self) -> dict[int, TrackedFrame]:
         """All keyframes."""
         return {keyframe.number: keyframe for keyframe in (*self.older, *self.keyframes)}
 
     @property
-    def frames(self) -> dict[int, PlacedFrame]:
+    def frames(self) -> dict[int, TrackedFrame]:
         """All frames that may still find their place, or another one."""
         return {frame.number: frame for frame, *_ in self.between} | self.by_number
 
     @property
     def keeps_focal(self) -> bool:
         """Whether alignments keep the focal length: that of one map must not depend on the window."""
-        return self.known.focal is not None and (self.known.stated_std > 0.0 or not self.whole)
+        return self.knowledge.focal is not None and (self.knowledge.stated_std > 0.0 or not self.whole)
 
     @property
-    def partners(self) -> list[PlacedFrame]:
+    def partners(self) -> list[TrackedFrame]:
         """What a frame is matched with."""
         return self.keyframes[: -_PARTNERS - 1 : -1]
 
-    def to_search(self) -> list[PlacedFrame]:
+    def to_search(self) -> list[TrackedFrame]:
         """Further keyframes for a frame without a place, others each time while the track is lost."""
         further = [*self.keyframes[:-_PARTNERS][::-1], *self.older[::-1]]
         start = self.searched % max(len(further), 1) if self.state.lost else 0
@@ -94,61 +94,90 @@ class KeyframeMap:
         """Whether a lost frame was compared with all."""
         return self.searched >= len(self.older) + max(len(self.keyframes) - _PARTNERS, 0)
 
-    def found_again(self, shown: Sequence[PlacedFrame]) -> None:
-        """Keyframes that a frame shows again are neighbours again."""
+    def found_again(self, shown: Sequence[TrackedFrame]) -> None:
+        """Make keyframes that a frame shows again the last ones."""
         self.keyframes = [k for k in self.keyframes if k not in shown] + list(shown)[::-1]
         self.older = [k for k in self.older if k not in shown]
 
     def place(
-        self, frame: Frame, other: PlacedFrame, before: FloatArray, now: FloatArray, *, rough: bool = False
-    ) -> MapPlace | None:
+        self, frame: Frame, other: TrackedFrame, before: FloatArray, now: FloatArray, *, rough: bool = False
+    ) -> FramePlace | None:
         """Where a frame lies by points (N, 2) of a keyframe that it shows too; None where no homography fits them."""
-        start, known = other.place, self.known
-        camera = camera_beside(frame, start.placement, lens_given=known.lens_given)
-        rough |= self.state.initialising and not known.distortion_known
+        start, knowledge = other.place, self.knowledge
+        camera = knowledge.camera_with_lens_of(start.placement, frame)
+        rough |= self.state.initialising and not knowledge.distortion_known
         error = _ROUGH * max(frame.camera.image_size) if rough else MATCH_ERROR
         homography, inliers = fitted_homography(start.placement.camera, camera, before, now, error)
         if homography is None:
             return None
-        if known.plane is None or start.covariance is None:
-            beside = replace(start.placement, camera=camera, homography=start.placement.homography @ homography)
-            return MapPlace(beside, start.aligned, None, inliers)
-        below = known.plane.below(camera, known.attitude(frame))
-        tilt_std = 0.0 if frame.attitude is None else known.attitude_std(frame)
+        if knowledge.plane is None or start.covariance is None:
+            placement = replace(start.placement, camera=camera, homography=start.placement.homography @ homography)
+            return FramePlace(placement, start.aligned, None, inliers)
+        below = knowledge.plane.below(camera, knowledge.attitude(frame))
+        tilt_std = 0.0 if frame.attitude is None else knowledge.attitude_std(frame)
         places = start.placement.to_plane(before[inliers])
-        placement, step = known.plane.placed(below, now[inliers], places, tilt_std=tilt_std)
+        placement, step = knowledge.plane.placed(below, now[inliers], places, tilt_std=tilt_std)
         at, was, covariance = placement.pose, start.placement.pose, None
         if at is not None and was is not None:
             covariance = chained(start.covariance, step, (at.x - was.x, at.y - was.y), was.height)
-        return MapPlace(placement, start.aligned, covariance, inliers)
+        return FramePlace(placement, start.aligned, covariance, inliers)
 
-    def place_by_links(self, frame: Frame, links: Sequence[Link]) -> MapPlace | None:
+    def place_by_links(self, frame: Frame, links: Sequence[Link]) -> FramePlace | None:
         """Where a frame lies by the largest of its links with keyframes; None where there is none, or it cannot be."""
         by_number = self.by_number
-        known = [link for link in links if link.image2 == frame.number and link.image1 in by_number]
-        if not known:
+        usable = [link for link in links if link.image2 == frame.number and link.image1 in by_number]
+        if not usable:
             return None
-        best = max(known, key=lambda link: (by_number[link.image1].place.aligned, len(link)))
+        best = max(usable, key=lambda link: (by_number[link.image1].place.aligned, len(link)))
         return self.place(frame, by_number[best.image1], best.points1, best.points2)
 
-    def place_anew(self, longer: float) -> None:
-        """Place all keyframes by the camera as it is known now, by which lengths are so many times as long."""
-        assert self.known.plane is not None
+    def confirm_first(self, second: TrackedFrame) -> TrackedFrame | None:
+        """The first keyframe, if it lies below a given camera, and a second frame is the first to show that."""
+        first = self.keyframes[0]
+        unconfirmed = len(self.keyframes) == 1 and not first.place.aligned and self.knowledge.plane is not None
+        if not unconfirmed or second.place.covariance is None:
+            return None
+        self.state = self.state.with_plane()
+        for frame in (first, second):
+            frame.place = replace(frame.place, aligned=True)
+        return first
+
+    def align(self, placements: Mapping[int, Placement]) -> None:
+        """Move keyframes, by number, to where an alignment has them."""
+        self.state = self.state.with_plane()
+        for number, keyframe in self.by_number.items():
+            if number in placements:
+                keyframe.place = replace(keyframe.place, placement=placements[number], aligned=True, predicted=False)
+
+    def follow_aligned(self, aligned: Container[int]) -> None:
+        """Move the last keyframes that an alignment left out to where their links with the others have them."""
+        covariance = np.zeros((4, 4))
+        for keyframe in self.keyframes if self.knowledge.plane is not None else []:
+            if keyframe.place.aligned:  # without a covariance, errors grow again from that of the keyframe before
+                covariance = covariance if keyframe.place.covariance is None else keyframe.place.covariance
+                keyframe.place = replace(keyframe.place, covariance=covariance)
+        for keyframe in self.keyframes:
+            if keyframe.number not in aligned:
+                keyframe.place = self.place_by_links(keyframe.frame, self.links) or keyframe.place
+
+    def rescale(self, length_factor: float) -> None:
+        """Place all keyframes again by the camera as it is known now, which changes all lengths by a factor."""
+        assert self.knowledge.plane is not None
         first, *others = self.keyframes
         was, move = first.place.pose, PlaneSimilarity(1.0, 0.0)
         if was is not None:
-            move = PlaneSimilarity(np.exp(-1j * was.yaw).item(), longer * complex(was.x, was.y))
-        below = move.applied(self.known.plane.below(first.frame.camera, self.known.attitude(first.frame)))
+            move = PlaneSimilarity(np.exp(-1j * was.yaw).item(), length_factor * complex(was.x, was.y))
+        below = move.applied(self.knowledge.plane.below(first.frame.camera, self.knowledge.attitude(first.frame)))
         covariance = np.zeros((4, 4)) if first.place.covariance is None else first.place.covariance
         first.place = replace(first.place, placement=below, aligned=True, covariance=covariance)
         self.state = self.state.with_plane()
         for keyframe in (*self.older, *others):
-            enlarged = PlaneSimilarity(longer, 0.0).applied(keyframe.place.placement)
+            enlarged = PlaneSimilarity(length_factor, 0.0).applied(keyframe.place.placement)
             keyframe.place = replace(keyframe.place, placement=enlarged)
         for keyframe in others:
             keyframe.place = self.place_by_links(keyframe.frame, self.links) or keyframe.place
 
-    def revise(self, waiting: set[int] | None = None) -> list[PlacedFrame]:
+    def revise(self, waiting: set[int] | None = None) -> list[TrackedFrame]:
         """Place the frames between keyframes anew; of all that have a place those that were waiting, None: all."""
         revised = self.by_number
         for placed, keyframe, before, now in self.between:

@@ -8,7 +8,7 @@ from rdstitch.errors import RdstitchError
 from rdstitch.inputs.source import Source
 from rdstitch.io.write import write_image
 from rdstitch.results.messages import Message
-from rdstitch.tracking import Preview, Tracked
+from rdstitch.tracking import Preview, TrackingResult
 
 _MEGAPIXELS = 0.08  # 10⁶ pixels that a keyframe is read with
 
@@ -20,7 +20,7 @@ class LivePreview:
         self._file, self._refresh, self._mosaic = file, refresh, Preview()
         self._written, self._changed, self._failed = -math.inf, False, False
 
-    def add(self, source: Source, result: Tracked) -> list[Message]:
+    def add(self, source: Source, result: TrackingResult) -> list[Message]:
         """Paint a keyframe; write the file when that is due. What fails is told once: the frames are worth more."""
         if self._failed:
             return []
@@ -31,7 +31,7 @@ class LivePreview:
             return [Message(f"no preview any more: {error}")]
         return []
 
-    def _add(self, source: Source, result: Tracked) -> None:
+    def _add(self, source: Source, result: TrackingResult) -> None:
         if result.keyframe and result.placement is not None:
             image = source.read(source.reduction(_MEGAPIXELS))
             self._mosaic.paint(image.pixels, result.placement)

@@ -5,17 +5,17 @@ import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
-from dataclasses import dataclass, replace
 from importlib import import_module
 
 import numpy as np
 
 from rdstitch.alignment import Alignment, align
-from rdstitch.errors import ImpossibleCameraError, RegistrationError
+from rdstitch.errors import RdstitchError
 from rdstitch.results.messages import Message
+from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.placement import Placement, PlaneSimilarity
-from rdstitch.tracking.tracked_frame import PlacedFrame
+from rdstitch.tracking.tracked_frame import TrackedFrame
 
 _IMPORTS = "scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial"  # of alignments
 _FIRST = 5  # keyframes that the first alignment takes
@@ -31,16 +31,16 @@ _MATCHES = 80  # of a link, that the alignment uses
 class _Window:
     """Keyframes that are being aligned."""
 
-    keyframes: list[PlacedFrame]
-    alignment: Future[Alignment]
+    keyframes: list[TrackedFrame]
+    future: Future[Alignment]
     keeps_focal: bool
 
 
 class MapRefinement:
     """One alignment at a time. Where it is waited for (``patient``), the same frames give the same poses."""
 
-    def __init__(self, executor: Executor, *, patient: bool, tell: Callable[[Message], None]) -> None:
-        self.patient, self._tell = patient, tell
+    def __init__(self, executor: Executor, *, patient: bool, report: Callable[[Message], None]) -> None:
+        self.patient, self._report = patient, report
         # The first alignment is small, and starting a process takes longer.
         self._executor = self._first_executor = executor
         if not patient:
@@ -48,6 +48,7 @@ class MapRefinement:
             weakref.finalize(self, self._first_executor.shutdown, wait=False, cancel_futures=True)
             for name in _IMPORTS:  # now: nothing that follows should wait for them
                 import_module(name)
+        self._window: _Window | None = None
         self.start_map()
 
     def start_map(self) -> None:
@@ -57,32 +58,36 @@ class MapRefinement:
         self.drop()
 
     def drop(self) -> None:
-        """Do not take over the alignment that is under way."""
-        self._window: _Window | None = None
+        """Do not take over the alignment that is under way; one that has not begun keeps no worker busy."""
+        if self._window is not None:
+            self._window.future.cancel()
+        self._window = None
 
-    def begin_if_due(self, frames: KeyframeMap) -> None:
+    def begin_if_due(self, keyframe_map: KeyframeMap) -> None:
         """Begin the next alignment of a map to which a keyframe was added, if it is time for it."""
-        if frames.seen + 1 < self._next or self._window is not None:
+        if keyframe_map.seen + 1 < self._next or self._window is not None:
             return
-        lens_known = frames.known.distortion_known
+        lens_known = keyframe_map.knowledge.distortion_known
         grown = max(2, round(self._next * (_GROWTH - 1.0)))
         self._next += _INTERVAL if lens_known else min(grown, _INTERVAL)
         # At a keyframe and not when it is done: so that time does not decide on the result.
-        self._taken_over_at = frames.seen + (_DELAY if lens_known and frames.state.has_plane else _FIRST_DELAY)
-        self.begin(frames)
+        self._taken_over_at = keyframe_map.seen + (
+            _DELAY if lens_known and keyframe_map.state.has_plane else _FIRST_DELAY
+        )
+        self.begin(keyframe_map)
 
-    def begin(self, frames: KeyframeMap) -> None:
+    def begin(self, keyframe_map: KeyframeMap) -> None:
         """Begin to align the last keyframes among themselves."""
-        window, known, keeps_focal = list(frames.keyframes), frames.known, frames.keeps_focal
-        executor = self._executor if frames.state.has_plane else self._first_executor
-        came = [keyframe.frame for keyframe in window]
-        options = replace(known.options_for(came), max_matches_per_link=_MATCHES, reference=None)
-        cameras = known.cameras_for(came, _EXACT if keeps_focal else None)
+        window, knowledge, keeps_focal = list(keyframe_map.keyframes), keyframe_map.knowledge, keyframe_map.keeps_focal
+        executor = self._executor if keyframe_map.state.has_plane else self._first_executor
+        frames = [keyframe.frame for keyframe in window]
+        options = replace(knowledge.options_for(frames), max_matches_per_link=_MATCHES, reference=None)
+        cameras = knowledge.cameras_for(frames, _EXACT if keeps_focal else None)
         place = {keyframe.number: index for index, keyframe in enumerate(window)}
-        links = [replace(link, image1=place[link.image1], image2=place[link.image2]) for link in frames.links]
+        links = [replace(link, image1=place[link.image1], image2=place[link.image2]) for link in keyframe_map.links]
         self._window = _Window(window, executor.submit(align, cameras, links, options), keeps_focal)
 
-    def take_over(self, frames: KeyframeMap, patience: float | None) -> list[PlacedFrame]:
+    def take_over(self, keyframe_map: KeyframeMap, patience: float | None) -> list[TrackedFrame]:
         """Take over what has been aligned; frames whose places are new, those between keyframes among them.
 
         It is waited for so many seconds at most, None for as long as it takes.
@@ -90,36 +95,32 @@ class MapRefinement:
         window = self._window
         if window is None or (alignment := self._finished(window, patience)) is None:
             return []
-        waiting = {number for number, frame in frames.frames.items() if not frame.place.aligned}
-        longer = _place(frames, window, alignment)
-        came = [keyframe.frame for keyframe in window.keyframes]
-        frames.known.learn(alignment, came, keeps_focal=window.keeps_focal)
-        if frames.known.plane is not None:
-            _continue_covariances(frames.keyframes)
-        used = {number for number, one in zip((k.number for k in came), alignment.used, strict=True) if one}
-        for keyframe in frames.keyframes:
-            if keyframe.number not in used:
-                keyframe.place = frames.place_by_links(keyframe.frame, frames.links) or keyframe.place
+        waiting = {number for number, frame in keyframe_map.frames.items() if not frame.place.aligned}
+        placements, length_factor = _on_map(keyframe_map, window, alignment)
+        keyframe_map.align(placements)
+        knowledge, frames = keyframe_map.knowledge, [keyframe.frame for keyframe in window.keyframes]
+        knowledge.learn(alignment, frames, keeps_focal=window.keeps_focal)
+        keyframe_map.follow_aligned(placements)
         # What was said of the lengths before is replaced, so that all lengths of a map are wrong by the same.
-        anew = not window.keeps_focal and abs(math.log(longer)) > _SAME_LENGTHS * frames.known.length_std
-        return frames.revise(None if anew else waiting)
+        rescaled = not window.keeps_focal and abs(math.log(length_factor)) > _SAME_LENGTHS * knowledge.length_std
+        return keyframe_map.revise(None if rescaled else waiting)
 
     def _finished(self, window: _Window, patience: float | None) -> Alignment | None:
         """The alignment of a window; None while it is under way, and, once the user knows, where there is none."""
         try:
-            alignment = window.alignment.result(patience)
+            alignment = window.future.result(patience)
         except NotYet:
             return None
-        except (RegistrationError, ImpossibleCameraError, np.linalg.LinAlgError) as error:
+        except (RdstitchError, np.linalg.LinAlgError) as error:
             self.drop()
-            self._tell(Message(f"an alignment of the last keyframes failed ({error}); the next one is tried"))
+            self._report(Message(f"an alignment of the last keyframes failed ({error}); the next one is tried"))
             return None
         self.drop()
         for message in alignment.messages:
             if message.severity in ("warning", "note"):
-                self._tell(message)
+                self._report(message)
         if alignment.on_sphere:
-            self._tell(Message("the camera turns on the spot: there is no path"))
+            self._report(Message("the camera turns on the spot: there is no path"))
             return None
         return alignment
 
@@ -128,31 +129,19 @@ class MapRefinement:
         return self.patient and seen >= self._taken_over_at
 
 
-def _place(frames: KeyframeMap, window: _Window, alignment: Alignment) -> float:
-    """Place keyframes on the map as they were aligned; how much longer lengths become."""
+def _on_map(keyframe_map: KeyframeMap, window: _Window, alignment: Alignment) -> tuple[dict[int, Placement], float]:
+    """Where keyframes, by number, lie on the map as they were aligned; by what factor lengths change."""
     aligned = zip(window.keyframes, alignment.cameras, alignment.homographies, alignment.used, strict=True)
     placed = [(keyframe, Placement(camera, h, alignment.focal)) for keyframe, camera, h, used in aligned if used]
-    move, longer = _to_map(placed)
+    move, length_factor = _to_map(placed)
     first, placement = placed[0]
-    if frames.whole and first.number == frames.keyframes[0].number and (pose := placement.pose) is not None:
+    if keyframe_map.whole and first.number == keyframe_map.keyframes[0].number and (pose := placement.pose) is not None:
         move = PlaneSimilarity.to_origin(pose)  # the others are relative to it
-    frames.state = frames.state.with_plane()
-    for keyframe, placement in placed:
-        keyframe.place = replace(keyframe.place, placement=move.applied(placement), aligned=True)
-    return longer
+    return {keyframe.number: move.applied(placement) for keyframe, placement in placed}, length_factor
 
 
-def _continue_covariances(keyframes: Sequence[PlacedFrame]) -> None:
-    """Give keyframes that have none the covariance of the one before, from which errors grow again."""
-    reached = np.zeros((4, 4))
-    for keyframe in keyframes:
-        if keyframe.place.aligned:
-            reached = reached if keyframe.place.covariance is None else keyframe.place.covariance
-            keyframe.place = replace(keyframe.place, covariance=reached)
-
-
-def _to_map(placed: Sequence[tuple[PlacedFrame, Placement]]) -> tuple[PlaneSimilarity, float]:
-    """From the plane of an alignment to that of the map, which the first one defines; how much longer lengths become.
+def _to_map(placed: Sequence[tuple[TrackedFrame, Placement]]) -> tuple[PlaneSimilarity, float]:
+    """From the plane of an alignment to that of the map, which the first one defines; by what factor lengths change.
 
     The unit of lengths is the height of the first keyframe: heights stay as they are, whatever focal length they are
     computed by.
@@ -167,8 +156,7 @@ def _to_map(placed: Sequence[tuple[PlacedFrame, Placement]]) -> tuple[PlaneSimil
     known = [(new, old) for new, old in poses if new is not None and old is not None]
     if len(known) < len(poses):
         return move, 1.0
-    larger = float(np.median([old.height / new.height for new, old in known]))
-    longer = larger / abs(move.turn)
-    turn = move.turn * longer
+    length_factor = float(np.median([old.height / new.height for new, old in known])) / abs(move.turn)
+    turn = move.turn * length_factor
     now, then = (np.mean([complex(pose.x, pose.y) for pose in side]) for side in zip(*known, strict=True))
-    return PlaneSimilarity(turn, complex(longer * then - turn * now)), longer
+    return PlaneSimilarity(turn, complex(length_factor * then - turn * now)), length_factor

@@ -1,17 +1,17 @@
 """Frames of a camera whose focal length and tilt are known: where they lie on a metric plane, and how surely."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
-from rdstitch.tracking.placement import Placement, PlaneSimilarity
+from rdstitch.system.dataclasses import dataclass
+from rdstitch.tracking.placement import HEIGHT, YAW, Placement, PlaneSimilarity, X, Y
 
-_CELLS = 8
-"""A side of an image: errors of one cell may have a part in common, as the lens and the pixels of a place make them."""
+_CELLS = 8  # a side of an image: errors of one cell share a part that comes of the lens and the pixels of a place
 
 
 @dataclass(frozen=True)
@@ -49,40 +49,45 @@ class MetricPlane:
         local = frame.to_plane(points)
         moved = PlaneSimilarity.fitted(local, places, keep_size=self.rigid)
         # As complex numbers: places = turn * local + shift, with turn = height exp(-i yaw).
-        source, target = local @ [1.0, 1.0j], places @ [1.0, 1.0j]
-        errors = target - moved.turn * source - moved.shift
-        middle = complex(source.mean())
-        freedom = 3 if self.rigid else 4
-        width, height = frame.camera.image_size
-        cell = np.floor(points * _CELLS / (width, height)).astype(np.intp)
-        cells = np.unique(cell @ [1, 1 << 16], return_inverse=True)[1].reshape(-1)
-        sums = np.bincount(cells, errors.real) ** 2 + np.bincount(cells, errors.imag) ** 2
-        # What errors of a cell have in common does not become less with their number.
-        squares = max(float((abs(errors) ** 2).sum()), float(sums.sum()))
-        variance = squares / max(2 * len(points) - freedom, 1)
-        around = source - middle
-        spread = max(float((abs(moved.turn * around) ** 2).sum()), 1e-300)
-        lever = moved.turn * middle  # from the camera's foot to the middle of the points
-        # The foot moves with the middle, by the turn (-yaw) and by the height about it.
-        by_yaw, by_height = 1j * lever, -lever / abs(moved.turn)
-        jacobian = np.zeros((4, 4))
-        jacobian[:2, :2] = np.eye(2)
-        jacobian[:2, 2] = by_height.real, by_height.imag
-        jacobian[:2, 3] = by_yaw.real, by_yaw.imag
-        jacobian[2, 2] = jacobian[3, 3] = 1.0
+        source = local @ np.array([1.0, 1.0j])
+        errors = places @ [1.0, 1.0j] - moved.turn * source - moved.shift
+        squares = _squared_errors(errors, points, frame.camera.image_size)
+        variance = squares / max(2 * len(points) - (3 if self.rigid else 4), 1)
+        return moved.applied(frame), self._pose_covariance(source, moved.turn, variance, tilt_std)
+
+    def _pose_covariance(
+        self, local: NDArray[np.complex128], turn: complex, variance: float, tilt_std: float
+    ) -> FloatArray:
+        """By places of a frame's points (N,) relative to its foot, each of them with so much variance on the map."""
+        middle, height = complex(local.mean()), abs(turn)
+        around = local - middle
+        spread = max(float((abs(turn * around) ** 2).sum()), 1e-300)
         # A tilt by a small angle moves a point s by its product with the angle and a coordinate of s. Where frames
         # follow one another, that of one turns both those before it and those after it, to the same side.
-        by_tilts = [np.vdot(around, axis * source).imag * abs(moved.turn) ** 2 / spread for axis in local.T]
+        by_tilts = [np.vdot(around, axis * local).imag * height**2 / spread for axis in (local.real, local.imag)]
         yaw_variance = variance / spread + (2.0 * tilt_std * math.hypot(*by_tilts)) ** 2
-        height_variance = 0.0 if self.rigid else variance / spread * abs(moved.turn) ** 2
-        alone = np.diag([variance / len(points), variance / len(points), height_variance, yaw_variance])
-        return moved.applied(frame), jacobian @ alone @ jacobian.T
+        height_variance = 0.0 if self.rigid else variance / spread * height**2
+        of_middle = np.diag([variance / len(local), variance / len(local), height_variance, yaw_variance])
+        lever = turn * middle  # from the camera's foot to the middle of the points
+        # The foot moves with the middle, by the turn (-yaw) and by the height about it.
+        to_foot = np.eye(4)
+        to_foot[[X, Y], HEIGHT] = -lever.real / height, -lever.imag / height
+        to_foot[[X, Y], YAW] = -lever.imag, lever.real
+        return np.asarray(to_foot @ of_middle @ to_foot.T)
+
+
+def _squared_errors(errors: NDArray[np.complex128], points: FloatArray, image_size: tuple[int, int]) -> float:
+    """Of errors (N,) at pixels (N, 2): what those of a cell share does not become less with their number."""
+    cell = np.floor(points * _CELLS / image_size).astype(np.intp)
+    cells = np.unique(cell @ [1, 1 << 16], return_inverse=True)[1].reshape(-1)
+    sums = np.bincount(cells, errors.real) ** 2 + np.bincount(cells, errors.imag) ** 2
+    return max(float((abs(errors) ** 2).sum()), float(sums.sum()))
 
 
 def chained(before: FloatArray, step: FloatArray, offset: tuple[float, float], height: float) -> FloatArray:
     """The covariance (4, 4) of a frame by that of the frame that it was placed by, which is ``offset`` behind it."""
     dx, dy = offset
     carried = np.eye(4)
-    carried[:2, 3] = dy, -dx  # yaw turns the map by minus itself, y being down
-    carried[:2, 2] = dx / height, dy / height
+    carried[[X, Y], YAW] = dy, -dx  # yaw turns the map by minus itself, y being down
+    carried[[X, Y], HEIGHT] = dx / height, dy / height
     return np.asarray(carried @ before @ carried.T + step)

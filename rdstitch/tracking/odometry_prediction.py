@@ -3,16 +3,16 @@
 import cmath
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.alignment.odometry import OdometryFit, motions_of
 from rdstitch.inputs.odometry import motion_between
+from rdstitch.system.dataclasses import dataclass
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.metric_plane import chained
 from rdstitch.tracking.placement import PlaneSimilarity
-from rdstitch.tracking.tracked_frame import Frame, MapPlace, PlacedFrame
+from rdstitch.tracking.tracked_frame import Frame, FramePlace, TrackedFrame
 
 _KEYFRAMES = 60  # the last ones, by which it is found how the camera is mounted on the body
 
@@ -22,28 +22,28 @@ class OdometryPrediction:
     """How the camera is mounted on the body, and the frame from which the wheels go on."""
 
     mounted: OdometryFit | None = None  # in units of the map
-    latest: PlacedFrame | None = None  # of those that had a place and odometry
+    latest: TrackedFrame | None = None  # of those that had a place and odometry
 
     @property
     def unit(self) -> tuple[float, float]:
         """Height of the first keyframe in units of the odometry, and its relative standard deviation."""
         return (math.nan, math.nan) if self.mounted is None else (abs(self.mounted.scale), self.mounted.relative_std)
 
-    def learn(self, keyframes: Iterable[PlacedFrame]) -> None:
-        """How the camera is mounted, by the keyframes of a map."""
+    def learn(self, keyframes: Iterable[TrackedFrame]) -> None:
+        """How the camera is mounted, by the keyframes of a map that images have placed."""
         last = sorted(keyframes, key=lambda keyframe: keyframe.number)[-_KEYFRAMES:]
-        # x to the right and y to the top.
-        known = [
-            (complex(pose.x, -pose.y), pose.yaw, keyframe.frame.body)
+        # x to the right and y to the top; without a body there is no motion to or from a frame.
+        poses = [
+            (complex(pose.x, -pose.y), pose.yaw, None if keyframe.place.predicted else keyframe.frame.body)
             for keyframe in last
             if (pose := keyframe.place.pose) is not None
         ]
-        self.mounted = OdometryFit.of(motions_of(known)) or self.mounted
+        self.mounted = OdometryFit.of(motions_of(poses)) or self.mounted
 
-    def place(self, frame: Frame, known: CameraKnowledge) -> MapPlace | None:
+    def place(self, frame: Frame, knowledge: CameraKnowledge) -> FramePlace | None:
         """Where a frame lies by its way from the latest one; None where that cannot be said."""
         last, fit = self.latest, self.mounted
-        if last is None or fit is None or frame.body is None or last.frame.body is None or known.plane is None:
+        if last is None or fit is None or frame.body is None or last.frame.body is None or knowledge.plane is None:
             return None
         was = last.place.pose
         if was is None or last.place.covariance is None:
@@ -51,10 +51,11 @@ class OdometryPrediction:
         step = motion_between(last.frame.body, frame.body)
         moved = cmath.exp(1j * was.yaw) * fit.camera_motion(step.moved, step.turn)
         place, yaw = complex(was.x, was.y) + moved.conjugate(), was.yaw + step.turn
-        below = known.plane.below(last.place.placement.camera, known.attitude(frame))
+        below = knowledge.plane.below(last.place.placement.camera, knowledge.attitude(frame))
         spread = fit.noise**2 * np.array([step.variance / abs(fit.scale) ** 2] * 2 + [0.0, step.turn_variance])
-        return MapPlace(
+        return FramePlace(
             PlaneSimilarity(was.height * cmath.exp(-1j * yaw), place).applied(below),
             True,
             chained(last.place.covariance, np.diag(spread), (moved.real, -moved.imag), was.height),
+            predicted=True,
         )

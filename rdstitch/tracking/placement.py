@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -12,8 +11,13 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.geometry.radial_homography import to_plane
+from rdstitch.system.dataclasses import dataclass
 
 _SAMPLES = 5  # points of an image's outline, a side, by which two planes are brought together
+
+
+# Rows of a pose's covariance (4, 4).
+X, Y, HEIGHT, YAW = range(4)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +13,7 @@ from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane
 from rdstitch.inputs.odometry import BodyPose
+from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.tracking.placement import CameraPose, Placement
 
 MIN_INLIERS = 15
@@ -22,7 +22,7 @@ _NO_IMAGE = prepare(View(np.zeros((1, 1), np.uint8)), None)  # of frames that ar
 
 
 @dataclass(frozen=True)
-class Tracked:
+class TrackingResult:
     """The result of one frame."""
 
     number: int = -1  # of the frame, in the order of arrival; -1 where it could not be read
@@ -91,13 +91,14 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class MapPlace:
+class FramePlace:
     """Where a frame lies relative to the keyframes."""
 
     placement: Placement
     aligned: bool = False  # whether that is on the plane of the map
     covariance: FloatArray | None = None  # (4, 4): of x, y, height and yaw; None: not known
     inliers: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))  # of the matches that it is by
+    predicted: bool = False  # by odometry: images have not measured it
 
     @property
     def quality(self) -> float:
@@ -111,11 +112,11 @@ class MapPlace:
 
 
 @dataclass(eq=False)
-class PlacedFrame:
-    """A frame with its place, instead of which it may be given another one."""
+class TrackedFrame:
+    """A frame with its place, which its map may revise."""
 
     frame: Frame
-    place: MapPlace
+    place: FramePlace
     keyframe: bool = False
 
     @property
@@ -123,12 +124,12 @@ class PlacedFrame:
         """That of the frame."""
         return self.frame.number
 
-    def points_in(self, other: "PlacedFrame", points: FloatArray) -> FloatArray:
+    def points_in(self, other: "TrackedFrame", points: FloatArray) -> FloatArray:
         """Where another frame shows points (N, 2) of this one, by the places of both."""
         there = other.place.placement
         return from_plane(there.camera, there.homography, self.place.placement.to_plane(points))
 
-    def share_shown_by(self, other: "PlacedFrame") -> float:
+    def share_shown_by(self, other: "TrackedFrame") -> float:
         """Share of the frame that another one shows."""
         axes = [(np.arange(_GRID) + 0.5) * side / _GRID - 0.5 for side in self.frame.camera.image_size]
         points = self.points_in(other, np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -17,6 +16,7 @@ from rdstitch.inputs.odometry import BodyPose
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
+from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.tracking.camera_check import check_camera
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.frame_links import agree
@@ -26,7 +26,7 @@ from rdstitch.tracking.odometry_prediction import OdometryPrediction
 from rdstitch.tracking.placement import Placement
 from rdstitch.tracking.relocalisation import links_with_map
 from rdstitch.tracking.state import TrackState
-from rdstitch.tracking.tracked_frame import Frame, MapPlace, PlacedFrame, Tracked
+from rdstitch.tracking.tracked_frame import Frame, FramePlace, TrackedFrame, TrackingResult
 
 _PATIENCE = 0.015  # seconds a frame that are waited for the first alignment
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
@@ -60,10 +60,10 @@ class FrameTracker:
     ) -> None:
         self._detect, self._match, self._count = detect, match, 0
         self.messages: list[Message] = []  # what the user should know of what has come so far
-        self._known = CameraKnowledge.of(options.alignment, options.pair)
+        self._knowledge = CameraKnowledge.of(options.alignment, options.pair)
         self._flow, self._odometry = CornerFlow(), OdometryPrediction()
-        self._map = KeyframeMap(self._known, TrackState(), [])
-        self._refinement = MapRefinement(executor, patient=options.patient, tell=self._tell)
+        self._map = KeyframeMap(self._knowledge, TrackState(), [])
+        self._refinement = MapRefinement(executor, patient=options.patient, report=self._report)
 
     @property
     def revisable(self) -> set[int]:
@@ -72,7 +72,7 @@ class FrameTracker:
 
     def add(
         self, image: PreparedImage, camera: Camera, attitude: FloatArray | None = None, body: BodyPose | None = None
-    ) -> list[Tracked]:
+    ) -> list[TrackingResult]:
         """Register the next frame; it comes last, after those before it whose place is new.
 
         ``camera`` is of the size of ``image``; ``attitude`` (S, 2) is ψ and θ, radians, as they were measured at
@@ -86,26 +86,26 @@ class FrameTracker:
         revised = [] if self._refinement.patient else self._take_over(None, patience)
         return [*revised, *self._registered(frame)]
 
-    def finish(self) -> list[Tracked]:
+    def finish(self) -> list[TrackingResult]:
         """Frames that find their place, or another one, when no other frame comes."""
-        results, frames = self._take_over(None, None), self._map
-        refinable = frames.state.initialising or self._known.plane is not None
-        if len(frames.keyframes) > 1 and not frames.keeps_focal and refinable:
-            self._refinement.begin(frames)
+        results, keyframe_map = self._take_over(None, None), self._map
+        refinable = keyframe_map.state.initialising or self._knowledge.plane is not None
+        if len(keyframe_map.keyframes) > 1 and not keyframe_map.keeps_focal and refinable:
+            self._refinement.begin(keyframe_map)
             results += self._take_over(None, None)
         return list({result.number: result for result in results}.values())
 
-    def _registered(self, frame: Frame) -> list[Tracked]:
+    def _registered(self, frame: Frame) -> list[TrackingResult]:
         """By the corners that were followed, else by links with keyframes, else by odometry."""
         placed, links = self._follow(frame), list[Link]()
         if placed is None or self._is_new(placed):
             links = links_with_map(frame, placed, self._map, self._match)
             if (place := self._map.place_by_links(frame, links)) is not None:
-                placed = PlacedFrame(frame, place)
+                placed = TrackedFrame(frame, place)
         if placed is not None:
             results = self._placed(placed, links)
-        elif (place := self._odometry.place(frame, self._known)) is not None:
-            placed = PlacedFrame(frame, place)
+        elif (place := self._odometry.place(frame, self._knowledge)) is not None:
+            placed = TrackedFrame(frame, place)
             results = self._predicted(placed)
         else:
             return [self._without_place(frame)]
@@ -115,74 +115,64 @@ class FrameTracker:
             placed.frame = frame.without_image()
         return results
 
-    def _first(self, frame: Frame, state: TrackState) -> Tracked:
+    def _first(self, frame: Frame, state: TrackState) -> TrackingResult:
         """The first keyframe of a map."""
-        known, self._odometry.latest = self._known, None
-        camera = known.camera_of(frame.camera)
-        place = MapPlace(Placement(camera, np.eye(3), None))
-        known.plane = known.plane or known.given_plane(frame.camera)
-        if known.plane is not None:
-            place = MapPlace(known.plane.below(camera, known.attitude(frame)), covariance=np.zeros((4, 4)))
-        first = PlacedFrame(frame, place, keyframe=True)
-        self._map = KeyframeMap(known, state, [first])
+        knowledge, self._odometry.latest = self._knowledge, None
+        camera = knowledge.camera_of(frame)
+        place = FramePlace(Placement(camera, np.eye(3), None))
+        if knowledge.plane is None:
+            knowledge.adopt_given(frame.camera)
+        if knowledge.plane is not None:
+            place = FramePlace(knowledge.plane.below(camera, knowledge.attitude(frame)), covariance=np.zeros((4, 4)))
+        first = TrackedFrame(frame, place, keyframe=True)
+        self._map = KeyframeMap(knowledge, state, [first])
         self._refinement.start_map()
         self._flow.begin(frame.image, frame.corners)
         reason = "first frame" if not state.map_number else "no keyframe shows what it shows: it begins a new map"
         return self._result(first, reason=reason if frame.textured else "no floor texture")
 
-    def _placed(self, placed: PlacedFrame, links: list[Link]) -> list[Tracked]:
+    def _placed(self, placed: TrackedFrame, links: list[Link]) -> list[TrackingResult]:
         """A frame that keyframes show; where it has links and shows anything new, it is the next keyframe."""
         self._map.state = self._map.state.placed()
         inliers, last = int(placed.place.inliers.sum()), self._map.keyframes[-1].number
         shown = next((link for link in links if link.image1 == last), None)
-        known = shown is not None and not self._is_new(placed)
-        if shown is not None and known:
+        between = shown is not None and not self._is_new(placed)
+        if shown is not None and between:
             self._flow.begin(placed.frame.image, shown.points1, shown.points2)
             self._map.keep_between(placed, shown.points1, shown.points2)
-        results = self._confirmed_by(placed)
+        confirmed = self._map.confirm_first(placed)
+        results = [] if confirmed is None else [self._result(confirmed, revised=True)]
         if links:
             inliers = max(map(len, links))
-            results += [] if known else self._add_keyframe(placed, links)
+            results += [] if between else self._add_keyframe(placed, links)
         return [*results, self._result(placed, inliers)]
 
-    def _confirmed_by(self, placed: PlacedFrame) -> list[Tracked]:
-        """The first keyframe, where it has its place by what is given, and a second frame shows that it is one."""
-        first = self._map.keyframes[0]
-        if self._known.plane is None or first.place.aligned or len(self._map.keyframes) > 1:
-            return []
-        if placed.place.covariance is None:
-            return []
-        self._map.state = self._map.state.with_plane()
-        for one in (first, placed):
-            one.place = replace(one.place, aligned=True)
-        return [self._result(first, revised=True)]
-
-    def _follow(self, frame: Frame) -> PlacedFrame | None:
+    def _follow(self, frame: Frame) -> TrackedFrame | None:
         """The frame at its place by the corners of the last keyframe; None where too few of them agree on one."""
         matched, last = self._flow.follow(frame.image), self._map.keyframes[-1]
         place = None if matched is None else self._map.place(frame, last, *matched, rough=True)
         if place is None or not agree(place.inliers):
             return None
         # Where the view turns, what is followed from frame to frame drifts.
-        to_frame = partial(last.points_in, PlacedFrame(frame, place))
+        to_frame = partial(last.points_in, TrackedFrame(frame, place))
         now, before = matched_corners(frame.image, last.frame.image, last.frame.corners, to_frame)
         place = self._map.place(frame, last, before, now)
         if place is None or not agree(place.inliers):
             return None
-        placed = PlacedFrame(frame, place)
+        placed = TrackedFrame(frame, place)
         self._flow.begin(frame.image, before, now)
         self._map.keep_between(placed, before[place.inliers], now[place.inliers])
         return placed
 
-    def _predicted(self, placed: PlacedFrame) -> list[Tracked]:
+    def _predicted(self, placed: TrackedFrame) -> list[TrackingResult]:
         """A frame placed by odometry, as the next keyframe where it shows anything new."""
-        revised = list[Tracked]()
+        revised = list[TrackingResult]()
         if placed.frame.textured and self._is_new(placed):
             self._map.state = self._map.state.placed()
             revised = self._add_keyframe(placed, [])
         return [*revised, self._result(placed)]
 
-    def _without_place(self, frame: Frame) -> Tracked:
+    def _without_place(self, frame: Frame) -> TrackingResult:
         """A frame that no keyframe shows; after many of them, a new map begins with the last."""
         self._map.state = self._map.state.unplaced()
         if not frame.textured:
@@ -192,16 +182,16 @@ class FrameTracker:
             return self._first(frame, state)
         return self._unplaced(frame, "no keyframe shows what it shows")
 
-    def _is_new(self, placed: PlacedFrame) -> bool:
+    def _is_new(self, placed: TrackedFrame) -> bool:
         """Whether the last keyframe shows too little of it."""
         return placed.share_shown_by(self._map.keyframes[-1]) < _KEYFRAME_OVERLAP
 
-    def _add_keyframe(self, placed: PlacedFrame, links: list[Link]) -> list[Tracked]:
+    def _add_keyframe(self, placed: TrackedFrame, links: list[Link]) -> list[TrackingResult]:
         """Keep the frame; take over an alignment of the last keyframes, which may place others, and begin the next."""
         self._flow.begin(placed.frame.image, placed.frame.corners)
         self._map.add(placed, links)
         if self._map.state.initialising:
-            self._known.vote(self._map.links)
+            self._knowledge.vote(self._map.links)
         revised = self._with_checked_camera(placed)
         if placed.frame.body is not None:
             self._odometry.learn(self._map.by_number.values())
@@ -210,35 +200,37 @@ class FrameTracker:
         self._refinement.begin_if_due(self._map)
         return revised
 
-    def _with_checked_camera(self, latest: PlacedFrame) -> list[Tracked]:
+    def _with_checked_camera(self, latest: TrackedFrame) -> list[TrackingResult]:
         """Earlier frames whose places are others, or surer, by what keyframes show of a camera that was given."""
         revision = check_camera(self._map, latest.frame)
         if revision is None:
             return []
         for message in revision.messages:
-            self._tell(message)
-        if revision.focal != self._known.focal:
+            self._report(message)
+        if revision.focal != self._knowledge.focal:
             self._refinement.drop()
-        self._known.revise(revision)
-        if revision.longer is not None:
-            self._map.place_anew(revision.longer)
-        elif not revision.given_again:
+        self._knowledge.revise(revision)
+        if revision.length_factor is not None:
+            self._map.rescale(revision.length_factor)
+        elif not revision.report_again:
             return []
         return self._revised(self._map.revise(), latest)
 
-    def _take_over(self, latest: PlacedFrame | None, patience: float | None) -> list[Tracked]:
+    def _take_over(self, latest: TrackedFrame | None, patience: float | None) -> list[TrackingResult]:
         return self._revised(self._refinement.take_over(self._map, patience), latest)
 
-    def _revised(self, frames: Iterable[PlacedFrame], latest: PlacedFrame | None) -> list[Tracked]:
+    def _revised(self, frames: Iterable[TrackedFrame], latest: TrackedFrame | None) -> list[TrackingResult]:
         return [self._result(frame, revised=True) for frame in frames if frame is not latest]
 
-    def _tell(self, message: Message) -> None:
+    def _report(self, message: Message) -> None:
         """Keep a message, if nothing of its kind is known."""
-        kinds = {known.code or known.text for known in self.messages}
+        kinds = {message.code or message.text for message in self.messages}
         if (message.code or message.text) not in kinds:
             self.messages.append(message)
 
-    def _result(self, placed: PlacedFrame, inliers: int = 0, *, reason: str = "", revised: bool = False) -> Tracked:
+    def _result(
+        self, placed: TrackedFrame, inliers: int = 0, *, reason: str = "", revised: bool = False
+    ) -> TrackingResult:
         place, pose, keyframes = placed.place, placed.place.pose, len(self._map.keyframes)
         if not place.aligned:
             reason = reason or self._map.state.why_waiting(keyframes, is_keyframe=placed.keyframe)
@@ -251,19 +243,19 @@ class FrameTracker:
             inliers=inliers,
             revised=revised,
             quality=place.quality,
-            covariance=None if pose is None else self._known.covariance(placed, pose),
+            covariance=None if pose is None else self._knowledge.covariance(placed, pose),
         )
 
-    def _unplaced(self, frame: Frame, reason: str) -> Tracked:
+    def _unplaced(self, frame: Frame, reason: str) -> TrackingResult:
         """A frame without a place, and what is known of its camera."""
-        known, (unit, unit_std) = self._known, self._odometry.unit
-        return Tracked(
+        knowledge, (unit, unit_std) = self._knowledge, self._odometry.unit
+        return TrackingResult(
             number=frame.number,
-            distortion=known.distortion,
-            distortion_std=known.distortion_std,
-            distortion_known=known.distortion_known,
+            distortion=knowledge.distortion,
+            distortion_std=knowledge.distortion_std,
+            distortion_known=knowledge.distortion_known,
             map_number=self._map.state.map_number,
-            length_std=known.length_std,
+            length_std=knowledge.length_std,
             unit=unit,
             unit_std=unit_std,
             reason=reason,

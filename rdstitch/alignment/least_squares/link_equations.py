@@ -8,7 +8,6 @@ products of the coordinates of p, are all that is summed: no Jacobian is formed.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -26,6 +25,7 @@ from rdstitch.geometry.radial_homography import (
     whiten,
 )
 from rdstitch.robust.loss import robust_weight
+from rdstitch.system.dataclasses import dataclass
 
 
 @dataclass(frozen=True, eq=False)

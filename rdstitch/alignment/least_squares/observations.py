@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -12,6 +11,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import Link, spread_choice
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, sigma_of
+from rdstitch.system.dataclasses import dataclass, replace
 
 _CHUNK = 4096
 """Correspondences linearized at a time: what stays in cache."""
@@ -140,6 +140,6 @@ class Observations:
         kept = [spread_choice(self.points1[a:b], most) + a for a, b in itertools.pairwise(self.start)]
         return self.rows(np.concatenate([np.empty(0, dtype=np.intp), *kept]), np.array([len(k) for k in kept]))
 
-    def thinned_to(self, total: int, least: int) -> Self:
+    def thinned_to(self, total: int, per_link: int) -> Self:
         """About so many correspondences in all, and of each link at least so many, if there are."""
-        return self.thinned(max(total // max(len(self), 1), least))
+        return self.thinned(max(total // max(len(self), 1), per_link))

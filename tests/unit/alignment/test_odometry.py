@@ -16,7 +16,7 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.odometry import BodyPose, read_odometry
 from rdstitch.synthetic import Sequence
-from rdstitch.tracking import Tracked
+from rdstitch.tracking import TrackingResult
 
 HEIGHT, LEVER, MOUNT = 0.42, 0.15 - 0.06j, np.exp(0.5j * np.pi)  # metres; the top of the image is ahead
 
@@ -123,7 +123,7 @@ def test_offline_and_live_give_metres_and_bridge_what_shows_nothing(drive: Seque
 
 
 def test_a_height_of_one_is_a_height() -> None:
-    known = Tracked(0, None, DISTORTION, 0.0, True, 0, True, 0, length_std=0.01, unit=0.3, unit_std=0.05)
+    known = TrackingResult(0, None, DISTORTION, 0.0, True, 0, True, 0, length_std=0.01, unit=0.3, unit_std=0.05)
     for given, length, std in ((None, 0.3, 0.05), (1.0, 1.0, 0.01)):
         pose = rdstitch.Pose("", 0, 0.0, known, poses=rdstitch.FollowedPoses(given))
         assert (pose.unit, pose.length_std) == (length, std)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from threading import Event
 
 import numpy as np
 import pytest
@@ -12,16 +13,25 @@ from numpy.typing import NDArray
 from examples.judging.trajectories import compare_trajectories
 from examples.worlds.floor_drives import floor_drive, true_path
 from examples.worlds.paths import drive_poses
+from rdstitch.alignment import AlignmentOptions
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.features import FeatureOptions, Features, detect, match
 from rdstitch.features.corner_flow import CornerFlow, corners_of, fitted_affine, matched_corners
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
+from rdstitch.inputs.odometry import BodyPose
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, sequence_over
-from rdstitch.tracking import FrameTracker, Placement, PlaneSimilarity, Preview, Tracked, TrackingOptions
+from rdstitch.tracking import FrameTracker, Placement, PlaneSimilarity, Preview, TrackingOptions, TrackingResult
+from rdstitch.tracking.camera_check import check_camera
+from rdstitch.tracking.camera_knowledge import CameraKnowledge
+from rdstitch.tracking.keyframe_map import KeyframeMap
+from rdstitch.tracking.map_refinement import MapRefinement
+from rdstitch.tracking.metric_plane import MetricPlane
+from rdstitch.tracking.odometry_prediction import OdometryPrediction
 from rdstitch.tracking.state import TrackState
+from rdstitch.tracking.tracked_frame import Frame, FramePlace, TrackedFrame
 
 SIZE = (320, 240)
 DISTORTION = -0.25
@@ -65,7 +75,7 @@ def _tracker(
     return FrameTracker(options, detector, partial(match, ratio=0.8), ThreadPoolExecutor(1))
 
 
-def _path(results: list[Tracked]) -> Trajectory:
+def _path(results: list[TrackingResult]) -> Trajectory:
     """The last pose given of each frame."""
     poses = {result.number: pose for result in results if (pose := result.pose) is not None}
     numbers = sorted(poses)
@@ -80,13 +90,13 @@ def drive() -> Sequence:
 
 
 @pytest.fixture(scope="module")
-def tracked(drive: Sequence) -> list[Tracked]:
+def tracked(drive: Sequence) -> list[TrackingResult]:
     """What becomes of its frames where nothing is known."""
     tracker = _tracker()
     return [result for frame in _frames(drive) for result in tracker.add(frame, Camera(SIZE))]
 
 
-def _check(results: list[Tracked], sequence: Sequence) -> None:
+def _check(results: list[TrackingResult], sequence: Sequence) -> None:
     """Near the truth; every frame but those before the first alignment has a place when it comes."""
     error = compare_trajectories(_path(results), true_path(sequence))
     assert error.drift < 0.004
@@ -94,7 +104,7 @@ def _check(results: list[Tracked], sequence: Sequence) -> None:
     assert all(result.placement is not None for result in results if result.number >= 12)
 
 
-def test_the_path_and_lambda_come_near_thetrue_path(tracked: list[Tracked], drive: Sequence) -> None:
+def test_the_path_and_lambda_come_near_thetrue_path(tracked: list[TrackingResult], drive: Sequence) -> None:
     _check(tracked, drive)
     assert abs(tracked[-1].distortion - DISTORTION) < 0.003
 
@@ -107,7 +117,7 @@ def test_a_lambda_that_is_given_is_kept(drive: Sequence) -> None:
     assert all(result.distortion_known for result in results)
 
 
-def test_lambda_becomes_surer_until_it_is_known(tracked: list[Tracked]) -> None:
+def test_lambda_becomes_surer_until_it_is_known(tracked: list[TrackingResult]) -> None:
     results = [result for result in tracked if not result.revised]
     stds = [result.distortion_std for result in results]
     assert stds[0] == math.inf
@@ -117,7 +127,7 @@ def test_lambda_becomes_surer_until_it_is_known(tracked: list[Tracked]) -> None:
     assert {result.distortion for result in results[first:]} == {results[first].distortion}
 
 
-def test_keyframes_that_came_before_the_map_are_given_their_place_later(tracked: list[Tracked]) -> None:
+def test_keyframes_that_came_before_the_map_are_given_their_place_later(tracked: list[TrackingResult]) -> None:
     revised = [result for result in tracked if result.revised]
     assert revised
     assert revised[0].number == 0
@@ -250,19 +260,21 @@ def test_where_no_homography_fits_frames_are_lost_and_keyframes_stay(
     tracker, images = _tracker(), _frames(drive)
     for image in images[:12]:
         tracker.add(image, Camera(SIZE, focal=256.0))
-    assert tracker._known.plane is not None
+    assert tracker._knowledge.plane is not None
     monkeypatch.setattr(
         "rdstitch.tracking.keyframe_map.fitted_homography",
         lambda *given: (None, np.zeros(len(given[2]), dtype=np.bool_)),
     )
-    later = [tracker.add(image, Camera(SIZE, focal=256.0))[-1] for image in images[12:14]]
-    assert [result.placement for result in later] == [None, None]
+    numbers = [keyframe.number for keyframe in tracker._map.keyframes]
+    later = [tracker.add(image, Camera(SIZE, focal=256.0))[-1] for image in (*images[12:14], images[2])]
+    assert [result.placement for result in later] == [None, None, None]
+    assert [keyframe.number for keyframe in tracker._map.keyframes] == numbers
     # Keyframes by odometry have no links either: their lengths change all the same.
     before = [keyframe.place.pose for keyframe in tracker._map.keyframes[1:]]
-    tracker._map.place_anew(1.1)
+    tracker._map.rescale(1.1)
     after = [keyframe.place.pose for keyframe in tracker._map.keyframes[1:]]
     tracker._map.links = []
-    tracker._map.place_anew(1.1)
+    tracker._map.rescale(1.1)
     again = [keyframe.place.pose for keyframe in tracker._map.keyframes[1:]]
     for scale, poses in ((1.1, after), (1.21, again)):
         np.testing.assert_allclose([p.x for p in poses], [scale * p.x for p in before], rtol=1e-9)
@@ -288,6 +300,53 @@ def _placed(x: float, y: float, yaw: float, height: float, tilt: tuple[float, fl
     rows = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, height]])
     projection = np.diag([f, f, 1.0]) @ rotation_from_tilt(tilt) @ turn @ rows
     return Placement(Camera((640, 480), -0.2), 3.0 * np.linalg.inv(projection), f)
+
+
+def _keyframe(number: int, place: FramePlace | None = None) -> TrackedFrame:
+    """Of a camera with a given focal length, on a body that moves ahead."""
+    camera = Camera((640, 480), -0.2, focal=1.3 * 400.0, focal_source="option")
+    image = prepare(View(np.zeros((480, 640), dtype=np.uint8)), None)
+    frame = Frame(number, camera, image, MADE_UP.__getitem__, body=BodyPose(0.5 * number, 0.0, 0.0))
+    return TrackedFrame(
+        frame, place or FramePlace(_placed(number, 0.0, 0.0, 1.0), True, np.zeros((4, 4))), keyframe=True
+    )
+
+
+def _given_camera() -> CameraKnowledge:
+    knowledge = CameraKnowledge.of(AlignmentOptions(lens_known=True), EstimationOptions(distortion=-0.2))
+    knowledge.focal, knowledge.plane = 1.3, MetricPlane(1.3, (0.1, -0.2), True)
+    return knowledge
+
+
+def test_keyframes_by_odometry_are_no_measurement_of_it() -> None:
+    rng, odometry, keyframes, fits = np.random.default_rng(0), OdometryPrediction(), [], []
+    for number in range(30):
+        x, y = rng.normal((number, 0.0), 0.05)
+        place = FramePlace(_placed(x, y, 0.0, 1.0), True, np.zeros((4, 4)))
+        if number >= 8:
+            place = odometry.place(_keyframe(number).frame, _given_camera())
+        keyframes.append(_keyframe(number, place))
+        odometry.latest = keyframes[-1]
+        odometry.learn(keyframes)
+        fits.append(odometry.mounted)
+    assert fits[7].noise > 2.0
+    assert set(fits[7:]) == {fits[7]}
+
+
+def test_keyframes_without_links_show_nothing_of_the_camera() -> None:
+    keyframe_map = KeyframeMap(_given_camera(), TrackState(has_plane=True), [_keyframe(23), _keyframe(24)], seen=24)
+    assert check_camera(keyframe_map, keyframe_map.keyframes[-1].frame) is None
+
+
+def test_an_alignment_that_is_dropped_keeps_no_worker_busy() -> None:
+    with ThreadPoolExecutor(1) as executor:
+        go_on, refinement = Event(), MapRefinement(executor, patient=True, report=print)
+        executor.submit(go_on.wait)
+        refinement.begin(KeyframeMap(_given_camera(), TrackState(has_plane=True), [_keyframe(0), _keyframe(1)]))
+        future = refinement._window.future
+        refinement.drop()
+        go_on.set()
+    assert future.cancelled()
 
 
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0, 1.0), (1.5, -2.0, 2.5, 0.8), (-3.0, 0.2, -3.0, 1.4)])

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.inputs.delays import DELAY_STD, at_delay, smooth
+from rdstitch.system.dataclasses import dataclass, replace
 
 _POINTS = 32  # of a pair
 _OUTLIER = 3.0  # medians of the errors
@@ -40,11 +40,11 @@ class SeenPairs:
 
         ``camera``: the tilt, the logarithm of how much longer the focal length is, and the delay.
         """
-        longer = math.exp(camera[_LOG_FOCAL])
+        focal_factor = math.exp(camera[_LOG_FOCAL])
         tilts = np.broadcast_to(camera[:2], (*self.rays.shape[:2], 2))
         if self.attitudes is not None:
             tilts = tilts + at_delay(self.attitudes, float(camera[_DELAY]))
-        rays = np.concatenate([self.rays / longer, np.ones((*self.rays.shape[:3], 1))], axis=-1)
+        rays = np.concatenate([self.rays / focal_factor, np.ones((*self.rays.shape[:3], 1))], axis=-1)
         seen = rays @ rotation_from_tilt(tilts)
         depth = np.where(seen[..., 2] > _HORIZON, seen[..., 2], np.nan)
         places = np.nan_to_num((seen[..., 0] + 1j * seen[..., 1]) / depth, nan=np.inf)
@@ -53,7 +53,7 @@ class SeenPairs:
         one, two = (places - middles) * weights
         turn = (one * two.conj()).sum(axis=-1, keepdims=True)
         # In given focal lengths, as the points were measured: a longer one makes no errors smaller.
-        errors = (one - turn / np.maximum(abs(turn), 1e-300) * two) * longer
+        errors = (one - turn / np.maximum(abs(turn), 1e-300) * two) * focal_factor
         return np.concatenate([errors.real.ravel(), errors.imag.ravel()])
 
     def without_outliers(self, errors: FloatArray) -> "SeenPairs":
@@ -65,7 +65,7 @@ class SeenPairs:
 
 
 @dataclass(frozen=True)
-class ShownCamera:
+class CameraEstimate:
     """What motions show of a camera."""
 
     tilt: tuple[float, float]  # (ψ, θ), radians, with the focal length that is given
@@ -78,7 +78,7 @@ class ShownCamera:
     delay_std: float
 
 
-def shown_camera(pairs: SeenPairs, tilt: tuple[float, float] | None = None) -> ShownCamera:
+def camera_from_motion(pairs: SeenPairs, tilt: tuple[float, float] | None = None) -> CameraEstimate:
     """The tilt, about as given if it is, and the focal length, by which the motions between frames are rigid."""
     count = pairs.rays.shape[1]
     base = [_PSI, _THETA] if pairs.attitudes is None else [_PSI, _THETA, _DELAY]
@@ -90,23 +90,23 @@ def shown_camera(pairs: SeenPairs, tilt: tuple[float, float] | None = None) -> S
             pairs = pairs.without_outliers(value)
             camera, value, slope = _fitted(pairs, camera, base)
         if not np.isfinite(slope).all():
-            return ShownCamera((0.0, 0.0), math.inf, math.inf, 0.0, math.inf, (0.0, 0.0), 0.0, DELAY_STD)
+            return CameraEstimate((0.0, 0.0), math.inf, math.inf, 0.0, math.inf, (0.0, 0.0), 0.0, DELAY_STD)
         free = [*base, _LOG_FOCAL]
-        longer, better, steeper = _fitted(pairs, camera, free)
+        freed, errors_freed, slope_freed = _fitted(pairs, camera, free)
     variance = _covariance(value, slope, count)
-    known = np.isfinite(steeper).all() and np.linalg.cond(steeper) < _MAX_CONDITION and count >= 2 * len(free)
-    freer = _covariance(better, steeper, count) if known else np.full((4, 4), math.inf)
+    known = np.isfinite(slope_freed).all() and np.linalg.cond(slope_freed) < _MAX_CONDITION and count >= 2 * len(free)
+    freer = _covariance(errors_freed, slope_freed, count) if known else np.full((4, 4), math.inf)
     delay, delay_std = 0.0, DELAY_STD
     if pairs.attitudes is not None and variance[2, 2] > 0.0:
         delay_std = 1.0 / math.sqrt(1.0 / float(variance[2, 2]) + 1.0 / DELAY_STD**2)
         delay = float(camera[_DELAY]) * delay_std**2 / float(variance[2, 2])
-    return ShownCamera(
+    return CameraEstimate(
         (float(camera[_PSI]), float(camera[_THETA])),
         math.sqrt(max(float(np.linalg.eigvalsh(variance[:2, :2])[-1]), 0.0)),
         math.sqrt(_cost(value) / max(float(pairs.weights.sum()), 1.0)),
-        float(longer[_LOG_FOCAL]) if known else 0.0,
+        float(freed[_LOG_FOCAL]) if known else 0.0,
         math.sqrt(float(freer[-1, -1])),
-        (float(longer[_PSI]), float(longer[_THETA])),
+        (float(freed[_PSI]), float(freed[_THETA])),
         delay,
         delay_std,
     )
