@@ -49,6 +49,11 @@ class Exposure:
     rms_before: float = 0.0
     rms_after: float = 0.0
 
+    def __post_init__(self) -> None:
+        """Refuse factors that are NaN, which would silently become black."""
+        if not all(np.isfinite(part).all() for part in (self.log_gain, self.vignetting, self.fields, self.white)):
+            raise ValueError("exposure is not finite")
+
     def part(self, images: Sequence[int]) -> "Exposure":
         """The same for some of the images."""
         chosen = list(images)

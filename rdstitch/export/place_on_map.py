@@ -37,7 +37,7 @@ class Located:
     cameras: Sequence[Camera]
     to_output: FloatArray  # (N, 3, 3): normalized undistorted coordinates of each image to pixels of the output
     names: Sequence[str]
-    nadirs: Sequence[tuple[float, float, float] | None] = ()  # straight down by each camera's attitude, where known
+    nadirs: Sequence[tuple[float, float, float] | None]  # straight down by each camera's attitude, where known
     control: Sequence[Sequence[GroundControl]] = ()
     relief: float = 0.0  # pixels of the images that neighbours are off together: hills on what is mapped as a plane
     lever_std: float = 0.0  # how far hills move the ground against what is below the cameras, in heights; 0: not known

@@ -20,6 +20,7 @@ from rdstitch.inputs.rosbag import images_in_bag, is_bag
 from rdstitch.io.video import VIDEO_SUFFIXES, opened_capture, write_frame
 
 _POLL_SECONDS = 0.2
+_REOPEN_SECONDS = 5.0  # without a frame, after which a camera or stream is opened again
 _MAX_PENDING = 256  # names that are read ahead
 
 
@@ -119,13 +120,19 @@ def _of_stream(
     stream: str, every: int, idle: float | None, folder: Callable[[], Path], kept: list[Named]
 ) -> Iterator[Frame]:
     """Every n-th frame of a camera or stream; kept as files too, since they come only once."""
-    with _capture(int(stream) if stream.isdecimal() else stream) as capture:
+    source = int(stream) if stream.isdecimal() else stream
+    with _capture(source) as capture:
         number, last = 0, time.monotonic()
+        opened, has_end = last, capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0  # a video behind a URL
         while True:
             if not capture.grab():
-                if idle is None or time.monotonic() - last >= idle:
+                now = time.monotonic()
+                if has_end if idle is None else now - last >= idle:
                     return
                 time.sleep(_POLL_SECONDS)
+                if not has_end and now - max(last, opened) >= _REOPEN_SECONDS:
+                    capture.open(source)
+                    opened = time.monotonic()
                 continue
             last, stamp = time.monotonic(), time.time()
             decoded, pixels = capture.retrieve() if number % every == 0 else (False, None)

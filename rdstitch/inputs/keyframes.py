@@ -6,7 +6,7 @@ around it. What two frames share is known by corners, which are followed on smal
 and an affine motion that is fitted to them.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -108,12 +108,20 @@ class Wanted:
         return [Message(f"{used}; --every 1 takes all", (str(path),), "note", code="frames-passed-over")]
 
 
-def wanted_frames(every: int | None, grey: Callable[[], Iterable[NDArray[np.uint8]]]) -> Wanted:
-    """Every n-th frame of a video; with None those that show new ground, by all of its grey frames."""
+def wanted_frames(every: int | None, grey: Callable[[], Iterable[NDArray[np.uint8] | None]]) -> Wanted:
+    """Every n-th frame of a video; with None those that show new ground, by all of its grey frames that are decoded."""
     if every is not None:
         return Wanted(every)
-    places = tracked(grey())
-    return Wanted(chosen=frozenset(keyframes(places)), total=len(places.places))
+    decoded: list[int] = []
+
+    def frames() -> Iterator[NDArray[np.uint8]]:
+        for number, frame in enumerate(grey()):
+            if frame is not None:
+                decoded.append(number)
+                yield frame
+
+    chosen = keyframes(tracked(frames()))
+    return Wanted(chosen=frozenset(decoded[k] for k in chosen), total=len(decoded))
 
 
 def keyframes(places: FramePlaces) -> list[int]:

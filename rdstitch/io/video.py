@@ -27,12 +27,11 @@ class VideoFrame(NamedTuple):
     timestamp: float
 
 
-def grey_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
-    """All frames of a video, (H, W); black where one cannot be decoded."""
-    black = np.zeros((1, 1), dtype=np.uint8)
+def grey_frames(path: Path) -> Iterator[NDArray[np.uint8] | None]:
+    """All frames of a video, (H, W); None where one cannot be decoded."""
     for _, _, capture in _grabbed(path):
         decoded, frame = capture.retrieve()
-        yield np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8) if decoded else black
+        yield np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8) if decoded else None
 
 
 def extract_frames(path: Path, folder: Path, wanted: Callable[[int], bool]) -> list[VideoFrame]:

@@ -29,6 +29,10 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 _LOCAL = ("file", "local")  # schemes of what is on this machine
 _SEVERAL = "::"  # between the parts of a chain, as in simplecache::s3://bucket/name
 _Content = TypeVar("_Content")
+
+FileState = tuple[int, int] | str
+"""Size, bytes, and time of the last change, ns; of a URL what its server says."""
+
 _held: ContextVar[tuple[str, bytes] | None] = ContextVar("held", default=None)
 
 
@@ -141,9 +145,11 @@ def _as_os_error() -> Iterator[None]:
         raise OSError(f"cannot be fetched: {reason}") from error
 
 
-def file_state(path: str | Path) -> tuple[int, int] | None:
-    """Size, bytes, and time of the last change, ns: what changes with a file's content; None where there is none."""
+def file_state(path: str | Path) -> FileState | None:
+    """What changes with a file's content and is the same on every machine that sees it; None where there is no file."""
     try:
+        if is_url(path):
+            return remote_status(path)[2]
         status = Path(path).stat()
     except OSError:
         return None
@@ -154,7 +160,7 @@ def cached_by_file_state(read: Callable[[str | Path], _Content]) -> Callable[[st
     """A reader that reads a file again only if it has changed, or after another one: for one value after the other."""
 
     @lru_cache(maxsize=1)
-    def of_state(path: str | Path, state: tuple[int, int] | None) -> _Content:
+    def of_state(path: str | Path, state: FileState | None) -> _Content:
         return read(path)
 
     @wraps(read)

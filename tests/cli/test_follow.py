@@ -6,11 +6,15 @@ import signal
 import subprocess
 import threading
 import time
+from contextlib import nullcontext
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from rdstitch.inputs import arrivals
 from rdstitch.inputs.arrivals import open_arrivals
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
@@ -167,6 +171,43 @@ def test_a_preview_that_cannot_be_written_ends_nothing(drive: list[Path], tmp_pa
     poses = list(follow(arrivals, options, preview=gone, refresh=0.0))
     assert len({pose.name for pose in poses}) == len(drive)
     assert [message.text[:14] for pose in poses for message in pose.messages] == ["no preview any"]
+
+
+class _Camera:
+    """A camera that drops every third frame, and whose connection breaks after the sixth until it is opened again."""
+
+    def __init__(self) -> None:
+        self.grabbed = self.opened = 0
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return True
+
+    def open(self, _: int | str) -> bool:
+        self.opened += 1
+        return True
+
+    def get(self, _: int) -> float:
+        return -1.0
+
+    def grab(self) -> bool:
+        self.grabbed += 1
+        return self.grabbed % 3 != 0 and (self.grabbed < 7 or self.opened > 0)
+
+    def retrieve(self) -> tuple[bool, Any]:
+        return True, np.full((4, 6, 3), self.grabbed, np.uint8)
+
+
+@pytest.mark.parametrize("idle", [None, 60.0])
+def test_a_stream_goes_on_after_a_lost_frame_and_is_opened_again(
+    idle: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = _Camera()
+    monkeypatch.setattr(arrivals, "opened_capture", lambda _: nullcontext(camera))
+    monkeypatch.setattr(arrivals, "_POLL_SECONDS", 0.0)
+    monkeypatch.setattr(arrivals, "_REOPEN_SECONDS", 0.01)
+    stream = open_arrivals("rtsp://camera", frames_folder=lambda: tmp_path, idle=idle)
+    assert [frame.number for frame in islice(stream, 7)] == list(range(7))
+    assert camera.opened
 
 
 def test_files_whose_writers_pause_are_read_when_they_are_whole(drive: list[Path], folder: Path) -> None:

@@ -82,6 +82,16 @@ def test_every_nth_frame_is_taken_unseen_and_what_was_passed_over_is_said() -> N
     assert Wanted(chosen=frozenset((0, 1)), total=2).messages(Path("a.mp4")) == []
 
 
+def test_a_frame_that_cannot_be_decoded_is_not_taken_and_changes_nothing_else() -> None:
+    frames = _film(8.0 * k for k in range(60))
+    whole, cut = (wanted_frames(None, lambda film=film: film) for film in (frames[:-1], [*frames[:-1], None]))
+    assert whole == cut
+    damaged = wanted_frames(None, lambda: [*frames[:20], None, *frames[20:]])
+    assert damaged.chosen is not None
+    assert 20 not in damaged.chosen
+    assert len(damaged.chosen) <= len(whole.chosen or ()) + 2
+
+
 def test_of_a_video_these_frames_are_written_unless_the_user_says_which(tmp_path: Path) -> None:
     file, folder = tmp_path / "drive.avi", tmp_path / "frames"
     folder.mkdir()

@@ -282,6 +282,21 @@ class _Runs:
         return os.system, ("true",)
 
 
+class _MakesAFolder:
+    """Would build a cache in a folder when it is read."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __reduce__(self) -> tuple[type[Cache], tuple[Path]]:
+        return Cache, (self._folder,)
+
+
+def test_what_is_read_makes_no_folder(tmp_path: Path) -> None:
+    assert unpack(pack(_MakesAFolder(tmp_path / "made"))) == Cache(tmp_path / "made")
+    assert not (tmp_path / "made").exists()
+
+
 @pytest.mark.parametrize("value", [_Runs(), open, Camera.distort, StitchOptions, np.load, [print], Cache])
 def test_what_could_run_code_is_refused(value: Any) -> None:
     """A class alone is data; what builds it is a dataclass of this package."""
