@@ -7,9 +7,9 @@ from pathlib import Path
 from rdstitch.errors import InputError
 from rdstitch.io.read import DecodedImage
 from rdstitch.results.messages import Message
-from rdstitch.system.file_access import FileState, file_state
+from rdstitch.system.file_access import ContentState, content_state
 
-GuardState = tuple[dict[Path, FileState | None], dict[Path, str]]
+GuardState = tuple[dict[Path, ContentState | None], dict[Path, str]]
 """Stamps of files, and why they may be damaged."""
 
 
@@ -21,20 +21,20 @@ class InputGuard:
 
     def __init__(self, strict: bool = False) -> None:
         self._strict = strict
-        self._stamps: dict[Path, FileState | None] = {}
+        self._stamps: dict[Path, ContentState | None] = {}
         self.damaged: dict[Path, str] = {}  # files of which parts may be wrong, and why
         self.unreadable: dict[Path, str] = {}  # files that were left out, and why
 
     @contextmanager
     def reading(self, path: Path) -> Iterator[None]:
         """Read a file inside the block; it must be what it was before."""
-        before = file_state(path)
+        before = content_state(path)
         self._note(path, before)
         yield
-        if file_state(path) != before:
+        if content_state(path) != before:
             raise InputError(f"{path}: is being written to; run again when that has ended")
 
-    def _note(self, path: Path, stamp: FileState | None) -> None:
+    def _note(self, path: Path, stamp: ContentState | None) -> None:
         if self._stamps.setdefault(path, stamp) != stamp:
             raise InputError(f"{path}: has changed during the run; run again")
 

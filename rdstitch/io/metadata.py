@@ -31,6 +31,7 @@ from rdstitch.io.opening import (
     has_late_metadata,
     is_raw,
     opened_image,
+    stored_bits,
 )
 from rdstitch.io.radiometric_tags import Radiometry, read_radiometry
 from rdstitch.io.raw import own_exif, raw_exif, raw_size
@@ -40,7 +41,6 @@ from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
 
-_BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
 _BLACK_LEVEL = 50714
 
 MAX_PROFILE = 2**20 - 2**10
@@ -154,7 +154,7 @@ def _raw_metadata(file: Path) -> Metadata:
 def metadata_of(image: Image.Image) -> Metadata:
     """Metadata of an image that Pillow has opened."""
     # First, since looking for EXIF at the end of a PNG file decodes it, and Pillow then forgets.
-    bit_depth = _bit_depth(image)
+    bit_depth = stored_bits(image)
     return _metadata(image.getexif(), image.info, image.size, bit_depth, _channels(image))
 
 
@@ -189,14 +189,6 @@ def _metadata(
         profile_lost=profile_lost,
         channels=channels,
     )
-
-
-def _bit_depth(image: Image.Image) -> int:
-    """Bits per sample as stored; Pillow shows 16-bit colour PNG as 8-bit."""
-    pieces = getattr(image, "tile", None)
-    if image.format == "PNG" and pieces and "16" in str(pieces[0][3]):
-        return 16
-    return _BIT_DEPTHS.get(image.mode, 8)
 
 
 def _colour_profile(profile: object) -> tuple[bytes, str]:

@@ -22,6 +22,7 @@ from rdstitch.synthetic.relief import Relief
 from rdstitch.synthetic.textures import LinearPixels, Texture
 
 _PIXELS_PER_STRIP = 400_000
+_SIXTEEN_BITS = (".png", ".tif", ".tiff")
 _MAX_SAMPLES_PER_SIDE = 6
 # A place that is in no image, for rays that meet nothing.
 _NOWHERE = -1e6
@@ -136,6 +137,9 @@ class Sequence:
             path = Path(folder) / name.format(index)
             image = self.frame(index)
             bgr = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
+            eight_only = image.dtype == np.uint16 and path.suffix.lower() not in _SIXTEEN_BITS
+            if eight_only or not cv2.haveImageWriter(path.name):
+                raise OutputError(f"{path}: cannot hold images of {self.photometry.bits} bits; use .png or .tif")
             _, encoded = cv2.imencode(path.suffix, bgr)
             try:
                 path.write_bytes(encoded.tobytes())
