@@ -23,6 +23,9 @@ ImageFile = Annotated[Path, Option("Image to write: .jpg, .png, .tif, .webp or .
 PrintSidecar = Annotated[bool, Option("Print the sidecar as JSON.", flag="--json")]
 
 
+GOES_ON = "the same command goes on from the cache"  # note at an interrupt
+
+
 def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callable[..., Any]], click.Command]:
     """A command of a function: its parameters with options become flags, and so do the options given.
 
@@ -33,8 +36,13 @@ def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callab
         @wraps(function)
         def run(*, quiet: bool, verbose: bool, **given: Any) -> Any:
             _check_not_read([given[name] for name in written if given[name] is not None], given.get("camera"))
-            with Reporter(verbose - quiet) as reporter:
-                return function(reporter=reporter, **given)
+            try:
+                with Reporter(verbose - quiet) as reporter:
+                    return function(reporter=reporter, **given)
+            except BaseException as error:
+                if given.get("cache") is not None:
+                    error.add_note(GOES_ON)
+                raise
 
         parameters: list[click.Parameter] = []
         for name, parameter in inspect.signature(function).parameters.items():
@@ -88,28 +96,45 @@ def _flag(entry: Declared, default: Any) -> click.Option:
         entry = entered
     names = [*(option.flag or f"--{entry.name.replace('_', '-')}").split(), entry.name]
     how: dict[str, Any] = {"required": True} if default is inspect.Parameter.empty else {"default": default}
-    unset = default is None or default is False or default == () or default is inspect.Parameter.empty
-    shown = option.default or ("" if unset else str(default))
-    if "/" in names[-2] and entry.words:  # a switch between two words
-        off, on = entry.words
-        how |= {"is_flag": True, "default": default == on, "callback": lambda _c, _o, value: on if value else off}
-        shown = ""
-    elif entry.types == (bool,):
-        how["is_flag"] = True
-    elif not entry.types:
-        how["type"] = click.Choice([word.replace("_", "-") for word in entry.words])
-        how["callback"] = lambda _c, _o, value: next((w for w in entry.words if w.replace("_", "-") == value), value)
-    elif Path in entry.types:
-        how["type"] = FilePath(entry.words)
-    elif entry.types == (str,):
-        how["type"] = str
-    elif entry.types[0] in (tuple[str, ...], tuple[Path, ...]):
-        how |= {"multiple": True, "type": FilePath() if entry.types[0] == tuple[Path, ...] else str}
-    else:
-        how["type"] = EnteredValue(entry)
-        shown = option.default or (how["type"].shown(default) if shown or option.none else "")
+    plain = "" if _is_unset(default) else str(default)
+    kind = Path if Path in entry.types else entry.types[0] if entry.types else None
+    how |= _KINDS.get(kind, _entered)(entry, default)
+    shown = how.pop("shown", plain)
+    shown = option.default or shown
     text = option.text + f"  [default: {shown}]" * bool(shown)
     return Flag(names, metavar=option.metavar or None, help=text, writes=option.writes, **how)
+
+
+def _is_unset(default: Any) -> bool:
+    """Whether there is nothing to show of a default."""
+    return default is None or default is False or default == () or default is inspect.Parameter.empty
+
+
+def _of_words(entry: Declared, default: Any) -> dict[str, Any]:
+    """One of some words; of two that a switch stands for, by the switch."""
+    if "/" in entry.option.flag:
+        off, on = entry.words
+        chosen = {"callback": lambda _c, _o, value: on if value else off, "shown": ""}
+        return {"is_flag": True, "default": default == on, **chosen}
+    by_flag = {word.replace("_", "-"): word for word in entry.words}
+    return {"type": click.Choice([*by_flag]), "callback": lambda _c, _o, value: by_flag.get(value, value)}
+
+
+def _entered(entry: Declared, default: Any) -> dict[str, Any]:
+    """Numbers, or a word."""
+    value = EnteredValue(entry)
+    return {"type": value, "shown": value.shown(default)}
+
+
+_KINDS: dict[Any, Callable[[Declared, Any], dict[str, Any]]] = {
+    None: _of_words,
+    bool: lambda _entry, _default: {"is_flag": True},
+    str: lambda _entry, _default: {"type": str},
+    Path: lambda entry, _default: {"type": FilePath(entry.words)},
+    tuple[str, ...]: lambda _entry, _default: {"multiple": True, "type": str},
+    tuple[Path, ...]: lambda _entry, _default: {"multiple": True, "type": FilePath()},
+}
+"""What click is told of an option, by its type; of all others, whose values are numbers, :func:`_entered`."""
 
 
 class Flag(click.Option):
@@ -182,9 +207,9 @@ class EnteredValue(click.ParamType):  # type: ignore[type-arg]  # generic since 
         return self.fail(f"expected {expected}, not {value!r}", param, ctx)
 
     def shown(self, value: Any) -> str:
-        """A default, as one would enter it."""
-        if value is None:
-            return self.entry.option.none
+        """A default, as one would enter it; empty where there is none."""
+        if _is_unset(value):
+            return self.entry.option.none if value is None else ""
         if self.entry.option.unit == "degrees":
             value = math.degrees(value)
         return f"{value:g}" if isinstance(value, int | float) else str(value)

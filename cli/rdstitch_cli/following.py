@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import click
 
-from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.option import Option
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch_cli.flags import flags
@@ -19,6 +18,8 @@ from rdstitch_cli.terminal import Reporter
 if TYPE_CHECKING:
     from rdstitch.inputs.arrivals import Arrivals
     from rdstitch.inputs.frame import Named
+    from rdstitch.pipeline.run import Run
+    from rdstitch.pipeline.run_files import RunFiles
     from rdstitch.results.pose import FollowedPoses
     from rdstitch.results.registration import Registration
 
@@ -52,43 +53,46 @@ FOLLOWING = flags(
 @contextmanager
 def followed(
     inputs: Sequence[Path],
-    stitch: StitchOptions,
+    run: "Run",
+    files: "RunFiles",
     reporter: Reporter,
     *,
-    output: Path,
     every: int | None,
     idle: float | None,
-    refresh: float | None = None,
-    plot: Path | None = None,
+    preview: Path | None = None,
+    refresh: float = 0.0,
     poses: "FollowedPoses | None" = None,
-    beside: FilesBeside = NOTHING_BESIDE,
 ) -> Iterator[list["Named"]]:
     """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe.
 
-    ``refresh`` is None where no image is made; ``plot`` will be written at the end too. ``poses`` says how poses are
-    printed: as the file that is written at the end has them.
+    ``files`` are those of the recipe, and ``poses`` says how poses are printed: as the recipe writes them.
     """
     from rdstitch.inputs.arrivals import open_arrivals
     from rdstitch.system.file_access import file_state
+    from rdstitch.system.outputs import Outputs
     from rdstitch.system.temporary_folder import TemporaryFolder
 
     if len(inputs) != 1:
         raise click.UsageError("--follow takes one input: a folder, a video, the index of a camera, a stream or -")
-    source = Path(inputs[0])
-    preview = output.with_suffix(".preview.jpg") if refresh else None
-    _check_files(source, stitch, output, [file for file in (preview, plot) if file is not None], beside, refresh)
-    before = file_state(preview) if preview else None
+    (source,), output = inputs, files.bag or files.written[0]
+    if source.is_dir() and output.resolve().parent == source.resolve():
+        raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
+    with Outputs(run.options.overwrite) as outputs:
+        files.check(outputs)
+    for note in run.notes:
+        reporter.tell(note)
+    before = None if preview is None else file_state(preview)
     with TemporaryFolder() as folder:
         arrivals = open_arrivals(
-            str(inputs[0]),
+            str(source),
             frames_folder=lambda: folder,
             names=sys.stdin,
             every=every or 1,
             idle=idle,
-            topic=stitch.topic,
+            topic=run.options.topic,
         )
         try:
-            _print_poses(arrivals, stitch, poses, preview, refresh or 0.0, reporter)
+            _print_poses(arrivals, run.options, poses, preview, refresh, reporter)
         except KeyboardInterrupt:
             reporter.note("interrupted: registering what has arrived; interrupt once more to give up")
         yield arrivals.inputs
@@ -97,32 +101,9 @@ def followed(
         preview.unlink(missing_ok=True)
 
 
-def _check_files(
-    source: Path,
-    stitch: StitchOptions,
-    output: Path,
-    others: Sequence[Path],
-    beside: FilesBeside,
-    refresh: float | None,
-) -> None:
-    """Find out before hours of frames, not after them, whether all can be written."""
-    from rdstitch.camera_files import format_of
-    from rdstitch.pipeline.compose import image_files
-    from rdstitch.pipeline.output_plan import files_beside
-    from rdstitch.system.outputs import check_outputs, check_suffix
-
-    if source.is_dir() and output.resolve().parent == source.resolve():
-        raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
-    planned = [*([output] if refresh is None else image_files(check_suffix(output)))]
-    if stitch.save_camera is not None:
-        format_of(stitch.save_camera, stitch.camera_format)
-        planned.append(stitch.save_camera)
-    check_outputs([*planned, *others, *files_beside(beside, output, [])], stitch.overwrite, [source])
-
-
 def _print_poses(
     arrivals: "Arrivals",
-    stitch: StitchOptions,
+    options: StitchOptions,
     poses: "FollowedPoses | None",
     preview: Path | None,
     refresh: float,
@@ -132,7 +113,7 @@ def _print_poses(
     from rdstitch.pipeline.follow import follow
 
     again, read = arrivals.comes_again, True
-    frames = follow(arrivals, stitch, poses, comes_again=again, preview=preview, refresh=refresh)
+    frames = follow(arrivals, options, poses, comes_again=again, preview=preview, refresh=refresh)
     with closing(frames):
         for frame in frames:
             if read:

@@ -11,6 +11,7 @@ import traceback
 import warnings
 from contextlib import suppress
 from importlib import import_module
+from itertools import takewhile
 from pathlib import Path
 from typing import Never
 
@@ -144,13 +145,12 @@ def _open_standard_streams() -> None:
 
 def run(arguments: list[str]) -> int:
     """Run one command; whatever goes wrong becomes one line on standard error and a status."""
-    debug = "--debug" in arguments
+    debug = "--debug" in takewhile(lambda argument: argument.startswith("-"), arguments)
     try:
         return _invoke(arguments)
-    except (KeyboardInterrupt, click.exceptions.Abort):
-        return _print_error(_interrupted(arguments), _INTERRUPTED, debug)
-    except _TerminatedError as asked:
-        return _print_error(_interrupted(arguments), 128 + asked.number, debug)
+    except (KeyboardInterrupt, click.exceptions.Abort, _TerminatedError) as asked:
+        status = 128 + asked.number if isinstance(asked, _TerminatedError) else _INTERRUPTED
+        return _print_error("; ".join(["interrupted", *getattr(asked, "__notes__", ())]), status, debug)
     except click.ClickException as error:
         context = getattr(error, "ctx", None)
         hint = "" if context is None else f"; see '{context.command_path} --help'"
@@ -225,11 +225,6 @@ class _TerminatedError(BaseException):
 
 def _end(number: int, frame: object) -> Never:
     raise _TerminatedError(number)
-
-
-def _interrupted(arguments: list[str]) -> str:
-    cached = any(argument.partition("=")[0] == "--cache" for argument in arguments)
-    return "interrupted" + "; the same command goes on from the cache" * cached
 
 
 def _print_error(text: str, status: int, debug: bool) -> int:

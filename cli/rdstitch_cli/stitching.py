@@ -21,7 +21,6 @@ from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.compositing import CompositePlan
-    from rdstitch.geometry.camera import Camera
     from rdstitch.results.registration import Registration
     from rdstitch.results.stitch_result import StitchResult
     from rdstitch.sidecar.recomposition import Recomposition
@@ -46,41 +45,6 @@ STITCHING = [
 """The options of every command that composes the images that it registers."""
 
 
-def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
-    """The camera of a file; how well λ describes the lens of a foreign one is said on standard error."""
-    if file is None:
-        return None
-    from rdstitch.camera_files import read_camera_file
-    from rdstitch.inputs.rosbag import camera_in, is_bag
-
-    if is_bag(file):
-        return camera_in(file)
-    read = read_camera_file(file, partial(_size_of_images, file))
-    if read.fit is not None:
-        left = f"rms {read.fit.rms:.2f} pixels, at most {read.fit.largest:.2f} pixels"
-        left += ", by which images are corrected" if read.camera.lens_model is not None else ""
-        reporter.warn(
-            f"{file}: λ = {read.camera.nearest_distortion:.6f} was fitted to the {read.kind} lens model, {left}"
-        )
-    return read.camera
-
-
-def _size_of_images(file: Path) -> tuple[int, int]:
-    """Width and height of the first input image as it is stored, for a camera file that does not say them."""
-    from rdstitch.errors import InputError
-    from rdstitch.geometry.exif_orientation import inverse, turned_size
-    from rdstitch.inputs.find import find_images
-    from rdstitch.io import read_metadata
-
-    # The names on standard input are read later, and a video only once.
-    named = [path for path in click.get_current_context().params["inputs"] if str(path) != "-"]
-    try:
-        metadata = read_metadata(find_images(named).frames[0].path)
-    except (InputError, IndexError) as error:
-        raise InputError(f"{file}: has no image size; add image_width and image_height") from error
-    return turned_size(metadata.size, inverse(metadata.orientation))
-
-
 def resolve(inputs: tuple[Path, ...]) -> list[Path]:
     """The inputs, with - replaced by the names on standard input, one a line or separated by NUL."""
     from rdstitch.inputs.arguments import names_in
@@ -92,7 +56,7 @@ def resolve(inputs: tuple[Path, ...]) -> list[Path]:
     return named
 
 
-def stitch_options(reporter: Reporter, given: Mapping[str, Any], **more: Any) -> StitchOptions:
+def stitch_options(given: Mapping[str, Any], **more: Any) -> StitchOptions:
     """The library's options from a command's flags."""
     if given.get("preview"):
         quick = {"seam": "voronoi", "max_features": 1500, "work_megapixels": 0.5}
@@ -100,7 +64,6 @@ def stitch_options(reporter: Reporter, given: Mapping[str, Any], **more: Any) ->
             quick["max_size"] = 1200  # they say the size too
         given = {**given, **{name: value for name, value in quick.items() if not is_given(name)}}
     more |= {
-        "camera": read_lens(given["camera"], reporter),
         "features": FeatureOptions(**values_of(FeatureOptions, given)),
         "composite": CompositeOptions(**values_of(CompositeOptions, given)),
     }
@@ -112,8 +75,10 @@ def files_beside(given: Mapping[str, Any]) -> FilesBeside:
     return FilesBeside(**values_of(FilesBeside, given), command=shlex.join(["rdstitch", *sys.argv[1:]]))
 
 
-def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:
-    """λ and the plan of a dry run, or the sidecar, to standard output; what the user must know to standard error."""
+def report_result(result: "StitchResult", reporter: Reporter, *, as_json: bool, more: str = "") -> None:
+    """λ and the plan of a dry run, or the sidecar, to standard output; what the user must know, and what was made, to
+    standard error.
+    """
     from rdstitch.sidecar.write import sidecar
 
     report_registration(result.registration, reporter, partial(sidecar, result) if as_json else None)
@@ -123,7 +88,9 @@ def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = Fal
         first, second = (result.registration.used_names[k] for k in one.images)
         x, y = one.position
         reporter.log(f"broken over {one.length:.0f} pixels at ({x:.0f}, {y:.0f}), between {first} and {second}")
-    if result.plan is not None and not as_json:
+    if result.plan is None:
+        reporter.made(f"{result.summary}{more}")
+    elif not as_json:
         show_plan(result.plan)
 
 

@@ -117,7 +117,8 @@ class Problem:
             spread = POSE_TILT_SPREAD if model.any_tilt and measured is None else measured or 0.0
         scales, at = _Scales(spread, self.overdispersion), start
         for rounds in itertools.count(1):
-            adjusted = self.adjuster(model, scales.tilt_spread, at.shared, scales.overdispersion).run(at, rough=True)
+            adjuster = self.adjuster(model, scales.tilt_spread, at.shared, scales.overdispersion)
+            adjusted = adjuster.run(at, wide_start=True)
             scales, changed = self._rescaled(scales, adjusted, rounds)
             if not changed:
                 own_tilts = scales.tilt_spread if model.free_tilts else None

@@ -49,7 +49,7 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
     """
     problem, fit, given = adjustment.problem, adjustment.choice.fit, adjustment.given
     agreement = _Agreement.of(adjustment)
-    uncertainty = _Uncertainty.of(adjustment, rough=agreement.relief.found)
+    uncertainty = _Uncertainty.of(adjustment, over_relief=agreement.relief.found)
     cameras = _adjusted_cameras(adjustment, uncertainty)
     reference = int(adjustment.images[problem.reference])
     used = np.zeros(len(given.cameras), dtype=np.bool_)
@@ -115,15 +115,15 @@ class _Uncertainty:
     considered: FloatArray  # (5, 5): of all parameters of the lens, with what was not estimated
 
     @classmethod
-    def of(cls, adjustment: AdjustedImages, *, rough: bool) -> Self:
-        """Over ``rough`` ground or not."""
+    def of(cls, adjustment: AdjustedImages, *, over_relief: bool) -> Self:
+        """Over relief or not."""
         problem, fit = adjustment.problem, adjustment.choice.fit
         covariance = fit.adjusted.covariance if adjustment.covariance is None else adjustment.covariance
         estimated = [name for name, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free]
         names = (*fit.model.shared_names, *estimated)
         lens = considered = _lens_covariance(names, covariance)
         if adjustment.lens_covariance is not None and adjustment.lens.observable and problem.free_lens[0]:
-            considered = considered_covariance(problem, fit, adjustment.lens_covariance, rough=rough)
+            considered = considered_covariance(problem, fit, adjustment.lens_covariance, over_relief=over_relief)
         return cls(names, covariance, lens, considered)
 
     @property
@@ -255,9 +255,9 @@ def _link_fits(adjustment: AdjustedImages, agreement: _Agreement) -> tuple[LinkF
             continue
         rows_of_link = slice(observations.start[row], observations.start[row + 1])
         good = squared[rows_of_link][agreeing[rows_of_link]]
-        share = len(good) / max(len(agreeing[rows_of_link]), 1)
+        fraction = len(good) / max(len(agreeing[rows_of_link]), 1)
         rms = float(np.sqrt(good.mean())) if len(good) else float(medians[row])
-        result.append(LinkFit(link.image1, link.image2, len(link), round(share * len(link)), rms, True))
+        result.append(LinkFit(link.image1, link.image2, len(link), round(fraction * len(link)), rms, True))
     return tuple(result)
 
 

@@ -175,8 +175,8 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
     """
     typical = observations.medians(np.sqrt(squared))
     usual = _weighted_median(typical, np.where(np.isfinite(typical), observations.matches, 0))
-    least = _MIN_ERROR * np.sqrt(observations.scale1 * observations.scale2)
-    outlying: BoolArray = ~(typical <= np.maximum(_OUTLYING * usual, least))
+    tolerance = _MIN_ERROR * np.sqrt(observations.scale1 * observations.scale2)
+    outlying: BoolArray = ~(typical <= np.maximum(_OUTLYING * usual, tolerance))
     return outlying
 
 

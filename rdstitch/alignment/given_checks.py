@@ -70,27 +70,16 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
         attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
         return replace(options, attitudes=attitudes, delayed_attitudes=None), attitudes_late(*late)
     given, stated = known.attitudes + known.tilt, options.attitudes_std if options.attitudes is not None else 0.0
-    changed = [shown.likelihood(given @ change.T) for change in _SIGNED_ORDERS]
-    none = shown.likelihood(np.zeros_like(given))
-    (likelihood, scatter), best = changed[0], int(np.argmax([score for score, _ in changed]))
-    if likelihood - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
+    found = shown.compared(given)
+    if found.as_given - shown.log_likelihood(given, stated) < _LOG_ODDS or found.scatter <= stated:
         return None
-    if max(changed[best][0], none[0]) < likelihood + _LOG_ODDS:
+    if max(found.changed, found.without) >= found.as_given + _LOG_ODDS:
         if options.attitudes is None:
-            return None
-        text = f"the attitudes agree with the images to {math.degrees(scatter):.2g} degrees, which is taken for their "
-        text += f"standard deviation instead of {math.degrees(stated):.2g}"
-        return replace(options, attitudes_std=scatter), Message(text, severity="note")
+            return without, _tilt_contradicted(given[0], shown)
+        return without, _attitudes_contradicted(found)
     if options.attitudes is None:
-        text = "the images contradict the given tilt of {:.2f}, {:.2f} degrees".format(*np.degrees(given[0]))
-        text += ", which is not used: they show {:.2f}, {:.2f}".format(*np.degrees(np.median(shown.tilts, axis=0)))
-    else:
-        text = f"the images contradict the attitudes by {math.degrees(scatter):.1f} degrees; they are not used: "
-        related = changed[best][0] > none[0] + _LOG_ODDS
-        error = math.degrees(max(changed[best][1], _EXACT))
-        better = f"with {_named(_SIGNED_ORDERS[best])} they would fit to {error:.2g} degrees"
-        text += better if related else "no signs and no order of psi and theta make them fit"
-    return without, Message(text, code="attitudes-contradicted")
+        return None
+    return replace(options, attitudes_std=found.scatter), _attitudes_scatter(found.scatter, stated)
 
 
 def _fit_without_tilts(
@@ -137,9 +126,9 @@ def judged_focal(stated_std: float, shown: float, shown_std: float) -> tuple[flo
     It is right within ``stated_std``, or wrong by anything (:data:`WRONG_GIVEN_FOCAL`); the images show one that is
     ``shown`` longer, as a logarithm, with a standard deviation that is inf where they show none.
     """
-    share, far = WRONG_GIVEN_FOCAL
+    prior_wrong, far = WRONG_GIVEN_FOCAL
     logs, squares = [], []
-    for weight, std in ((1.0 - share, stated_std), (share, far)):
+    for weight, std in ((1.0 - prior_wrong, stated_std), (prior_wrong, far)):
         spread = std**2 + shown_std**2
         gain = std**2 / spread if math.isfinite(spread) else 0.0
         logs.append(math.log(weight) - (0.5 * (math.log(spread) + shown**2 / spread) if gain else 0.0))
@@ -161,11 +150,43 @@ def attitudes_late(delay: float, std: float) -> Message:
     return Message(text, severity="note", code="attitudes-late")
 
 
+def _attitudes_scatter(scatter: float, stated: float) -> Message:
+    text = f"the attitudes agree with the images to {math.degrees(scatter):.2g} degrees, which is taken for their "
+    return Message(f"{text}standard deviation instead of {math.degrees(stated):.2g}", severity="note")
+
+
+def _tilt_contradicted(given: FloatArray, shown: "_ShownTilts") -> Message:
+    text = "the images contradict the given tilt of {:.2f}, {:.2f} degrees".format(*np.degrees(given))
+    text += ", which is not used: they show {:.2f}, {:.2f}".format(*np.degrees(np.median(shown.tilts, axis=0)))
+    return Message(text, code="attitudes-contradicted")
+
+
+def _attitudes_contradicted(found: "_Comparison") -> Message:
+    text = f"the images contradict the attitudes by {math.degrees(found.scatter):.1f} degrees; they are not used: "
+    error = math.degrees(max(found.scatter_changed, _EXACT))
+    better = f"with {_named(found.change)} they would fit to {error:.2g} degrees"
+    related = found.changed > found.without + _LOG_ODDS
+    text += better if related else "no signs and no order of psi and theta make them fit"
+    return Message(text, code="attitudes-contradicted")
+
+
 def _named(change: FloatArray) -> str:
     """What is to be changed in a table of attitudes."""
     psi, theta = ("-psi" if row[0] < 0 else "psi" if row[0] else "-theta" if row[1] < 0 else "theta" for row in change)
     changes = [f"{new} for {old}" for new, old in ((psi, "psi"), (theta, "theta")) if new != old]
     return " and ".join(changes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """Log likelihoods, each at its best scatter, of tilts as given, with other signs or order, and of none."""
+
+    as_given: float
+    scatter: float  # radians
+    change: FloatArray  # (2, 2): the likeliest of the changes
+    changed: float
+    scatter_changed: float
+    without: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,8 +227,15 @@ class _ShownTilts:
         variance = self.variances + scatter**2 + _EXACT**2
         return -0.5 * float((error**2 / variance + np.log(variance)).sum())
 
-    def likelihood(self, expected: FloatArray) -> tuple[float, float]:
-        """The largest log likelihood, and the scatter that it has."""
+    def compared(self, given: FloatArray) -> _Comparison:
+        """Tilts (N, 2) that are given, with what they might be instead."""
+        changed = [self.best_scatter(given @ change.T) for change in _SIGNED_ORDERS]
+        best = max(range(len(changed)), key=lambda k: changed[k][0])
+        without, _ = self.best_scatter(np.zeros_like(given))
+        return _Comparison(*changed[0], _SIGNED_ORDERS[best], *changed[best], without)
+
+    def best_scatter(self, expected: FloatArray) -> tuple[float, float]:
+        """The largest log likelihood of tilts (N, 2), and the scatter that it has."""
         values = [self.log_likelihood(expected, scatter) for scatter in _SCATTERS.tolist()]
         best = int(np.argmax(values))
         return values[best], float(_SCATTERS[best])
@@ -215,11 +243,13 @@ class _ShownTilts:
     def delay(self, expected: FloatArray) -> tuple[float, float] | None:
         """By how many seconds the times of tilts (N, S, 2) at :data:`DELAYS` are late, with its std, or None."""
         slow = smooth(expected)
-        scores = np.array([self.likelihood(slow[:, k])[0] for k in range(len(DELAYS))]) - (DELAYS / DELAY_STD) ** 2 / 2
+        scores = (
+            np.array([self.best_scatter(slow[:, k])[0] for k in range(len(DELAYS))]) - (DELAYS / DELAY_STD) ** 2 / 2
+        )
         best, step = int(np.argmax(scores)), float(DELAYS[1] - DELAYS[0])
         if best in (0, len(DELAYS) - 1):
             return None
         below, top, above = scores[best - 1 : best + 2].tolist()
-        bend = 2.0 * top - below - above
-        delay, std = float(DELAYS[best]) + step * (above - below) / (2.0 * bend), step / math.sqrt(bend)
+        curvature = 2.0 * top - below - above
+        delay, std = float(DELAYS[best]) + step * (above - below) / (2.0 * curvature), step / math.sqrt(curvature)
         return (delay, std) if abs(delay) > LATE * std else None

@@ -78,7 +78,7 @@ class _KnownPlaces(ABC):
 
     metres: ComplexArray  # (N,): east - i north
     std: FloatArray  # (N,): of a coordinate, m
-    least: int
+    min_count: int
     name: str
 
     @abstractmethod
@@ -100,7 +100,7 @@ class _KnownPlaces(ABC):
     @property
     def enough(self) -> bool:
         """Whether they say anything of the shape; whatever a few of them are."""
-        if len(self.metres) < self.least:
+        if len(self.metres) < self.min_count:
             return False
         middle = complex(np.median(self.metres.real), np.median(self.metres.imag))
         return float(np.median(np.abs(self.metres - middle) / self.std)) >= _MIN_SPREAD
@@ -119,7 +119,7 @@ class _KnownPlaces(ABC):
 
 
 class _Positions(_KnownPlaces):
-    least, name = _MIN_POSITIONS, "GPS positions"
+    min_count, name = _MIN_POSITIONS, "GPS positions"
 
     def __init__(self, problem: Problem) -> None:
         metres, std = problem.camera_priors.positions @ np.array([1.0, -1.0j]), problem.camera_priors.positions_std
@@ -150,7 +150,7 @@ class _Positions(_KnownPlaces):
 
 
 class _Control(_KnownPlaces):
-    least, name = _MIN_CONTROL, "ground control points"
+    min_count, name = _MIN_CONTROL, "ground control points"
 
     def __init__(self, problem: Problem, fit: Fit) -> None:
         given = problem.camera_priors.control
@@ -159,7 +159,7 @@ class _Control(_KnownPlaces):
         self.metres = known.places @ np.array([1.0, -1.0j])
         self.count = np.bincount(known.point, minlength=len(known.names))
         self.std = known.std
-        if len(self.metres) >= self.least:
+        if len(self.metres) >= self.min_count:
             places = self.estimated(fit)
             pixel = np.bincount(known.point, known.pixel) / self.count
             self.std = np.hypot(known.std, _CLICK * pixel * abs(fit_similarity(places, self.metres, 0.0).scale))

@@ -78,17 +78,17 @@ def shared_variance(observations: Observations, errors: FloatArray, inliers: Boo
 def neighbours(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:
     """Inliers, of very many links every n-th, and the nearest neighbour in the same link of each that has one."""
     chosen = _sample(observations, inliers)
-    apart = np.column_stack([observations.points1[chosen], observations.link[chosen] * 10.0])
-    if len(apart) < 2:
+    spaced = np.column_stack([observations.points1[chosen], observations.link[chosen] * 10.0])
+    if len(spaced) < 2:
         return chosen[:0], chosen[:0]
-    distance, neighbour = nearest_points(apart, apart, 4)
+    distance, neighbour = nearest_points(spaced, spaced, 4)
     pairs = (distance[:, 1:] > _MIN_DISTANCE) & (distance[:, 1:] < _MAX_DISTANCE)
     has_neighbour = pairs.any(axis=1)
-    nearest = neighbour[np.arange(len(apart)), np.argmax(pairs, axis=1) + 1]
+    nearest = neighbour[np.arange(len(spaced)), np.argmax(pairs, axis=1) + 1]
     return chosen[has_neighbour], chosen[nearest[has_neighbour]]
 
 
-def apart(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:
+def distant_pairs(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:
     """Pairs of inliers of a link, of very many links of every n-th, at all distances, by the first of each."""
     chosen = _sample(observations, inliers)
     link = observations.link[chosen]

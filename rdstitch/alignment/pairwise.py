@@ -7,7 +7,7 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import (
-    ROUGH_GAIN,
+    LOOSE_GAIN,
     BundleAdjuster,
     BundleAdjustmentResult,
     FreeParameters,
@@ -68,8 +68,8 @@ def independent_pairs(
     start = Parameters(nearest_pairs(model, observations, homographies, shared, known.attitudes), shared, lens)
     freedom = FreeParameters.fixing(model, count, list(range(0, count, 2)), free_lens)
     first = 2 * np.arange(len(observations))
-    apart = replace(observations, image1=first, image2=first + 1)
-    return BundleAdjuster(model, apart, freedom, known.of_camera(model, count), max_iterations=_MAX_ITERATIONS), start
+    pairs, priors = replace(observations, image1=first, image2=first + 1), known.of_camera(model, count)
+    return BundleAdjuster(model, pairs, freedom, priors, max_iterations=_MAX_ITERATIONS), start
 
 
 def nearest_pairs(
@@ -102,7 +102,7 @@ def best_trial(problem: Problem, model: MotionModel) -> tuple[BundleAdjuster, Pa
     squared = [adjuster.squared(start) for adjuster, start in trials]
     width = ALIGNMENT_WIDTH * min(float(np.median(sample.scale2)), *map(sigma_of, squared))
     adjuster, start = trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
-    return replace(adjuster, min_gain=ROUGH_GAIN), start
+    return replace(adjuster, min_gain=LOOSE_GAIN), start
 
 
 def fit_trial(problem: Problem, model: MotionModel) -> BundleAdjustmentResult:

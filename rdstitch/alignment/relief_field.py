@@ -18,7 +18,7 @@ from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, B
 from rdstitch.alignment.least_squares.linear_response import Fields, LinearResponse
 from rdstitch.alignment.least_squares.link_equations import LinearizedErrors, split_lens
 from rdstitch.alignment.motion_models import LOG_HEIGHT, X, Y
-from rdstitch.alignment.noise import apart, neighbours
+from rdstitch.alignment.noise import distant_pairs, neighbours
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.division_model import distort, undistort
 from rdstitch.geometry.radial_homography import inverses, project
@@ -235,7 +235,7 @@ class ReliefField:
         nearest = np.unique(np.sort(np.stack(neighbours(o, inliers)), axis=0), axis=1)
         if not nearest.size:
             return []
-        first, second = apart(o, inliers)
+        first, second = distant_pairs(o, inliers)
         distance = np.linalg.norm(o.points1[first] - o.points1[second], axis=1)
         result = [(nearest[0], nearest[1])]
         for low, high in pairwise(_DISTANCES):
@@ -268,13 +268,13 @@ def _nonnegative_solution(equations: FloatArray, right: FloatArray) -> FloatArra
 
     To try them all is quick for the few bands; SciPy's optimizers would take longer to import than a pair to align.
     """
-    best, least = np.zeros(equations.shape[1]), np.inf
+    best, min_cost = np.zeros(equations.shape[1]), np.inf
     for chosen in product((False, True), repeat=len(best)):
         solution = np.zeros(len(best))
         solution[list(chosen)] = np.linalg.lstsq(equations[:, list(chosen)], right)[0]
         cost = float(np.linalg.norm(equations @ solution - right))
-        if cost < least and (solution >= 0.0).all():
-            best, least = solution, cost
+        if cost < min_cost and (solution >= 0.0).all():
+            best, min_cost = solution, cost
     return best
 
 

@@ -23,7 +23,7 @@ from rdstitch.alignment.starts import fit_model, start_from
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 
-_FEWEST = 3
+_MIN_IMAGES = 3
 """Images: of two, tilts do what heights do, and the errors do not show which."""
 
 _ROUNDS, _SETTLED = 4, 0.02
@@ -41,9 +41,9 @@ _SIGNIFICANT = 3.0
 def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[str], purpose: Purpose) -> ModelChoice:
     """The model of one camera chosen again, with heights that account for errors, where such heights show.
 
-    Without a free distortion centre, which over rough ground bends the whole as the ground bends the images.
+    Freeing the distortion centre is not tried: over relief it bends the whole as the ground bends the images.
     """
-    if not _is_rough(problem, choice.fit) or weighted_by_relief(problem, choice.fit) is problem:
+    if not _shows_relief(problem, choice.fit) or weighted_by_relief(problem, choice.fit) is None:
         return choice
     problem = replace(problem, overdispersion=choice.fit.overdispersion)
     fits: list[Fit] = []
@@ -67,13 +67,13 @@ def adjust_over_relief(problem: Problem, choice: ModelChoice) -> tuple[Problem, 
     return problem, _refined(problem, choice.fit)
 
 
-def weighted_by_relief(problem: Problem, fit: Fit) -> Problem:
-    """The problem with what heights add to the covariances of its errors; as it is where no heights show.
+def weighted_by_relief(problem: Problem, fit: Fit) -> Problem | None:
+    """The problem with what heights add to the covariances of its errors; None where no heights show.
 
     Of one camera over a plane only.
     """
-    if not fit.model.has_metric_poses or problem.count < _FEWEST:
-        return problem
+    if not fit.model.has_metric_poses or problem.count < _MIN_IMAGES:
+        return None
     plain = replace(problem, observations=replace(problem.observations, relief=None))
     adjuster, adjusted, o = plain.adjuster_of(fit), fit.adjusted, plain.observations
     field = Parallax(adjuster, adjusted)
@@ -85,11 +85,11 @@ def weighted_by_relief(problem: Problem, fit: Fit) -> Problem:
         moved[part.rows][seen] = np.linalg.solve(-part.by_point2[seen], parallax[part.rows][seen, :, None])[:, :, 0]
     scatter = _scatter(errors, parallax, independent_errors(o, plain.homographies, plain.lens)[1])
     if scatter == 0.0:
-        return problem if problem.observations.relief is None else plain
+        return None
     return replace(problem, observations=replace(o, relief=scatter * moved * o.scale2[o.link, None]))
 
 
-def _is_rough(problem: Problem, fit: Fit) -> bool:
+def _shows_relief(problem: Problem, fit: Fit) -> bool:
     """Whether the ground moves points, and not by next to nothing.
 
     Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
@@ -101,7 +101,8 @@ def _settled(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     """A problem and a fit that go with each other."""
     size = math.inf
     for _ in range(_ROUNDS):
-        problem = weighted_by_relief(problem, fit)
+        flat = replace(problem, observations=replace(problem.observations, relief=None))
+        problem = weighted_by_relief(problem, fit) or flat
         fit = _refined(problem, fit)
         relief, former = problem.observations.relief, size
         size = 0.0 if relief is None else float(np.median(np.linalg.norm(relief, axis=1)))
@@ -126,8 +127,8 @@ def _scatter(errors: FloatArray, parallax: FloatArray, effective: float) -> floa
     along = np.einsum("mi,mi->m", errors, direction) ** 2
     across = (errors[:, 1] * direction[:, 0] - errors[:, 0] * direction[:, 1]) ** 2
     noise = float(np.median(across)) / _NORMAL_MEDIAN if len(across) else 0.0
-    least = math.exp(_SIGNIFICANT * _MEDIAN_STD * math.sqrt(2.0 / (effective / 2.0)))
-    if noise <= 0.0 or float(np.median(along)) <= least * noise * _NORMAL_MEDIAN:
+    min_ratio = math.exp(_SIGNIFICANT * _MEDIAN_STD * math.sqrt(2.0 / (effective / 2.0)))
+    if noise <= 0.0 or float(np.median(along)) <= min_ratio * noise * _NORMAL_MEDIAN:
         return 0.0
     # Of this scatter the median of ``along / (noise + (scatter length)²)`` is what it is for normal variables.
     variance = float(np.median((along / _NORMAL_MEDIAN - noise) / length**2))

@@ -10,10 +10,12 @@ translation. Of the planar models the least free one is taken that the images al
 import math
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.frames.reference_frame import MAX_STRETCH
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.least_squares.link_equations import split_lens, whitened_errors
 from rdstitch.alignment.lens.lens_selection import NO_COHERENCE, residual_coherence
@@ -33,10 +35,6 @@ _GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).resha
 
 _FRAMES = 12
 """Images that are tried as the frame of a plane without a metric."""
-
-_MAX_STRETCH = 10.0
-"""Ratio of areas from which on a layout is not believed. A plane seen from above has up to 7, one seen under 35 degrees
-6 to 15, by the focal length."""
 
 
 def stretch(fit: Fit) -> float:
@@ -104,8 +102,8 @@ class Hypothesis:
 
     @property
     def implausible(self) -> bool:
-        """Whether a turn is what a person would rather see."""
-        return not self.stretch <= _MAX_STRETCH
+        """Whether areas are stretched out of proportion, or images folded."""
+        return not self.stretch <= MAX_STRETCH
 
 
 @dataclass(frozen=True)
@@ -126,7 +124,7 @@ class Posterior:
         return evidence_of(self.problem.observations, self.link_errors)
 
     @cached_property
-    def least(self) -> ErrorCost:
+    def floor(self) -> ErrorCost:
         """What the errors of links on their own say, which those of no model undercut by much."""
         return self.evidence.cost(self.link_errors)
 
@@ -134,17 +132,17 @@ class Posterior:
         """What the errors say that an adjustment leaves."""
         return self.evidence.cost(adjusted.errors)
 
-    def of(self, fit: Fit) -> Hypothesis:
+    def scored(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
         errors = self.cost(fit.adjusted)
         layout = stretch(fit) if self.purpose.picture else 1.0
         spread = (fit.tilt_spread or 0.0) / _TYPICAL_TILT_SPREAD
         wide = 4.0 * self.problem.count * math.log(max(spread, 1.0))
         priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
-        score = self.bound(fit.model, errors, fit.free_lens) + wide + priors
+        score = self.lower_bound(fit.model, errors, fit.free_lens) + wide + priors
         return Hypothesis(fit, score, float(errors.field[0]), layout)
 
-    def bound(self, model: MotionModel, errors: ErrorCost, free_lens: BoolArray | None = None) -> float:
+    def lower_bound(self, model: MotionModel, errors: ErrorCost, free_lens: BoolArray | None = None) -> float:
         """The score of a model that leaves such errors, of a camera that is as cameras are."""
         free = parameter_count(self.problem, model, self.problem.free_lens if free_lens is None else free_lens)
         preference = TWENTY_TO_ONE if model.on_sphere != (self.purpose is Purpose.PANO) else 0.0
@@ -152,9 +150,9 @@ class Posterior:
 
     def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
-        if not model.one_camera and not _is_beyond_one_camera(self, best, float(self.least.field[0])):
+        if not model.one_camera and not _is_beyond_one_camera(self, best, float(self.floor.field[0])):
             return True
-        return not best.implausible and best.score <= self.bound(model, self.least)
+        return not best.implausible and best.score <= self.lower_bound(model, self.floor)
 
 
 def select_model(
@@ -171,39 +169,60 @@ def select_model(
     regular motion. Free homographies are a model of another kind, taken only for what one camera cannot explain.
     """
     posterior = Posterior(problem, purpose)
-    tried: list[Hypothesis] = []
-    later: list[tuple[float, MotionModel, FloatArray]] = []
+    models = [MODELS[name] for name in names]
+    planar = [model for model in models if not model.on_sphere]
     wide = replace(problem, free_lens=np.logical_or.reduce([problem.free_lens, *lenses]))
-    planar = [MODELS[name] for name in names if not MODELS[name].on_sphere]
-    for turn in [MODELS[name] for name in names if MODELS[name].on_sphere]:
+    turns = [_TurnTrial.of(posterior, wide, model) for model in models if model.on_sphere]
+    bar = posterior.lower_bound(planar[0], posterior.floor) if planar else math.inf
+    early = [turn.scored(posterior) for turn in turns if turn.bound < bar]
+    tried = _with_planar(posterior, early, planar, free=not all(model.one_camera for model in models))
+    for turn in (turn for turn in turns if turn.bound >= bar):
+        best = min((one for one in tried if one.fit.model.one_camera), key=_score)
+        if best.implausible or turn.bound < best.score:
+            tried.insert(0, turn.scored(posterior))
+    tried = _with_wider_lenses(posterior, tried, lenses)
+    return _choice(tried, _best(posterior, tried), requested=len(names) == 1)
+
+
+@dataclass(frozen=True, eq=False)
+class _TurnTrial:
+    """What links that are turns on their own say of a turn of all images: no score of it is less than the bound."""
+
+    model: MotionModel
+    bound: float
+    shared: FloatArray | None  # parameters to start from
+
+    @classmethod
+    def of(cls, posterior: Posterior, problem: Problem, model: MotionModel) -> Self:
         if len(problem.observations) == 1:  # a trial is the whole
-            tried.append(posterior.of(fit_model(problem, turn)))
-            continue
-        trial = fit_trial(wide, turn)
-        bound, shared = posterior.bound(turn, posterior.cost(fit_pairwise(wide, turn, trial))), trial.parameters.shared
-        if not planar or bound < posterior.bound(planar[0], posterior.least):
-            tried.append(posterior.of(fit_model(problem, turn, shared=shared)))
-        else:
-            later.append((bound, turn, shared))
-    for model in planar:
-        if problem.count == 2 and model.free_tilts and not all(MODELS[name].one_camera for name in names):
+            return cls(model, -math.inf, None)
+        trial = fit_trial(problem, model)
+        bound = posterior.lower_bound(model, posterior.cost(fit_pairwise(problem, model, trial)))
+        return cls(model, bound, trial.parameters.shared)
+
+    def scored(self, posterior: Posterior) -> Hypothesis:
+        return posterior.scored(fit_model(posterior.problem, self.model, shared=self.shared))
+
+
+def _with_planar(
+    posterior: Posterior, tried: Sequence[Hypothesis], models: Sequence[MotionModel], *, free: bool
+) -> list[Hypothesis]:
+    """With planar models, from the least to the most free, which are ``free`` homographies or not."""
+    tried = list(tried)
+    for model in models:
+        if posterior.problem.count == 2 and model.free_tilts and free:
             continue  # with two images, one camera that tilts is a homography
         if tried and posterior.suffices(min(tried, key=_score), model):
             break
         planes = [one.fit for one in tried if not one.fit.model.on_sphere]
-        tried.append(posterior.of(fit_model(problem, model, planes[-1:])))
-    for bound, turn, shared in later:
-        best = min((one for one in tried if one.fit.model.one_camera), key=_score)
-        if best.implausible or bound < best.score:
-            tried.insert(0, posterior.of(fit_model(problem, turn, shared=shared)))
-    tried = _with_wider_lenses(posterior, tried, lenses)
-    return _choice(tried, _best(posterior, tried), requested=len(names) == 1)
+        tried.append(posterior.scored(fit_model(posterior.problem, model, planes[-1:])))
+    return tried
 
 
 def best_of(problem: Problem, fits: Sequence[Fit], purpose: Purpose, *, requested: bool) -> ModelChoice | None:
     """Take the best of some fits of the problem; None where nobody would keep the layout of any."""
     posterior = Posterior(problem, purpose)
-    tried = [posterior.of(fit) for fit in fits]
+    tried = [posterior.scored(fit) for fit in fits]
     tried = [one for one in tried if not one.implausible]
     return _choice(tried, _best(posterior, tried), requested=requested) if tried else None
 
@@ -217,7 +236,7 @@ def _with_wider_lenses(
         order = sorted(range(len(tried)), key=lambda index: tried[index].score)[:2]
         for index in sorted({0, *order}):
             fit = tried[index].fit
-            wider = posterior.of(posterior.problem.extend(fit, lens | fit.free_lens))
+            wider = posterior.scored(posterior.problem.extend(fit, lens | fit.free_lens))
             # A centre that is off bends a plane as rough ground bends the images; directions it does not bend.
             shown = fit.model.on_sphere or residual_coherence(wider.fit.adjusted).correlation < NO_COHERENCE
             if wider.score < tried[index].score and shown:

@@ -94,9 +94,9 @@ def _relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> Relie
     """What relief does, by as many matches of each link as show its waves."""
     observations = adjuster.observations
     few = observations.thinned_to(_ENOUGH, _MIN_MATCHES_PER_LINK)
-    share = len(few.points1) / max(len(observations.points1), 1)
-    if share < 1.0:  # each counts for several beside the priors
-        adjuster = replace(adjuster, observations=few, overdispersion=adjuster.overdispersion * share)
+    fraction = len(few.points1) / max(len(observations.points1), 1)
+    if fraction < 1.0:  # each counts for several beside the priors
+        adjuster = replace(adjuster, observations=few, overdispersion=adjuster.overdispersion * fraction)
         adjusted = replace(adjusted, adjuster=adjuster)
     return ReliefField(LinearResponse.of(adjuster, adjusted))
 
@@ -115,13 +115,13 @@ def _influence(response: LinearResponse) -> tuple[FloatArray, FloatArray]:
     return influence, shared - information
 
 
-def _at_least(covariance: FloatArray, least: FloatArray) -> FloatArray:
+def _at_least(covariance: FloatArray, other: FloatArray) -> FloatArray:
     """The covariance (S, S), in no direction less than another, which may be singular."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     values = np.maximum(values, _SINGULAR)
     root, inverse = vectors * np.sqrt(values) * scale[:, None], vectors / np.sqrt(values) / scale[:, None]
-    return enlarged(root, inverse.T @ least @ inverse)
+    return enlarged(root, inverse.T @ other @ inverse)
 
 
 def _by_keypoints(observations: Observations, influence: FloatArray) -> FloatArray:
@@ -158,28 +158,28 @@ def _by_images(observations: Observations, influence: FloatArray) -> FloatArray:
     return covariance
 
 
-def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *, rough: bool) -> FloatArray:
+def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *, over_relief: bool) -> FloatArray:
     """The covariance (5, 5) of all parameters of a lens with what a wrong model of the motion does to them.
 
     A focal length that next to no lens has bends the images with something else, and λ may be what goes with the usual
-    one. Where the ground is ``rough`` that is known, and in the covariance.
+    one. Over relief that is known, and in the covariance.
     """
     count, deviation = len(problem.free_lens), 0.0
     if fit.model.has_metric_poses:
         log_focal = float(fit.model.physical_parameters(fit.adjusted.parameters.shared)[0][-1])
         deviation = log_focal - problem.camera_priors.log_focal
-    if not rough and abs(deviation) > _UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
+    if not over_relief and abs(deviation) > _UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
         adjuster = replace(problem, free_lens=np.ones_like(problem.free_lens)).adjuster_of(fit)
         together = adjuster.covariance(fit.adjusted)
         focal = len(fit.model.shared_names) - 1
         moved = together[-count:, focal] * (deviation / together[focal, focal])
         covariance = covariance + np.outer(moved, moved)
     if problem.count == 2 and fit.model.has_metric_poses:
-        covariance = _with_free_motion(problem, fit, covariance, rough=rough)
+        covariance = _with_free_motion(problem, fit, covariance, over_relief=over_relief)
     return covariance
 
 
-def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rough: bool) -> FloatArray:
+def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, over_relief: bool) -> FloatArray:
     """The covariance (5, 5) over two models: the one taken, and a homography (Buckland, Burnham and Augustin 1997).
 
     Of two images nothing but their errors says whether they were tilted alike, and over rough ground they say little.
@@ -187,11 +187,11 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rou
     """
     free = fit_model(problem, HOMOGRAPHY)
     posterior = Posterior(problem, Purpose.TRAJECTORY)
-    against = float(np.clip((posterior.of(free).score - posterior.of(fit).score) / 2.0, -50.0, 50.0))
-    share = 1.0 / (1.0 + math.exp(against))
+    against = float(np.clip((posterior.scored(free).score - posterior.scored(fit).score) / 2.0, -50.0, 50.0))
+    of_free = 1.0 / (1.0 + math.exp(against))
     off = free.adjusted.parameters.lens - fit.adjusted.parameters.lens
-    other = considered_covariance(problem, free, covariances(problem, free)[1], rough=rough) + np.outer(off, off)
-    mixed: FloatArray = (1.0 - share) * covariance + share * other
+    other = considered_covariance(problem, free, covariances(problem, free)[1], over_relief=over_relief)
+    mixed: FloatArray = (1.0 - of_free) * covariance + of_free * (other + np.outer(off, off))
     return mixed
 
 

@@ -1,5 +1,6 @@
 """Images of a result as layers for retouching: each warped, with its mask."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,25 +16,17 @@ from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_outputs, file_name
 
 
-def layer_files(names: list[str], folder: str | Path) -> list[Path]:
-    """The files of images of these names, two each: the layer, and its mask.
+def layer_files(names: Sequence[str], folder: str | Path) -> dict[str, tuple[Path, Path]]:
+    """Of each image, by its name, the files of the layer and of its mask.
 
     They are called like the images without their suffixes, or with them, where two files would have one name.
     """
     whole = [file_name(name) for name in names]
     for stems in ([Path(name).stem for name in whole], whole):
-        files = [Path(folder) / f"{stem}{kind}.tif" for stem in stems for kind in ("", "_mask")]
-        if len({str(file).casefold() for file in files}) == len(files):
-            return files
+        files = [(Path(folder) / f"{stem}.tif", Path(folder) / f"{stem}_mask.tif") for stem in stems]
+        if len({str(file).casefold() for pair in files for file in pair}) == 2 * len(files):
+            return dict(zip(names, files, strict=True))
     raise OutputError(f"{folder}: several images have one name, but layers need different ones; rename them")
-
-
-def make_folder(folder: str | Path) -> None:
-    """Make a folder of outputs, or say why not, which is better known before long work than after it."""
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
 
 
 @one_native_thread()
@@ -43,7 +36,6 @@ def write_layers(
     *,
     whole: bool = False,
     overwrite: bool = False,
-    outputs: Outputs | None = None,
 ) -> list[Path]:
     """Write each image of a result as a layer, and its mask, as TIFF.
 
@@ -58,8 +50,6 @@ def write_layers(
         On the whole canvas; otherwise cropped, with the offset in the tags XPosition and YPosition and the canvas in
         PixarImageFullWidth and -Length, as enblend reads it.
     overwrite : bool
-    outputs : Outputs, optional
-        Where the files are staged, to be published with the image.
 
     Returns
     -------
@@ -70,16 +60,23 @@ def write_layers(
     OutputError
         When a file exists or cannot be written.
     """
-    placed, options = result.placed, result.options.composite
-    files = layer_files([source.name for source in placed.sources], folder)
-    make_folder(folder)
-    check_outputs(files, overwrite, [source.path for source in placed.sources])
-    images = placed.images(result.canvas.near)
-    task = decide(images, result.canvas, replace(options, crop="none"))
-    with prepare_composite(task) as prepared, Outputs.or_own(outputs, overwrite) as staging:
+    files = layer_files([source.name for source in result.placed.sources], folder)
+    written = [file for pair in files.values() for file in pair]
+    with Outputs(overwrite) as outputs:
+        outputs.make_folder(Path(folder))
+        check_outputs(written, overwrite, [source.path for source in result.placed.sources])
+        stage_layers(result, files, outputs, whole=whole)
+    return written
+
+
+def stage_layers(result: OutputImage, files: Mapping[str, tuple[Path, Path]], outputs: Outputs, *, whole: bool) -> None:
+    """Stage the layer and the mask of each image of a result, whose names say the files."""
+    images = result.placed.images(result.canvas.near)
+    task = decide(images, result.canvas, replace(result.options.composite, crop="none"))
+    with prepare_composite(task) as prepared:
         canvas = prepared.tiles.box
         size = canvas[2] - canvas[0], canvas[3] - canvas[1]
-        for index, warp in enumerate(prepared.renderer.warps):
+        for index, (source, warp) in enumerate(zip(result.placed.sources, prepared.renderer.warps, strict=True)):
             box = canvas if whole else intersection(warp.box, canvas) or canvas
             samples, covered, mask = prepared.renderer.layer(index, box)
             offset = box[0] - canvas[0], box[1] - canvas[1]
@@ -87,8 +84,8 @@ def write_layers(
             tags = () if result.georeference is None else result.georeference.after(shift).tiff_tags()
             write = partial(write_cropped_tiff, offset=offset, size=size, extra_tags=tags)
             alpha, shown = (np.where(where, np.uint8(255), np.uint8(0)) for where in (covered, mask))
-            with staging.writing(files[2 * index]) as staged:
+            layer, mask_file = files[source.name]
+            with outputs.writing(layer) as staged:
                 write(staged, samples, alpha)
-            with staging.writing(files[2 * index + 1]) as staged:
+            with outputs.writing(mask_file) as staged:
                 write(staged, shown, None)
-    return files

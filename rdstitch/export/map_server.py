@@ -13,13 +13,16 @@ import numpy as np
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
-from rdstitch.errors import ArgumentError
+from rdstitch.compositing.plan import default_memory
+from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.export.trajectory_files import AXES
 from rdstitch.io import ImageSpec, write_strips
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs, text_bytes
+
+_BYTES_A_PIXEL = 6  # grey levels and transparency, as they are, on the map, and while they are written
 
 
 def write_map(result: StitchResult, folder: Path, height: float, outputs: Outputs) -> None:
@@ -30,6 +33,7 @@ def write_map(result: StitchResult, folder: Path, height: float, outputs: Output
     description, map_image = map_files(folder)
     to_metres = _pixel_to_metres(result, height)
     assert result.output is not None
+    _check_memory(map_image, result)
     image = read_image(outputs.staged(result.output) or result.output)
     grey = image.pixels if image.pixels.ndim == 2 else cv2.cvtColor(image.pixels[..., :3], cv2.COLOR_RGB2GRAY)
     if grey.dtype != np.uint8:
@@ -60,6 +64,18 @@ def write_map(result: StitchResult, folder: Path, height: float, outputs: Output
     }
     lines = "".join(f"{name}: {json.dumps(value)}\n" for name, value in fields.items())
     outputs.write(description, text_bytes(lines))
+
+
+def _check_memory(file: Path, result: StitchResult) -> None:
+    """Refuse a map whose making would take more memory than there is: that the mosaic is kept counts more."""
+    sources, (width, height) = result.placed.sources, result.canvas.size
+    pixel = max(one.metadata.channels * max(one.metadata.bit_depth // 8, 1) for one in sources) + _BYTES_A_PIXEL
+    limit = result.options.composite.max_memory or default_memory()
+    if (need := width * height * pixel) > limit:
+        raise LimitError(
+            f"{file}: a map of {width} x {height} pixels needs {need / 2**20:.0f} MB of memory, and there are "
+            f"{limit / 2**20:.0f} MB; make the output smaller, with --scale or --max-size"
+        )
 
 
 def map_files(folder: Path) -> list[Path]:

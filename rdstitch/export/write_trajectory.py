@@ -10,12 +10,12 @@ from rdstitch.system.outputs import Outputs, text_bytes
 
 
 def write_trajectory(
-    path: Trajectory, file: Path, layout: TrajectoryFormat, frame: TrajectoryFrame | None, outputs: Outputs
+    path: Trajectory, file: Path, file_format: TrajectoryFormat, frame: TrajectoryFrame | None, outputs: Outputs
 ) -> None:
     """Stage the file among the outputs; the bag of ROS 2, which is a folder, is put in its place at once."""
-    frame = frame or frame_of(layout)
-    if layout != "bag":
-        outputs.write(file, text_bytes(WRITERS[layout](path, frame)))
+    frame = frame or frame_of(file_format)
+    if file_format != "bag":
+        outputs.write(file, text_bytes(WRITERS[file_format](path, frame)))
     elif file.suffix.lower() == ".bag":
         with outputs.writing(file) as staged:
             write_bag(path, staged, frame)

@@ -165,5 +165,5 @@ def _interpolation(side: int) -> tuple[FloatArray, FloatArray]:
     angle = (np.arange(_NODES) + 0.5) * np.pi / _NODES
     pixel = (2.0 * np.arange(side) + 1.0) / side - 1.0
     # Barycentric weights; no pixel lies on a node but by chance, and then next to it.
-    share = (-1.0) ** np.arange(_NODES) * np.sin(angle) / (pixel[:, None] - np.cos(angle) + 1e-12)
-    return (np.cos(angle) + 1.0) * side / 2.0 - 0.5, share / share.sum(axis=1, keepdims=True)
+    weight = (-1.0) ** np.arange(_NODES) * np.sin(angle) / (pixel[:, None] - np.cos(angle) + 1e-12)
+    return (np.cos(angle) + 1.0) * side / 2.0 - 0.5, weight / weight.sum(axis=1, keepdims=True)

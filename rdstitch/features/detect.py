@@ -15,9 +15,11 @@ from rdstitch.features.sift_tiles import LARGE, SiftTilesDetection
 from rdstitch.features.surf.descriptor import SurfDetection
 from rdstitch.options.feature_options import CLOSER, FeatureOptions
 
-_MIN_KEYPOINT_SHARE = 0.5  # of the keypoints wanted: where a reduced image shows fewer, a larger one is used
+_MIN_KEYPOINT_FRACTION = 0.5  # of the keypoints wanted: where a reduced image shows fewer, a larger one is used
 _SPREAD_CELL = 0.05  # side of a cell over which keypoints are spread, diagonals of the image
-_LASTING = 0.5  # share of the keypoints that must be seen at less contrast, too; of fewer, contrast is what is missing
+_LASTING = (
+    0.5  # fraction of the keypoints that must be seen at less contrast, too; of fewer, contrast is what is missing
+)
 
 
 Detection = SurfDetection | AlikedDetection | SiftTilesDetection | OpenCVDetection
@@ -76,14 +78,14 @@ def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask 
 def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
     """As :func:`detect`, for an image that is loaded as large as it is needed."""
     most, megapixels = options.limits
-    image, detection, usable = _look(source, options, megapixels)
-    shown, few = len(usable), len(usable) < _MIN_KEYPOINT_SHARE * most
-    faint = False
+    image, detection, usable = _find(source, options, megapixels)
+    detected_count, few = len(usable), len(usable) < _MIN_KEYPOINT_FRACTION * most
+    low_contrast = False
     if few:  # with differences of grey levels divided by the most that equalization multiplies them by
         weakened = np.rint(image.grey / CLIP_LIMIT).astype(np.uint8)
-        faint = len(_usable(image, find(weakened, options))) <= _LASTING * shown
+        low_contrast = len(_usable(image, find(weakened, options))) <= _LASTING * detected_count
     if megapixels is not None and image.reduced and few:
-        image, detection, usable = _look(source, options, CLOSER * megapixels)
+        image, detection, usable = _find(source, options, CLOSER * megapixels)
     points, response = detection.points[usable], detection.response[usable]
     if options.spread:
         cell = _SPREAD_CELL * float(np.hypot(*image.grey.shape))
@@ -93,15 +95,20 @@ def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
     features = detection.describe(usable[chosen])
     # Some detectors return them in an order of their own.
     features = features.take(strongest(features.response, len(features)))
-    scale = features.scale * float(np.sqrt(image.factor.prod()))
-    points = image.to_full_size(features.points)
-    return replace(features, points=points, scale=scale, image_size=image.full_size, shown=shown, faint=faint)
+    return replace(
+        features,
+        points=image.to_full_size(features.points),
+        scale=features.scale * float(np.sqrt(image.factor.prod())),
+        image_size=image.full_size,
+        detected_count=detected_count,
+        low_contrast=low_contrast,
+    )
 
 
-def _look(
+def _find(
     source: ViewLoader, options: FeatureOptions, megapixels: float | None
 ) -> tuple[PreparedImage, Detection, NDArray[np.intp]]:
-    """The image at most so large, what is found in it, and which of that may count."""
+    """The image at most so large, the keypoints detected in it, and which of them keep clear of the mask."""
     image = prepare(source(megapixels), megapixels, stretch=options.stretch, equalize=bool(options.equalize))
     detection = find(image.grey, options)
     return image, detection, _usable(image, detection)

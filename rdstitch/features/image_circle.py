@@ -10,7 +10,7 @@ from rdstitch.arrays import FloatArray
 
 _DARK = 0.1  # of the brightest twentieth, up to which a pixel is dark: a surround has stray light, and noise
 _TOLERANCE = 0.01  # of the radius that the edge of the circle may be off: JPEG files and blurred rims
-_MIN_ARC = 0.5  # share of the circle that has to be seen: longer sides may cut off the rest
+_MIN_ARC = 0.5  # fraction of the circle that has to be seen: longer sides may cut off the rest
 
 
 @dataclass(frozen=True)

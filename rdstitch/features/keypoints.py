@@ -36,10 +36,10 @@ class Features:
     image_size: tuple[int, int] | None = None  # width and height of the image, pixels
     # keypoints that the image shows at its working size, before any were chosen, or a larger image was used for want of
     # them; None where that is not known
-    shown: int | None = None
+    detected_count: int | None = None
     # whether these are few, and most of them only just strong enough: they are not seen at the contrast divided by what
     # equalizing it locally multiplies it by at most
-    faint: bool = False
+    low_contrast: bool = False
 
     def __post_init__(self) -> None:
         count = len(self.points)

@@ -20,7 +20,7 @@ Matcher = Callable[[Features, Features], Correspondences]
 
 _DEFAULT_RATIO = 0.85
 _BLOCK_BYTES = 2**21  # two threads have room for it in the caches; the products of smaller ones take longer
-_USUAL = 0.95  # share of the known matches' distances that a new match may not exceed
+_USUAL = 0.95  # fraction of the known matches' distances that a new match may not exceed
 
 
 def match(

@@ -50,7 +50,11 @@ class FoundImages:
 
 @contextmanager
 def found_images(
-    arguments: Iterable[Named], *, output: str | Path | None = None, every: int | None = None, topic: str | None = None
+    arguments: Iterable[Named],
+    *,
+    outputs: Iterable[Path | None] = (),
+    every: int | None = None,
+    topic: str | None = None,
 ) -> Iterator[FoundImages]:
     """The images of :func:`find_images`, of videos too, whose frames exist only inside the block."""
     with ExitStack() as stack:
@@ -59,7 +63,7 @@ def found_images(
         def frames_folder() -> Path:
             return stack.enter_context(TemporaryFolder())
 
-        exclude = [] if output is None else [output]
+        exclude = [path for path in outputs if path is not None]
         yield find_images(arguments, exclude=exclude, frames_folder=frames_folder, every=every, topic=topic)
 
 

@@ -50,6 +50,7 @@ def write_image(
     quality: int = 95,
     background: int = 0,
     overwrite: bool = True,
+    outputs: Outputs | None = None,
 ) -> None:
     """Write an image (H, W) or (H, W, C) in RGB order; the format follows the suffix.
 
@@ -67,8 +68,8 @@ def write_image(
     spec = ImageSpec((width, height), channels, samples.dtype, alpha is not None, described, quality, background)
     pieces = (slice(top, top + _ROWS_AT_A_TIME) for top in range(0, height, _ROWS_AT_A_TIME))
     strips = ((samples[rows], None if alpha is None else alpha[rows]) for rows in pieces)
-    with Outputs(overwrite) as outputs:
-        write_strips(path, spec, strips, outputs=outputs)
+    with Outputs.or_own(outputs, overwrite) as staging:
+        write_strips(path, spec, strips, outputs=staging)
 
 
 def write_strips(

@@ -28,7 +28,7 @@ _SEQUENCE_NEIGHBOURS = 3  # images after each one that are tried
 _RETRIEVED = 4  # images most like each one that are tried, whatever the others are like
 _NEAREST = 8  # images taken nearest to each one that are tried
 _NEIGHBOURS = 10  # nearest images, by their middles, that are considered for each one
-_MIN_OVERLAP = 0.15  # share of the image of which more is seen in the other
+_MIN_OVERLAP = 0.15  # fraction of the image of which more is seen in the other
 _PLACES_PER_SIDE = 10  # of an image, that are looked up in others
 _PARTNERS = 6  # pairs of an image that its place is found by; those that others choose come on top
 _CELLS_PER_SIDE = 4  # cells of an image, a side, that its partners are to cover
@@ -150,8 +150,8 @@ def loop_closures(
 
 def _shares_seen(cameras: Sequence[Camera], homographies: FloatArray, pairs: IntArray) -> FloatArray:
     """Share of the first image of each pair (M, 2) that the second shows, by places on a grid over it, (M,)."""
-    share = (np.arange(_PLACES_PER_SIDE) + 0.5) / _PLACES_PER_SIDE
-    grid = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2)
+    fraction = (np.arange(_PLACES_PER_SIDE) + 0.5) / _PLACES_PER_SIDE
+    grid = np.stack(np.meshgrid(fraction, fraction), axis=-1).reshape(-1, 2)
     different = list(dict.fromkeys(cameras))  # most images are of one
     of_image = np.array([different.index(camera) for camera in cameras])
     result = np.empty(len(pairs))

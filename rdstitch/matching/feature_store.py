@@ -24,8 +24,10 @@ class StoredFeatures:
     # width and height of the image in whose pixels they are wanted; None: as they are stored
     image_size: Size | None = None
     chosen: NDArray[np.intp] | None = None  # (N,), intp: those that are wanted, in their order; None: all
-    shown: int = 0  # keypoints that the image shows at its working size, see :class:`rdstitch.features.Features`
-    faint: bool = False  # whether these are few and weak
+    detected_count: int = (
+        0  # keypoints that the image shows at its working size, see :class:`rdstitch.features.Features`
+    )
+    low_contrast: bool = False
 
     @classmethod
     def of(cls, features: Features) -> Self:
@@ -36,8 +38,8 @@ class StoredFeatures:
     def at(cls, stored: Stored[PackedFeatures]) -> Self:
         """Features wherever they lie; they are read once."""
         features = stored.load().features
-        shown = len(features) if features.shown is None else features.shown
-        return cls(stored, len(features), shown=shown, faint=features.faint)
+        detected_count = len(features) if features.detected_count is None else features.detected_count
+        return cls(stored, len(features), detected_count=detected_count, low_contrast=features.low_contrast)
 
     def __len__(self) -> int:
         """Number of features."""

@@ -111,7 +111,7 @@ def _per_image_distortions(pairs: Sequence[PairRegistration], threshold: float) 
 def _matches_near_one_lens(pair: PairRegistration, threshold: float) -> tuple[FloatArray, FloatArray]:
     """Matches not too far from where one λ puts them, evenly spread, pixels."""
     matched = pair.correspondences
-    apart = np.linalg.norm(pair.relation.transfer(matched.points1) - matched.points2, axis=1)
-    near = np.flatnonzero(apart < _MAX_DISTANCE * threshold)
+    error = np.linalg.norm(pair.relation.transfer(matched.points1) - matched.points2, axis=1)
+    near = np.flatnonzero(error < _MAX_DISTANCE * threshold)
     near = near[spread_choice(matched.points1[near], _MAX_MATCHES)]
     return matched.points1[near], matched.points2[near]

@@ -63,8 +63,8 @@ def two_lenses(cameras: Sequence[Camera], votes: LensVotes) -> TwoLenses | None:
     which = votes.which(second)
     between = which[:, 0] != which[:, 1]
     number, missed = int(between.sum()), votes.mahalanobis_residuals(lenses[which])
-    least = max(float(missed[between].sum()), max(_MAX_MEAN_RESIDUAL, float(missed.mean())) * number)
-    if not number or by_one[between].sum() < (_MIN_GAIN + _GAIN_OF_FEW / number) * least:
+    remaining = max(float(missed[between].sum()), max(_MAX_MEAN_RESIDUAL, float(missed.mean())) * number)
+    if not number or by_one[between].sum() < (_MIN_GAIN + _GAIN_OF_FEW / number) * remaining:
         return None
     clear = _margins(count, votes, second, lenses)[seen].min() >= _MIN_MARGIN
     return TwoLenses(second, (float(lenses[0]), float(lenses[1])), bool(clear and not between.all()))

@@ -12,7 +12,7 @@ from rdstitch.matching.two_view import Pair, PairRegistration
 
 _STRONGEST = 500  # features of an image, by which pairs are prescreened
 _MIN_MATCHES = 6  # matches among these; images that share nothing have two to five by chance
-_MIN_RELATIVE_MATCHES = 0.05  # share of the matches that an image has with the one most like it; less adds nothing
+_MIN_RELATIVE_MATCHES = 0.05  # fraction of the matches that an image has with the one most like it; less adds nothing
 
 
 def prescreen_pairs(estimator: PairEstimator, pairs: Sequence[Pair]) -> dict[Pair, StoredMatches]:

@@ -92,8 +92,8 @@ def repetition(features: Features) -> float:
     squared = _squared_distances(strongest, strongest)
     # The median of a sixteenth of the rows is that of all.
     one, other = np.nonzero(squared < _SIMILAR_DISTANCE**2 * np.median(squared[::16]))
-    apart = np.linalg.norm(strongest.points[one] - strongest.points[other], axis=1)
-    elsewhere = apart > 2.0 * np.maximum(strongest.scale[one], strongest.scale[other])
+    distance = np.linalg.norm(strongest.points[one] - strongest.points[other], axis=1)
+    elsewhere = distance > 2.0 * np.maximum(strongest.scale[one], strongest.scale[other])
     alike = np.bincount(one[elsewhere], minlength=len(strongest))
     return float(np.mean(alike >= _MIN_REPETITIONS))
 

@@ -26,8 +26,10 @@ _TRAINING_PER_BRANCH = 50
 _ROUNDS = 3  # of Lloyd's algorithm
 _SHORTLIST = 40  # most similar images of each that are considered further
 _SHARED_NEIGHBOURS = 10  # most similar images of each that two images may have in common
-_SEQUENCE_RANK = 0.75  # share of the other images that are less alike than the next one where the order means something
-_MIN_SEQUENTIAL_SHARE = 0.5  # share of the images of which that is true of the next one; a quarter by chance
+_SEQUENCE_RANK = (
+    0.75  # fraction of the other images that are less alike than the next one where the order means something
+)
+_MIN_SEQUENTIAL_FRACTION = 0.5  # fraction of the images of which that is true of the next one; a quarter by chance
 _BLOCK = 8192  # descriptors assigned at a time
 _ROWS = 256  # images compared with all others at a time
 
@@ -157,7 +159,7 @@ def _compare(weights: "sparse.csr_array") -> Similarity:
         order = np.argsort(-of_nearest, axis=1, kind="stable")
         best[rows], values[rows] = (np.take_along_axis(one, order, axis=1) for one in (nearest, of_nearest))
     excess = np.maximum(values - (usual[:, None] + usual[best]) / 2.0, 0.0)
-    ordered = bool(next_one[:-1].mean() > _MIN_SEQUENTIAL_SHARE)
+    ordered = bool(next_one[:-1].mean() > _MIN_SEQUENTIAL_FRACTION)
     return Similarity(_with_shared_neighbours(best, excess), best, ordered)
 
 

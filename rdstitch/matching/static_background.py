@@ -20,7 +20,7 @@ from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.late_imports import spatial
 
 _MIN_IMAGES, _MIN_SHARE = 3, 0.5
-"""Images, in number and as a share, that pairs which move must connect: two could agree by chance."""
+"""Images, in number and as a fraction, that pairs which move must connect: two could agree by chance."""
 
 _MAX_STATIC_MOTION = 1.0 / 3.0
 """Motion of a static match at most, in thresholds: its two keypoints are localised to better than that."""
@@ -32,7 +32,7 @@ _MIN_CONFIRMATIONS = 3
 """Static matches at one place, from which on every feature there counts as static."""
 
 _MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE = 2, 0.2
-"""Pairs with such matches, in number and as a share of the pairs that move; by one pair alone nothing is decided."""
+"""Pairs with such matches, in number and as a fraction of the pairs that move; by one pair alone nothing is decided."""
 
 
 @dataclass(frozen=True, eq=False)

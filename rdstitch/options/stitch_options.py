@@ -184,6 +184,7 @@ class StitchOptions(RansacOptions):
     def files(self) -> list[Path]:
         """The files that are read besides the images, none of which may be written over."""
         return files_in(
+            self.camera if isinstance(self.camera, str | Path) else None,
             self.mask,
             None if self.attitude == "xmp" else self.attitude,
             self.timestamps,

@@ -9,7 +9,7 @@ from rdstitch.choices import Origin, ScanOrder, ZPlane
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.option import check_options, documented, option
-from rdstitch.options.shared_options import DryRun, FlatField, Overwrite, Strict, Topic, Workers
+from rdstitch.options.shared_options import DryRun, FlatField, Overwrite, Strict, Topic, Workers, files_in
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -75,6 +75,14 @@ class TileOptions:
     dry_run: DryRun = False
     workers: Workers = 0
     topic: Topic = None
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that are read besides the images, none of which may be written over."""
+        return files_in(
+            self.positions if isinstance(self.positions, str | Path) else None,
+            None if self.flat_field in ("auto", "off") else self.flat_field,
+        )
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -17,10 +17,11 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.band_lens import BandLens, band_lens
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.compose import Layout, check_world_files, compose_images, image_files
+from rdstitch.pipeline.compose import Layout, compose_images
 from rdstitch.pipeline.deep_zoom_page import plainly_viewed, write_page
 from rdstitch.pipeline.replacements import Replacements, read_replacements
 from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run_files import RunFiles, check_world_files
 from rdstitch.pipeline.straighten import reoriented
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages, SavedGrid
@@ -30,7 +31,7 @@ from rdstitch.sidecar.recomposition import Recomposition
 from rdstitch.sidecar.write_applied import applied_sidecar
 from rdstitch.stage.tile_frames import with_position_folders
 from rdstitch.system.native_threads import one_native_thread
-from rdstitch.system.outputs import Outputs, check_outputs, check_suffix, json_bytes
+from rdstitch.system.outputs import Outputs, json_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent
 
 _GEOMETRY = (
@@ -96,25 +97,22 @@ def apply(
     mismatch = mismatch_with_image(saved)
     if options.strict and mismatch:
         raise InputError(mismatch)
+    run = apply_run(saved, None if output is None else Path(output), composite or saved.composite, options, progress)
     given = as_inputs(images, options.channel_order)
     if saved.record.stage is not None:
         given = with_position_folders(given)
     with (
-        found_images(given, output=output, every=options.every, topic=options.topic) as listed,
+        found_images(given, outputs=[run.output], every=options.every, topic=options.topic) as listed,
         Outputs(options.overwrite) as outputs,
     ):
-        if output is not None:
-            like = (composite or saved.composite).like
-            read = [*listed.files, saved.path, *options.files, *([] if like is None else [Path(like)])]
-            check_outputs(image_files(check_suffix(output)), options.overwrite, read)
-        run = apply_run(saved, output, composite or saved.composite, options, progress)
+        RunFiles.of_images(run, listed.files).check(outputs)
         result = apply_found(saved, listed, run, options, outputs)
     return replace(result, messages=(*([Message(mismatch)] if mismatch else []), *result.messages))
 
 
 def apply_run(
     saved: SavedRegistration,
-    output: str | Path | None,
+    output: Path | None,
     composite: CompositeOptions,
     options: ApplyOptions,
     progress: Progress,
@@ -127,13 +125,14 @@ def apply_run(
         workers=options.workers,
         dry_run=options.dry_run,
     )
-    return Run(settings, output, progress=StageTimer(progress), guard=InputGuard(options.strict))
+    read = [saved.path, *options.files, *settings.files]
+    return Run(settings, output, progress=StageTimer(progress), guard=InputGuard(options.strict), read=read)
 
 
 def apply_found(
     saved: SavedRegistration, listed: FoundImages, run: Run, options: ApplyOptions, outputs: Outputs
 ) -> Recomposition:
-    """The same of images that were found, into memory or among the outputs."""
+    """Compose images that were found by a saved registration, into memory or among the outputs."""
     output = run.output
     given = read_replacements(saved, listed.frames, options, run.guard, run.options.composite.max_memory)
     if output is not None:

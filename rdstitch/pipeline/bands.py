@@ -22,16 +22,16 @@ from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply_found, apply_run
-from rdstitch.pipeline.read_inputs import with_camera_read
 from rdstitch.pipeline.recipes import stitch_found
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.read import read_sidecar
 from rdstitch.sidecar.recomposition import Recomposition
+from rdstitch.sidecar.write import sidecar
 from rdstitch.system.native_threads import one_native_thread
-from rdstitch.system.outputs import Outputs, check_outputs
-from rdstitch.system.progress import Progress, StageTimer, silent
+from rdstitch.system.outputs import Outputs, fingerprint, json_bytes
+from rdstitch.system.progress import Progress, silent
 
 
 def parse_bands(text: str) -> dict[str, str]:
@@ -61,22 +61,24 @@ def mosaic_bands(
     it alone. ``field.tif`` has all bands, with their names; ``field-NIR.tif`` and so on one each. Formats that hold
     no number of bands have only the latter. Given are the first band, and the others, each by its own lens.
     """
-    options, file = with_camera_read(options or StitchOptions()), Path(output)
+    options, file = options or StitchOptions(), Path(output)
     if options.dry_run:
         raise ArgumentError("bands have no plan before the first of them is registered: leave out dry_run")
     files = [file.with_name(f"{file.stem}-{name}{file.suffix}") for name in bands]
+    stack = [file, Path(f"{file}.json")] if file.suffix.lower() in (".tif", ".tiff") else []
+    given = as_inputs(inputs, options.channel_order)
+    run = Run.of(given, options, files[0], beside, progress)
     with (
-        found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed,
+        found_images(given, outputs=[file, *files], every=every, topic=options.topic) as listed,
         Outputs(options.overwrite) as outputs,  # all are published together
     ):
-        stack = [file] if file.suffix.lower() in (".tif", ".tiff") else []
-        check_outputs([*files, *stack], options.overwrite, [*listed.files, *options.files])
         frames = selected(listed.frames, options.exclude, options.include_only)
         chosen = [_of_band(frames, pattern) for pattern in bands.values()]
-        options = replace(options, exclude=(), include_only=())
         _check_alike(dict(zip(bands, chosen, strict=True)), in_one_file=bool(stack))
-        run = Run(options, files[0], beside, StageTimer(progress))
-        first = stitch_found(replace(listed, frames=chosen[0]), run, outputs, files[1:])
+        whole = replace(run.options, exclude=(), include_only=())
+        run = replace(run, options=whole, read=[*run.read, *listed.files])
+        of_first = replace(listed, frames=chosen[0])
+        first = stitch_found(of_first, run, outputs, more_images=files[1:], more_files=stack)
         registered = outputs.staged(f"{files[0]}.json")
         assert registered is not None
         saved = replace(read_sidecar(registered), path=Path(f"{files[0]}.json"))
@@ -133,10 +135,16 @@ def _stage_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, out
         count = samples.shape[2]
         names += [name] if count == 1 else [f"{name} {k}" for k in range(1, count + 1)]
     metadata = Metadata(first.canvas.size, channels=len(names), planes=True, channel_names=tuple(names))
-    layout = ImageSpec(first.canvas.size, len(names), heads[0][0].dtype, transparent=True, metadata=metadata)
+    spec = ImageSpec(first.canvas.size, len(names), heads[0][0].dtype, transparent=True, metadata=metadata)
     tags = [] if first.georeference is None else first.georeference.tiff_tags()
     strips = map(joined, chain([heads], zip(*streams, strict=True)))
-    write_strips(file, layout, strips, tags, outputs=outputs)
+    write_strips(file, spec, strips, tags, outputs=outputs)
+    # It is the first band's in all but its own bytes, which say that it is no image to stitch.
+    staged = outputs.staged(file)
+    assert staged is not None
+    written, record = fingerprint(staged), sidecar(first)
+    record["output"] |= {"file": file.name, "bytes": written.size, "sha256": written.sha256}
+    outputs.write(f"{file}.json", json_bytes(record))
 
 
 def _of_band(frames: Sequence[Frame], pattern: str) -> list[Frame]:

@@ -12,14 +12,13 @@ from rdstitch.inputs.selection import selected
 from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.read_inputs import with_camera_in_bag
 from rdstitch.pipeline.recipes import stitch_found
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs
-from rdstitch.system.progress import Progress, StageTimer, silent
+from rdstitch.system.progress import Progress, silent
 from rdstitch.system.temporary_folder import TemporaryFolder
 from rdstitch.verification.verdict import RefusedError
 
@@ -57,28 +56,26 @@ def mosaic_blocks(
     results: list[StitchResult] = []
     refused: list[Message] = []
     given = as_inputs(inputs, options.channel_order)
-    options, notes = with_camera_in_bag(given, options)
+    run = Run.of(given, options, file, beside, progress)
     with ExitStack() as stack:
-        listed = stack.enter_context(found_images(given, output=output, every=every, topic=options.topic))
-        if options.cache is None:
-            # What was found of images and pairs serves the next block.
-            options = replace(options, cache=stack.enter_context(TemporaryFolder()))
+        listed = stack.enter_context(found_images(given, outputs=[file], every=every, topic=options.topic))
+        # What was found of images and pairs serves the next block.
+        cache = options.cache or stack.enter_context(TemporaryFolder())
         # All are published together.
         outputs = stack.enter_context(Outputs(options.overwrite))
         listed = replace(
-            listed, frames=list(with_times(listed.frames, options.timestamps)), notes=(*listed.notes, *notes)
+            listed, frames=list(with_times(listed.frames, options.timestamps)), notes=(*listed.notes, *run.notes)
         )
-        options = replace(options, timestamps=None)
         frames = selected(listed.frames, options.exclude, options.include_only)
         names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
-        run = Run(options, beside=beside, progress=StageTimer(progress))
+        run = replace(run, options=replace(run.options, cache=cache, timestamps=None), notes=())
         further = names[1:]
         found = replace(listed, outputs=[], notes=())
         while len(frames) > 1 or not results:
             run = replace(run, output=names[len(results)])
             try:
                 with outputs.together():
-                    result = stitch_found(found, run, outputs, further)
+                    result = stitch_found(found, run, outputs, more_images=further)
                 registration = result.registration
             except RdstitchError as error:
                 if not results or isinstance(error, OutputError):

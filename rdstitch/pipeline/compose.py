@@ -1,6 +1,6 @@
 """The last stage of every image: from registered images to pixels, in memory or in a file with a page beside it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -23,7 +23,6 @@ from rdstitch.compositing import (
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.tiles import BlockRunner
 from rdstitch.export.georeference import Georeference, world_file_paths
-from rdstitch.export.place_on_map import has_place
 from rdstitch.inputs.source import Source
 from rdstitch.io.formats import check_memory, check_size
 from rdstitch.io.metadata import Metadata
@@ -35,7 +34,7 @@ from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.system.dataclasses import dataclass, replace
-from rdstitch.system.outputs import Outputs, check_outputs, text_bytes
+from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.verification.output_messages import (
     cut_away_messages,
@@ -44,7 +43,6 @@ from rdstitch.verification.output_messages import (
     masked_messages,
     seam_messages,
 )
-from rdstitch.viewer.page import viewer_path
 
 
 @dataclass(frozen=True)
@@ -161,18 +159,6 @@ def _box_of_rectangle(placed: PlacedImages, corners: Corners, canvas: Canvas) ->
     low = np.clip(np.rint(places.min(axis=0)), 0, canvas.size).astype(int)
     high = np.clip(np.rint(places.max(axis=0)) + 1, 0, canvas.size).astype(int)
     return (*low.tolist(), *high.tolist()) if (high > low).all() else None
-
-
-def image_files(output: str | Path) -> list[Path]:
-    """An image and what always belongs to it: the sidecar, and the page of a Deep Zoom image."""
-    page = viewer_path(output)
-    return [Path(output), Path(f"{output}.json"), *([] if page is None else [page])]
-
-
-def check_world_files(outputs: Iterable[str | Path], sources: Sequence[Source], overwrite: bool) -> None:
-    """Find out before long work whether the files that place images on the Earth can be written, if there will be."""
-    if has_place([source.metadata.gps for source in sources]) or any(source.control for source in sources):
-        check_outputs([file for output in outputs for file in world_file_paths(output)], overwrite)
 
 
 def _write_world_files(outputs: Outputs, paths: Sequence[Path], place: Georeference) -> None:

@@ -164,14 +164,14 @@ def _show_little(sources: Sequence[Source], detected: DetectedFeatures, options:
     for index, (source, count) in enumerate(zip(sources, counts.tolist(), strict=True)):
         size = np.prod(source.metadata.size) / source.reduction(megapixels) ** 2 / 1e6
         few = count < _LOW_SHARE * min(most, max(_USUAL_DENSITY * size, usual))
-        if few and detected.features.items[index].faint and index not in detected.damaged:
+        if few and detected.features.items[index].low_contrast and index not in detected.damaged:
             poor.append(index)
     return poor
 
 
 def _shown(features: Sequence[StoredFeatures]) -> IntArray:
     """Keypoints that each image shows at its working size, (N,)."""
-    return np.array([item.shown for item in features], dtype=np.intp)
+    return np.array([item.detected_count for item in features], dtype=np.intp)
 
 
 def _stretch_of(

@@ -26,7 +26,8 @@ from rdstitch.inputs.times import time_of, timestamps_of
 from rdstitch.io.opening import check_readable
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.alignment_inputs import alignment_options
-from rdstitch.pipeline.read_inputs import read_frames, with_camera_read
+from rdstitch.pipeline.given_camera import with_camera
+from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message
 from rdstitch.results.pose import FollowedPoses, Pose
@@ -111,7 +112,8 @@ class Tracker:
     def __init__(
         self, options: StitchOptions | None = None, poses: FollowedPoses | None = None, *, patient: bool = False
     ) -> None:
-        self._options, self._poses = with_camera_read(options or StitchOptions()), poses or FollowedPoses()
+        self._options, self._notes = with_camera(options or StitchOptions(), of_bag=False)
+        self._poses = poses or FollowedPoses()
         self._detection = _live_features(self._options.features)
         self._megapixels = self._detection.limits[1]
         given = self._options.odometry
@@ -138,7 +140,7 @@ class Tracker:
     @property
     def messages(self) -> tuple[Message, ...]:
         """What the user should know of all that has come so far."""
-        return tuple(self._frames.messages)
+        return (*self._notes, *self._frames.messages)
 
     def add(
         self,
@@ -229,9 +231,9 @@ class Tracker:
 
     def _poses_of(self, results: Sequence[TrackingResult]) -> list[Pose]:
         poses = [replace(self._labels[result.number], tracked=result, reason=result.reason) for result in results]
-        new, self._reported = self._frames.messages[self._reported :], len(self._frames.messages)
         if poses:
-            poses[-1] = replace(poses[-1], messages=tuple(new))
+            poses[-1] = replace(poses[-1], messages=self.messages[self._reported :])
+            self._reported = len(self.messages)
         revisable = self._frames.revisable
         self._labels = {number: known for number, known in self._labels.items() if number in revisable}
         return poses

@@ -20,7 +20,7 @@ from rdstitch.matching.repeated_pattern import shows_repeated_pattern
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.feature_options import CLOSER, WORK_MEGAPIXELS
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
-from rdstitch.robust.chance import places
+from rdstitch.robust.chance import occupied_cells
 
 _MEGAPIXELS = WORK_MEGAPIXELS * CLOSER
 _ROUNDS = 2  # of matching, the second one with the lens that the first one has found
@@ -96,7 +96,8 @@ def _matched(
     indices = np.column_stack([seen, nearest[:, 0]])[chosen]
     points1, points2 = first[indices[:, 0]], second[indices[:, 1]]
     keypoints, sizes = pair.link(), (pair.relation.camera.image_size, pair.relation.camera2.image_size)
-    covered, before = places(points1, points2, *sizes), places(keypoints.points1, keypoints.points2, *sizes)
+    covered = occupied_cells(points1, points2, *sizes)
+    before = occupied_cells(keypoints.points1, keypoints.points2, *sizes)
     if len(indices) < _MIN_MATCHES or covered < _MIN_PLACES * before:
         return pair
     matches = Correspondences(indices, points1, points2, np.zeros(len(indices)))

@@ -1,17 +1,16 @@
 """From frames and options to the images that are registered."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.attitudes import with_attitudes
-from rdstitch.inputs.frame import Frame, Named
+from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.ground_control import with_ground_control
 from rdstitch.inputs.image_folders import natural_key
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.positions import with_positions
-from rdstitch.inputs.rosbag import camera_in, camera_in_bag, is_bag
 from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.flat_field import read_flat_field
@@ -35,26 +34,6 @@ def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
     if len(frames) > EXHAUSTIVE_UP_TO or any(frame.image is not None for frame in frames):
         return frames
     return sorted(frames, key=lambda frame: (natural_key(frame.path), frame.number or 0))
-
-
-def with_camera_read(options: StitchOptions) -> StitchOptions:
-    """Options with the camera itself, where they name its file."""
-    file = options.camera
-    return replace(options, camera=camera_in(file)) if isinstance(file, str | Path) else options
-
-
-def with_camera_in_bag(inputs: Iterable[Named], options: StitchOptions) -> tuple[StitchOptions, list[Message]]:
-    """Options with the camera that they name; without one, with that of a ROS bag, and the message that it is used."""
-    options = with_camera_read(options)
-    named = [Path(item) for item in inputs if not isinstance(item, Frame)]
-    if options.known_distortion is not None or len(named) != 1 or not is_bag(named[0]):
-        return options, []
-    found = camera_in_bag(named[0], options.topic)
-    if found is None:
-        return options, []
-    text = f"the calibration in the bag, {found[1]}, is used; --camera FILE takes another one"
-    note = Message(text, (str(named[0]),), "note")
-    return replace(options, camera=found[0].camera, lens="auto", solver="auto"), [note]
 
 
 def read_frames(

@@ -1,7 +1,8 @@
 """The recipes: each reads as the sequence of its stages."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -9,11 +10,10 @@ from pathlib import Path
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.errors import RegistrationError
-from rdstitch.export.odometry_bag import check_bag
 from rdstitch.export.trajectory_files import has_times, path_as_svg
 from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.inputs.find import FoundImages, found_images
-from rdstitch.inputs.frame import Frame, Images, as_inputs
+from rdstitch.inputs.frame import Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
@@ -24,23 +24,23 @@ from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.along_odometry import with_odometry_of_bag
 from rdstitch.pipeline.camera_path import camera_path
 from rdstitch.pipeline.choose_layout import choose_layout
-from rdstitch.pipeline.compose import check_world_files, compose_images
+from rdstitch.pipeline.compose import compose_images
 from rdstitch.pipeline.deep_zoom_page import viewed_images, write_page
 from rdstitch.pipeline.lay_out import LaidOut
 from rdstitch.pipeline.map_canvas import check_map
-from rdstitch.pipeline.output_plan import check_run, report_refused, stage_beside
-from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs, with_camera_in_bag, with_camera_read
+from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs
 from rdstitch.pipeline.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.remote_blocks import blocks_on
 from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run_files import RunFiles, check_world_files, report_refused, stage_beside
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.native_threads import one_native_thread
-from rdstitch.system.outputs import Outputs, check_not_read, check_outputs, json_bytes, text_bytes
-from rdstitch.system.progress import Progress, StageTimer, silent
+from rdstitch.system.outputs import Outputs, json_bytes, text_bytes
+from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.verdict import RefusedError
 
 _NO_TIMES = Message(
@@ -92,7 +92,7 @@ def pano(
     >>> result.image.shape[2], result.ok
     (3, True)
     """
-    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, StageTimer(progress), Purpose.PANO))
+    return _stitch(inputs, every, Purpose.PANO, output, options, beside, progress)
 
 
 @one_native_thread()
@@ -136,41 +136,55 @@ def mosaic(
     >>> result.output.name, result.registration.alignment.used.all()
     ('small.tif', np.True_)
     """
-    return _stitch(inputs, every, Run(options or StitchOptions(), output, beside, StageTimer(progress)))
+    return _stitch(inputs, every, Purpose.MOSAIC, output, options, beside, progress)
 
 
-def _stitch(inputs: Images, every: int | None, run: Run) -> StitchResult:
+def _stitch(
+    inputs: Images,
+    every: int | None,
+    purpose: Purpose,
+    output: str | Path | None,
+    options: StitchOptions | None,
+    beside: FilesBeside,
+    progress: Progress,
+) -> StitchResult:
     """The stages of :func:`mosaic`, and, where every image must be readable and one gives the plane, :func:`pano`."""
-    given = as_inputs(inputs, run.options.channel_order)
-    options, notes = with_camera_in_bag(given, run.options)
+    options = options or StitchOptions()
+    given = as_inputs(inputs, options.channel_order)
+    run = Run.of(given, options, output, beside, progress, purpose)
     with (
-        found_images(given, output=run.output, every=every, topic=options.topic) as listed,
+        found_images(given, outputs=[run.output], every=every, topic=options.topic) as listed,
         Outputs(options.overwrite) as outputs,
     ):
-        listed = replace(listed, notes=(*listed.notes, *notes))
-        return stitch_found(listed, replace(run, options=options), outputs)
+        return stitch_found(listed, run, outputs)
 
 
-def stitch_found(listed: FoundImages, run: Run, outputs: Outputs, further: Sequence[Path] = ()) -> StitchResult:
-    """The same of images that were found; ``further`` are images that may follow."""
+def stitch_found(
+    listed: FoundImages,
+    run: Run,
+    outputs: Outputs,
+    *,
+    more_images: Sequence[Path] = (),
+    more_files: Sequence[Path] = (),
+) -> StitchResult:
+    """Stitch images that were found into an output of a run; more images, and files, may be written after it."""
     options = run.options
-    run = replace(run, guard=InputGuard(options.strict))
     frames = in_lasting_order(with_times(listed.frames, options.timestamps))
     names = [frame.name for frame in selected(frames, options.exclude, options.include_only)]
-    check_run(run, listed.files, names, further)
+    files = RunFiles.of_images(run, listed.files, names, more_images, more_files)
+    files.check(outputs)
+    run = replace(run, guard=InputGuard(options.strict), layers=files.layers)
     sources, unread = read_inputs(frames, options, run.guard, skip_bad=run.purpose is not Purpose.PANO)
-    check_world_files([*([] if run.output is None else [run.output]), *further], sources, options.overwrite)
+    check_world_files([*([] if run.output is None else [run.output]), *more_images], sources, options.overwrite)
     check_map(sources, options.composite)
     if run.beside.frame == "first":
         run = replace(run, options=replace(options, reference=sources[0].name))
+    known = [*unread, *listed.messages, *run.notes]
     with run.executor(len(sources)) as executor:
-        accepted, run = _accepted(sources, [*unread, *listed.messages], run, executor)
-        run.progress("laying out", 0, 1)
-        try:
+        with _failures_explained(run, known):
+            accepted, run = _accepted(sources, known, run, executor)
+            run.progress("laying out", 0, 1)
             chosen = choose_layout(accepted, run.options, aligner_of(accepted, run.options, run.purpose))
-        except RefusedError as error:
-            report_refused(run, error.registration)
-            raise
         return compose_registration(chosen, run, outputs, executor)
 
 
@@ -202,16 +216,15 @@ def calibrate(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    options = with_camera_read(options or StitchOptions())
-    run = Run(options, None, beside, StageTimer(progress), Purpose.CALIBRATE, InputGuard(options.strict))
-    with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as listed:
-        check_run(run, listed.files, ())
-        frames = with_times(listed.frames, options.timestamps)
-        sources, unread = read_inputs(frames, options, run.guard, skip_bad=True)
-        with run.executor(len(sources)) as executor:
-            accepted, _ = _accepted(sources, [*unread, *listed.messages], run, executor)
-        result = _finished(at_full_size(accepted), run)
-    with Outputs(options.overwrite) as outputs:
+    options = options or StitchOptions()
+    given = as_inputs(inputs, options.channel_order)
+    run = Run.of(given, options, None, beside, progress, Purpose.CALIBRATE)
+    with (
+        found_images(given, every=every, topic=options.topic) as listed,
+        Outputs(options.overwrite) as outputs,
+    ):
+        RunFiles.of_images(run, listed.files).check(outputs)
+        result = _registered(listed, run)
         _save_camera(result, options, outputs)
         return result.with_messages(stage_beside(run, outputs, result))
 
@@ -254,57 +267,46 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = replace(options or StitchOptions(), pose_covariance=True)
-    if layout == "bag" and output is not None:
-        check_bag(Path(output), overwrite=options.overwrite)
     given = as_inputs(inputs, options.channel_order)
-    options, notes = with_camera_in_bag(given, options)
     options = with_odometry_of_bag(given, options)
-    with found_images(given, every=every, topic=options.topic) as listed:
-        files = [Path(file) for file in (output, plot) if file is not None]
-        # The bag of ROS 2 is a folder, which another one takes the place of.
-        bags = [file for file in files[:1] if layout == "bag" and file.is_dir() and options.overwrite]
-        check_outputs([f for f in files if f not in bags], options.overwrite, [*listed.files, *options.files])
-        check_not_read(bags, [Path(name) for name in given if not isinstance(name, Frame)])
+    run = Run.of(given, options, progress=progress, purpose=Purpose.TRAJECTORY)
+    with (
+        found_images(given, every=every, topic=options.topic) as listed,
+        Outputs(options.overwrite) as outputs,
+    ):
+        RunFiles.of_path(run, listed.files, output, plot, layout).check(outputs)
         # Numbered as they were named: what is left out leaves a gap.
-        frames = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
-        guard = InputGuard(options.strict)
-        sources, unread = read_inputs(with_times(frames, options.timestamps), options, guard, skip_bad=True)
-        run = Run(options, progress=StageTimer(progress), purpose=Purpose.TRAJECTORY, guard=guard)
-        with run.executor(len(sources)) as executor:
-            accepted, _ = _accepted(sources, [*unread, *listed.messages, *notes], run, executor)
-    registration = _finished(at_full_size(accepted), run)
-    path, messages = camera_path(registration, options.odometry, height)
-    registration = registration.with_messages([*scale_uncertainty(registration.alignment), *messages])
-    if layout in ("tum", "bag") and not has_times(path):
-        registration = registration.with_messages([_NO_TIMES])
-    with Outputs(options.overwrite) as outputs:
+        numbered = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
+        registration = _registered(replace(listed, frames=numbered), run)
+        path, of_path = camera_path(registration, options.odometry, height)
+        messages = [*scale_uncertainty(registration.alignment), *of_path]
+        if layout in ("tum", "bag") and not has_times(path):
+            messages.append(_NO_TIMES)
         if output is not None:
             write_trajectory(path, Path(output), layout, frame, outputs)
         if plot is not None:
-            file, drawn = plot, path_as_svg(path, "heights" if height is None else "m")
-            failed = outputs.attempt(file, lambda: outputs.write(file, text_bytes(drawn)))
-            registration = registration.with_messages(failed)
-    return path, registration
+            drawn = text_bytes(path_as_svg(path, "heights" if height is None else "m"))
+            messages += outputs.attempt(plot, partial(outputs.write, plot, drawn))
+        return path, registration.with_messages(messages)
 
 
-def _accepted(
-    sources: Sequence[Source], known: Sequence[Message], run: Run, executor: Executor
-) -> tuple[Registration, Run]:
-    """Register and check, with what is known of the inputs already; a failure names what could not be read well.
+def _registered(listed: FoundImages, run: Run) -> Registration:
+    """The registration of images that were found, in pixels of their full size."""
+    frames = with_times(listed.frames, run.options.timestamps)
+    sources, unread = read_inputs(frames, run.options, run.guard, skip_bad=True)
+    known = [*unread, *listed.messages, *run.notes]
+    with run.executor(len(sources)) as executor, _failures_explained(run, known):
+        accepted, _ = _accepted(sources, known, run, executor)
+    return _finished(at_full_size(accepted), run)
 
-    In pixels of the working size. Where the first image shall be the reference, but was left out, the first that is
-    used becomes it: the run says so then.
+
+@contextmanager
+def _failures_explained(run: Run, known: Sequence[Message]) -> Iterator[None]:
+    """A registration that fails in the block names what could not be read well; of one that is refused the report is
+    written.
     """
     try:
-        registration = register(sources, run, executor).with_messages(known)
-        run.progress("checking", 0, 1)
-        accepted = accept(registration, run)
-        first = accepted.alignment.used.tolist().index(True)
-        if run.beside.frame == "first" and accepted.alignment.reference != first:
-            run = replace(run, options=replace(run.options, reference=accepted.sources[first].name))
-            again = with_reference_of(registration, aligner_of(registration, run.options, run.purpose))
-            accepted = accept(again, run)
-        return accepted, run
+        yield
     except RegistrationError as error:
         unread = [message for message in known if message.severity == "left out"]
         reasons = [str(replace(message, code="")) for message in merge_by_reason([*unread, *run.guard.warnings])]
@@ -312,6 +314,25 @@ def _accepted(
         if isinstance(error, RefusedError):
             report_refused(run, error.registration)
         raise
+
+
+def _accepted(
+    sources: Sequence[Source], known: Sequence[Message], run: Run, executor: Executor
+) -> tuple[Registration, Run]:
+    """Register and check, with what is known of the inputs already.
+
+    In pixels of the working size. Where the first image shall be the reference, but was left out, the first that is
+    used becomes it: the run says so then.
+    """
+    registration = register(sources, run, executor).with_messages(known)
+    run.progress("checking", 0, 1)
+    accepted = accept(registration, run)
+    first = accepted.alignment.used.tolist().index(True)
+    if run.beside.frame == "first" and accepted.alignment.reference != first:
+        run = replace(run, options=replace(run.options, reference=accepted.sources[first].name))
+        again = with_reference_of(registration, aligner_of(registration, run.options, run.purpose))
+        accepted = accept(again, run)
+    return accepted, run
 
 
 def compose_registration(chosen: LaidOut, run: Run, outputs: Outputs, executor: Executor) -> StitchResult:

@@ -1,27 +1,51 @@
 """What all stages of one run have in common."""
 
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
+from typing import Self
 
 from rdstitch.choices import Purpose
 from rdstitch.executors import open_executor
+from rdstitch.inputs.frame import Named
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.pipeline.given_camera import with_camera
+from rdstitch.results.messages import Message
 from rdstitch.system.dataclasses import dataclass, field
-from rdstitch.system.progress import StageTimer
+from rdstitch.system.progress import Progress, StageTimer, silent
 
 
 @dataclass(frozen=True)
 class Run:
-    """What the user decided, where results go, and what is noticed meanwhile."""
+    """What the user decided, what is read and written, and what is noticed meanwhile."""
 
     options: StitchOptions
-    output: str | Path | None = None  # image to write; None for one in memory
+    output: Path | None = None  # image to write; None for one in memory
     beside: FilesBeside = NOTHING_BESIDE
     progress: StageTimer = field(default_factory=StageTimer)  # it knows how long each stage took, for the report
     purpose: Purpose = Purpose.MOSAIC
     guard: InputGuard = field(default_factory=InputGuard)  # what all who read the input files notice of them
+    read: Sequence[Path] = ()  # files that are read besides the images
+    notes: Sequence[Message] = ()  # on what is given besides the images
+    layers: Mapping[str, tuple[Path, Path]] = field(default_factory=dict)  # files of each image's layer and mask
+
+    @classmethod
+    def of(
+        cls,
+        inputs: Sequence[Named],
+        options: StitchOptions | None,
+        output: str | Path | None = None,
+        beside: FilesBeside = NOTHING_BESIDE,
+        progress: Progress = silent,
+        purpose: Purpose = Purpose.MOSAIC,
+    ) -> Self:
+        """Begin a run over inputs; the camera is read that options name, or that a bag has."""
+        options = options or StitchOptions()
+        known, notes = with_camera(options, inputs, of_bag=purpose is not Purpose.CALIBRATE)
+        file, timer, guard = None if output is None else Path(output), StageTimer(progress), InputGuard(options.strict)
+        return cls(known, file, beside, timer, purpose, guard, options.files, notes)
 
     def executor(self, images: int) -> Executor:
         """Where the tasks of so many images are computed; to be used in a ``with`` block."""

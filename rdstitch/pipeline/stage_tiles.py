@@ -16,7 +16,6 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.places_files import fiji_list, places_table
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Images
-from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.io.stored_tiles import StoredTile
@@ -24,18 +23,17 @@ from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
-from rdstitch.pipeline.compose import check_world_files
 from rdstitch.pipeline.lay_out import lay_out
-from rdstitch.pipeline.output_plan import check_run
 from rdstitch.pipeline.read_inputs import NO_FLAT_FIELD, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
 from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run_files import RunFiles, check_world_files
 from rdstitch.pipeline.tiles_as_registration import tiles_as_registration
 from rdstitch.results.messages import Message, left_out
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.stage.axes import with_axes_shown
-from rdstitch.stage.correlation import coarse_tile
+from rdstitch.stage.coarse_tile import coarse_tile
 from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.pair_candidates import SearchPlan
@@ -45,7 +43,7 @@ from rdstitch.stage.tile_frames import tile_frames
 from rdstitch.stage.tile_inputs import as_tiles
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, text_bytes
-from rdstitch.system.progress import Progress, StageTimer, silent
+from rdstitch.system.progress import Progress, silent
 
 _COMPARED = 32  # overlaps by which a flat field is judged
 
@@ -84,26 +82,30 @@ def tiles(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = replace(options or TileOptions(), **fields)
-    guard = InputGuard(options.strict)
-    run = Run(_stitch_options(options), output, beside, StageTimer(progress), guard=guard)
-    with found_images(as_tiles(inputs), output=output, topic=options.topic) as listed:
-        registration, tiled = _registered(listed, run, options, positions_file)
-        with Outputs(options.overwrite) as outputs, run.executor(len(registration.sources)) as executor:
+    run = _tile_run(options, output, beside, progress)
+    with (
+        found_images(as_tiles(inputs), outputs=[run.output], topic=options.topic) as listed,
+        Outputs(options.overwrite) as outputs,
+    ):
+        registration, tiled = _registered(listed, run, options, positions_file, outputs)
+        with run.executor(len(registration.sources)) as executor:
             _write_beside(outputs, positions_file, options, registration, tiled)
             chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
             chosen = replace(chosen, layout=replace(chosen.layout, photographs=False))
             return compose_registration(chosen, run, outputs, executor)
 
 
-def _stitch_options(options: TileOptions) -> StitchOptions:
-    """What the stages after registration take of the options."""
-    return StitchOptions(
+def _tile_run(options: TileOptions, output: str | Path | None, beside: FilesBeside, progress: Progress) -> Run:
+    """A run with what the stages after registration take of the options."""
+    settings = StitchOptions(
         distortion=None if options.distortion == "auto" else options.distortion,
         composite=options.composite,
         overwrite=options.overwrite,
+        strict=options.strict,
         dry_run=options.dry_run,
         workers=options.workers,
     )
+    return replace(Run.of((), settings, output, beside, progress), read=[*options.files, *settings.files])
 
 
 @one_native_thread()
@@ -125,26 +127,23 @@ def place_tiles(
         As for :func:`tiles`.
     """
     options = replace(options or TileOptions(), **fields)
-    with found_images(as_tiles(inputs), topic=options.topic) as listed:
-        run = Run(_stitch_options(options), progress=StageTimer(progress), guard=InputGuard(options.strict))
-        registration, tiled = _registered(listed, run, options, positions_file)
-    with Outputs(options.overwrite) as outputs:
+    run = _tile_run(options, None, NOTHING_BESIDE, progress)
+    with (
+        found_images(as_tiles(inputs), topic=options.topic) as listed,
+        Outputs(options.overwrite) as outputs,
+    ):
+        registration, tiled = _registered(listed, run, options, positions_file, outputs)
         _write_beside(outputs, positions_file, options, registration, tiled)
     return tiled, registration
 
 
 def _registered(
-    listed: FoundImages, run: Run, options: TileOptions, positions_file: str | Path | None
+    listed: FoundImages, run: Run, options: TileOptions, positions_file: str | Path | None, outputs: Outputs
 ) -> tuple[Registration, TileRegistration]:
     """The places of all tiles, once it is clear that everything can be written."""
-    positions = options.positions if isinstance(options.positions, str | os.PathLike) else None
-    read = [positions, None if options.flat_field in ("auto", "off") else options.flat_field]
-    check_run(
-        run,
-        [*listed.files, *(file for file in read if file is not None)],
-        [frame.name for frame in listed.frames],
-        others=[Path(file) for file in (positions_file, options.save_flat_field) if file is not None],
-    )
+    tables = [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
+    names = [frame.name for frame in listed.frames]
+    RunFiles.of_images(run, listed.files, names, more_files=tables).check(outputs)
     frames, stored, notes = tile_frames(listed.frames, options.z, options.time)
     limit = options.composite.max_memory
     sources, unread = read_sources(frames, skip_bad=not options.strict, guard=run.guard, max_memory=limit)

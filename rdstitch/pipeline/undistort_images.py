@@ -1,8 +1,7 @@
 """Undistorting single images with a known lens."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypedDict, Unpack, get_args, overload
 
@@ -13,7 +12,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import ChannelOrder, Framing, ImageFormat
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedImage, compose
 from rdstitch.errors import ArgumentError, OutputError
-from rdstitch.export.layers import make_folder
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Images, as_inputs, to_channel_order
@@ -21,16 +19,18 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
+from rdstitch.options.shared_options import files_in
+from rdstitch.pipeline.given_camera import read_camera
 from rdstitch.results.messages import Message, ignored
 from rdstitch.system.native_threads import one_native_thread
-from rdstitch.system.outputs import WRITABLE_SUFFIXES, check_outputs, file_name
+from rdstitch.system.outputs import WRITABLE_SUFFIXES, Outputs, check_outputs, file_name
 from rdstitch.system.progress import Progress, silent
 
 _POINTS_PER_SIDE = 256
 
 
 class _Choices(TypedDict, total=False):
-    camera: Camera | None
+    camera: Camera | str | Path | None
     distortion: float | None
     view: Framing
     image_format: ImageFormat | None
@@ -50,7 +50,7 @@ def undistort(
     inputs: Images,
     folder: str | Path | None = None,
     *,
-    camera: Camera | None = None,
+    camera: Camera | str | Path | None = None,
     distortion: float | None = None,
     view: Framing = "same",
     image_format: ImageFormat | None = None,
@@ -65,12 +65,13 @@ def undistort(
     Parameters
     ----------
     inputs : path, ndarray, or iterable of them
-        Whatever :func:`rdstitch.mosaic` takes. An array becomes the PNG file ``image_000i.png``, or TIFF where its
+        Whatever :func:`rdstitch.mosaic` takes; every image must be readable, or none is written. An array becomes the
+        PNG file ``image_000i.png``, or TIFF where its
         samples need that.
     folder : path, optional
         Made if it does not exist. Without it, nothing is written.
-    camera : Camera, optional
-        The lens; adapted to the size of each image.
+    camera : Camera or path, optional
+        The lens, or its file; adapted to the size of each image.
     distortion : float, optional
         λ in the half-diagonal frame, instead of a camera.
     view : str
@@ -100,27 +101,30 @@ def undistort(
     if image_format is not None and image_format not in get_args(ImageFormat):
         raise ArgumentError(f"unknown format {image_format!r}; choose {', '.join(get_args(ImageFormat))}")
     given = as_inputs(inputs, channel_order)
+    file = camera if isinstance(camera, str | Path) else None
+    lens, notes = read_camera(camera, given) if isinstance(camera, str | Path) else (camera, [])
     with found_images(given, every=1, topic=topic) as listed:
         guard = InputGuard()
-        sources, _ = read_sources(listed.frames, camera=camera, distortion=distortion, skip_bad=False, guard=guard)
-        for message in listed.messages:
+        sources, _ = read_sources(listed.frames, camera=lens, distortion=distortion, skip_bad=False, guard=guard)
+        for message in (*notes, *listed.messages):
             warn(message)
         if folder is None:
             images = [to_channel_order(_undistorted(source, view).pixels, channel_order) for source in sources]
             for message in guard.messages:
                 warn(message)
             return images
-        outputs = _outputs(sources, Path(folder), image_format)
-        with _existing(Path(folder)):
-            check_outputs(outputs, overwrite, listed.files)
-            for done, (source, output) in enumerate(zip(sources, outputs, strict=True), start=1):
+        files = _files(sources, Path(folder), image_format)
+        with Outputs(overwrite) as outputs:
+            outputs.make_folder(Path(folder))
+            check_outputs(files, overwrite, [*listed.files, *files_in(file)])
+            for done, (source, file) in enumerate(zip(sources, files, strict=True), start=1):
                 image = _undistorted(source, view)
                 metadata = source.metadata if view == "same" else source.metadata.in_another_size()
-                write_image(output, image.pixels, image.alpha, metadata=metadata, overwrite=overwrite)
+                write_image(file, image.pixels, image.alpha, metadata=metadata, outputs=outputs)
                 progress("undistorting", done, len(sources))
         for message in guard.messages:
             warn(message)
-        return outputs
+        return files
 
 
 def _undistorted(source: Source, view: Framing) -> Composite:
@@ -130,27 +134,13 @@ def _undistorted(source: Source, view: Framing) -> Composite:
     return compose([PlacedImage(read, source.camera, np.eye(3))], canvas, plain)
 
 
-@contextmanager
-def _existing(folder: Path) -> Iterator[None]:
-    """A folder that exists inside the block, and afterwards if anything was written into it."""
-    missing = [place for place in (folder, *folder.parents) if not place.exists()]
-    make_folder(folder)
-    try:
-        yield
-    except BaseException:
-        with suppress(OSError):
-            for place in missing:
-                place.rmdir()
-        raise
-
-
-def _outputs(sources: Sequence[Source], folder: Path, image_format: ImageFormat | None) -> list[Path]:
+def _files(sources: Sequence[Source], folder: Path, image_format: ImageFormat | None) -> list[Path]:
     """The files to write, of different names."""
-    outputs = [folder / _output_name(source, image_format) for source in sources]
-    twice = [path for path, count in Counter(outputs).items() if count > 1]
+    files = [folder / _output_name(source, image_format) for source in sources]
+    twice = [path for path, count in Counter(files).items() if count > 1]
     if twice:
         raise OutputError(f"{min(twice)}: two of the images have this name; undistort them into different folders")
-    return outputs
+    return files
 
 
 def _output_name(source: Source, image_format: ImageFormat | None) -> str:

@@ -10,7 +10,7 @@ from rdstitch.arrays import FloatArray
 _CELLS_PER_DIAGONAL = 32
 _CELL_NUMBER = np.array([2.0**20, 1.0])  # of points within half a million cells
 
-MIN_PLACES = 8
+MIN_OCCUPIED_CELLS = 8
 """Cells in which the inliers must lie.
 
 With half as many, 14 % of 72 pairs come out wrong instead of 3 %, mostly clusters of wrong matches; with twice as many,
@@ -22,7 +22,7 @@ _NEGLIGIBLE = 1e-17
 _MAX_CHANCE = 1e-4  # probability that as many wrong matches agree by chance
 
 
-def places(points1: FloatArray, points2: FloatArray, size1: tuple[int, int], size2: tuple[int, int]) -> int:
+def occupied_cells(points1: FloatArray, points2: FloatArray, size1: tuple[int, int], size2: tuple[int, int]) -> int:
     """In how many cells of a grid over each image the matches (N, 2), pixels, lie, where these are fewer."""
     sides = np.array([math.hypot(*size) for size in (size1, size2)]) / _CELLS_PER_DIAGONAL
     cells = np.stack([points1, points2]) / sides[:, None, None]
@@ -30,16 +30,16 @@ def places(points1: FloatArray, points2: FloatArray, size1: tuple[int, int], siz
     return int((numbers[:, 1:] != numbers[:, :-1]).sum(axis=1).min()) + min(1, len(points1))
 
 
-def binomial_tail(least: int, trials: int, probability: float) -> float:
+def binomial_tail(successes: int, trials: int, probability: float) -> float:
     """Probability that ``least`` or more of independent events happen, each with a probability in (0, 1)."""
-    if least <= 0:
+    if successes <= 0:
         return 1.0
-    if least < trials * probability:  # from the other side, where terms only become smaller
-        return 1.0 - binomial_tail(trials - least + 1, trials, 1.0 - probability)
-    first = math.lgamma(trials + 1) - math.lgamma(least + 1) - math.lgamma(trials - least + 1)
-    first += least * math.log(probability) + (trials - least) * math.log1p(-probability)
+    if successes < trials * probability:  # from the other side, where terms only become smaller
+        return 1.0 - binomial_tail(trials - successes + 1, trials, 1.0 - probability)
+    first = math.lgamma(trials + 1) - math.lgamma(successes + 1) - math.lgamma(trials - successes + 1)
+    first += successes * math.log(probability) + (trials - successes) * math.log1p(-probability)
     tail, term, odds = 0.0, 1.0, probability / (1.0 - probability)  # in units of the first term
-    for happened in range(least, trials + 1):
+    for happened in range(successes, trials + 1):
         tail += term
         term *= (trials - happened) / (happened + 1.0) * odds
         if term < _NEGLIGIBLE * tail:
@@ -61,9 +61,9 @@ def rejection_reason(
     places? Neighbouring matches go wrong together, on a moving object or on a repeated pattern, and count once.
     """
     count = int(inliers.sum())
-    cells = places(points1[inliers], points2[inliers], *sizes)
-    if cells < MIN_PLACES:
-        if count < MIN_PLACES:
+    cells = occupied_cells(points1[inliers], points2[inliers], *sizes)
+    if cells < MIN_OCCUPIED_CELLS:
+        if count < MIN_OCCUPIED_CELLS:
             return f"only {count} of {len(inliers)} matches agree"
         return f"{count} of {len(inliers)} matches agree, but they lie in {cells} places of the image only"
     by_chance = min(0.5, np.pi * threshold**2 / math.prod(sizes[1]) + 0.01)

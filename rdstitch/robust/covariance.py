@@ -11,7 +11,7 @@ _CELLS_PER_SIDE = 64  # more than an image has, wherever its distortion centre i
 
 
 def covariances(
-    information: FloatArray, influence: FloatArray, chain: FloatArray, noise: FloatArray, data: Measurements
+    information: FloatArray, influence: FloatArray, jacobian: FloatArray, noise: FloatArray, data: Measurements
 ) -> FloatArray:
     """Covariance (B, P, P) that holds also where neighbouring errors are alike, as parallax and lens misfit make them.
 
@@ -20,7 +20,7 @@ def covariances(
     errors give. Infinite where a parameter is not determined.
 
     ``information`` (B, P, P); ``influence`` (B, N, E): each match's share of the gradient by other parameters;
-    ``chain`` (B, E, P): derivatives of these; ``noise`` (B,): standard deviation of the errors per axis, pixels.
+    ``jacobian`` (B, E, P): derivatives of these; ``noise`` (B,): standard deviation of the errors per axis, pixels.
     """
     result = np.full(information.shape, np.inf)
     scale = np.sqrt(np.einsum("bpp->bp", information))
@@ -36,7 +36,7 @@ def covariances(
     of_cells, pair = _summed_over_cells(influence[usable], data.x1[usable])
     starts = np.searchsorted(pair, np.arange(len(usable)))
     outer = np.add.reduceat(of_cells[:, :, None] * of_cells[:, None], starts, axis=0)
-    turn = chain[usable] @ root
+    turn = jacobian[usable] @ root
     clustered = np.swapaxes(turn, 1, 2) @ (outer / (noise[usable] ** 2)[:, None, None]) @ turn
     result[usable] = (noise[usable] ** 2)[:, None, None] * enlarged(root, clustered)
     return result

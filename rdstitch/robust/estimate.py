@@ -11,7 +11,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography, are_homographies
 from rdstitch.options.estimation_options import EstimationOptions
-from rdstitch.robust.chance import MIN_PLACES, places, rejection_reason
+from rdstitch.robust.chance import MIN_OCCUPIED_CELLS, occupied_cells, rejection_reason
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
@@ -150,7 +150,7 @@ def estimate_radial_homographies(pairs: Sequence[PairMatches], options: Estimati
     result: dict[int, RadialHomography] = {}
     batches: dict[tuple[int, float, float, bool], list[int]] = {}
     for index, pair in enumerate(pairs):
-        if (cells := places(pair.points1, pair.points2, *pair.sizes)) < MIN_PLACES:
+        if (cells := occupied_cells(pair.points1, pair.points2, *pair.sizes)) < MIN_OCCUPIED_CELLS:
             reason = f"only {len(pair)} matches, in {cells} places of the image"
             result[index] = RadialHomography.failed(reason, pair.camera1, pair.camera2, len(pair))
         else:

@@ -8,7 +8,7 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.system.dataclasses import dataclass
 
-SHORT_STEP, ROUGH_STEP = 0.3, 1.0
+SHORT_STEP, LOOSE_STEP = 0.3, 1.0
 """Standard deviations of the parameters, all together, of a step that is not worth taking; and where another descent
 goes on from there."""
 
@@ -74,14 +74,14 @@ def descend(
     start: FloatArray,
     iterations: int,
     *,
-    rough: bool = False,
+    loose: bool = False,
 ) -> tuple[FloatArray, Equations]:
     """Where at most so many steps lead to, parameters of shape (B, K), and the equations there.
 
-    A problem that has converged takes no further part, so that each is solved as if it were alone. ``rough``: another
+    A problem that has converged takes no further part, so that each is solved as if it were alone. ``loose``: another
     descent goes on from there.
     """
-    least_gain = (ROUGH_STEP if rough else SHORT_STEP) ** 2
+    least_gain = (LOOSE_STEP if loose else SHORT_STEP) ** 2
     result, parameters = start.copy(), start
     current = equations = problems.normal_equations(start)
     damping, rows = np.full(len(start), FIRST_DAMPING), np.arange(len(start))

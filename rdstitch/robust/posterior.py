@@ -85,11 +85,11 @@ class Prior:
 
     def slope(self, value: float) -> float:
         """Half the derivative of the cost."""
-        return sum(share * (value - mean) / std**2 for share, (_, mean, std) in self._shares(value))
+        return sum(weight * (value - mean) / std**2 for weight, (_, mean, std) in self._responsibilities(value))
 
     def curvature(self, value: float) -> float:
-        """Half the second derivative of the cost where the shares of the parts stay as they are: positive."""
-        return sum(share / std**2 for share, (_, _, std) in self._shares(value))
+        """Half the second derivative of the cost where the weights of the parts stay as they are: positive."""
+        return sum(weight / std**2 for weight, (_, _, std) in self._responsibilities(value))
 
     def combined(self, value: float, std: float) -> float:
         """Where a measurement and the prior put the parameter: where their cost is least about its likeliest part."""
@@ -113,7 +113,7 @@ class Prior:
             for height, (_, mean, std) in zip(self._heights, self.parts, strict=True)
         ]
 
-    def _shares(self, value: float) -> list[tuple[float, tuple[float, float, float]]]:
+    def _responsibilities(self, value: float) -> list[tuple[float, tuple[float, float, float]]]:
         """How likely the value comes from each part, with the part."""
         if not self.parts:
             return []

@@ -9,7 +9,7 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.options.estimation_options import EstimationOptions
-from rdstitch.robust.chance import MIN_PLACES
+from rdstitch.robust.chance import MIN_OCCUPIED_CELLS
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel
@@ -25,8 +25,8 @@ _ALONE = 512  # samples up to which the solver that assumes least goes on alone 
 _SAMPLES_AT_ONCE = 4096
 _MIN_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before
 _QUICK_SCORE = 128  # matches on which hypotheses are compared before the best are scored on all
-_SOLVER_SUCCESS = 0.8  # share of all-inlier samples that lead to the model, in the face of noise
-_NOVELTY = 0.1  # share of a hypothesis's inliers that must be new for it to be worth optimising
+_SOLVER_SUCCESS = 0.8  # fraction of all-inlier samples that lead to the model, in the face of noise
+_NOVELTY = 0.1  # fraction of a hypothesis's inliers that must be new for it to be worth optimising
 _FREE_REFINEMENT = 12  # inliers from which on refinement may leave the model that the minimal solver assumes
 _LOCAL_STEPS = 4
 _GOLDEN = 0.618034  # its multiples are spread evenly, whatever their number
@@ -144,7 +144,7 @@ class _SolverState:
         With ``explore`` at least as many as every solver draws.
         """
         counts = self.data.count[rows]
-        agreeing = np.maximum(best.inliers[rows].sum(axis=1), MIN_PLACES)
+        agreeing = np.maximum(best.inliers[rows].sum(axis=1), MIN_OCCUPIED_CELLS)
         good = _SOLVER_SUCCESS * np.minimum(agreeing / counts, 1.0) ** self.solver.sample_size
         needed = np.log1p(-self.options.confidence) / np.log1p(-np.minimum(good, 1.0 - 1e-12))
         return np.asarray(np.maximum(needed, _MIN_EXPLORATION) if explore else needed)
@@ -192,11 +192,11 @@ class _SolverState:
         order = np.lexsort((costs, pair))
         first = order[np.flatnonzero(np.diff(pair[order], prepend=-1))]
         homography, distortion = np.zeros((len(rows), 3, 3)), np.zeros(len(rows))
-        least = np.full(len(rows), np.inf)
+        min_cost = np.full(len(rows), np.inf)
         which = pair[first]
         homography[which], distortion[which] = solutions.homography[first], solutions.distortion[first]
-        least[which] = costs[first]
-        return homography, distortion, least
+        min_cost[which] = costs[first]
+        return homography, distortion, min_cost
 
     def _optimized(self, start: Hypotheses, data: Measurements, rows: IntArray) -> Hypotheses:
         """The best of each hypothesis, its refinement in the model it assumes, and from there as a free homography.
@@ -224,7 +224,7 @@ class _SolverState:
         problems = PairProblems(model, data, np.full(len(data), scale), None, self.solver.fixed_distortion)
         state = model.initialize(start.homography, None if self.tilts is None else self.tilts[rows])
         begin = Fits(state, start.homography, start.distortion)
-        fits, _ = refine_pairs(problems, begin, _LOCAL_STEPS, rough=True)
+        fits, _ = refine_pairs(problems, begin, _LOCAL_STEPS, loose=True)
         judged = Hypotheses.judged(fits.homography, fits.distortion, data, self.options.threshold, self.index)
         result = start.take(np.arange(len(data)))
         better = judged.cost < start.cost

@@ -80,15 +80,15 @@ class PairProblems:
 
     def normal_equations(self, parameters: FloatArray) -> PairEquations:
         """Loss, normal matrix and gradient."""
-        transferred, chain = self.transfer(parameters), self.chain(parameters)
+        transferred, jacobian = self.transfer(parameters), self.jacobian(parameters)
         scale, noise = self.scale, self.noise
         squared = np.where(transferred.lost | ~self.data.present, np.inf, transferred.squared)
         if noise is None:
-            noise = noise_of(np.sqrt(squared), scale, chain.shape[2])
+            noise = noise_of(np.sqrt(squared), scale, jacobian.shape[2])
             scale = loss_width(noise, scale)
         entries = entry_equations(transferred, self.data.present, scale, self.free > 0)
-        information = np.swapaxes(chain, 1, 2) @ entries.information @ chain
-        gradient = (entries.gradient[:, None] @ chain)[:, 0]
+        information = np.swapaxes(jacobian, 1, 2) @ entries.information @ jacobian
+        gradient = (entries.gradient[:, None] @ jacobian)[:, 0]
         weight = noise**2
         residual, by_state = self.model.prior(parameters[:, -_STATE:])
         prior = (residual**2).sum(axis=1)
@@ -112,13 +112,13 @@ class PairProblems:
         result: FloatArray = before.cost + prior + ((change - unchanged) * self.data.present).sum(axis=1)
         return result
 
-    def chain(self, parameters: FloatArray) -> FloatArray:
+    def jacobian(self, parameters: FloatArray) -> FloatArray:
         """Derivative of the entries of H and the lens by the lens and the model's parameters, (B, 9 + E, E + P)."""
         by_state = self.model.jacobian(parameters[:, -_STATE:])
-        chain = np.zeros((len(parameters), 9 + self.free, self.free + by_state.shape[2]))
-        chain[:, :9, self.free :] = by_state
-        chain[:, 9:, : self.free] = np.eye(self.free)
-        return chain
+        jacobian = np.zeros((len(parameters), 9 + self.free, self.free + by_state.shape[2]))
+        jacobian[:, :9, self.free :] = by_state
+        jacobian[:, 9:, : self.free] = np.eye(self.free)
+        return jacobian
 
     def retract(self, parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Parameters after steps, and whether a lens can be so."""
@@ -130,9 +130,9 @@ class PairProblems:
 
     def covariances(self, parameters: FloatArray, equations: PairEquations) -> FloatArray:
         """Of the parameters where they stand, (B, P, P)."""
-        shares = influence(equations.transferred, self.data.present, equations.scale, self.free > 0)
-        chain = self.chain(parameters)
-        return covariances(equations.information, shares, chain, equations.noise, self.data)
+        of_matches = influence(equations.transferred, self.data.present, equations.scale, self.free > 0)
+        jacobian = self.jacobian(parameters)
+        return covariances(equations.information, of_matches, jacobian, equations.noise, self.data)
 
 
 @np.errstate(all="ignore")  # a step may leave the domain of the lens model
@@ -141,13 +141,13 @@ def refine_pairs(
     start: Fits,
     iterations: int,
     *,
-    rough: bool = False,
+    loose: bool = False,
 ) -> tuple[Fits, PairEquations]:
     """Fit the model and λ by at most so many steps; the fits, and the equations there.
 
-    ``problems``: of B pairs; ``start``: their ``distortion`` is kept where it is fixed; ``rough``: another refinement
+    ``problems``: of B pairs; ``start``: their ``distortion`` is kept where it is fixed; ``loose``: another refinement
     goes on from there.
     """
-    parameters, equations = descend(problems, start.parameters, iterations, rough=rough)
+    parameters, equations = descend(problems, start.parameters, iterations, loose=loose)
     state = parameters[:, 1:]
     return Fits(state, problems.model.homography(state), parameters[:, 0]), equations

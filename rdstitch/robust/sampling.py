@@ -34,9 +34,9 @@ class Sampler:
         if missing > 0:
             self._numbers = np.concatenate([self._numbers, self._random.random((missing, sample_size))])
         number = start[:, None] + np.arange(batch)
-        # The samples from the best n of N matches are a share (n / N)^k of all: so n grows by the k-th root.
-        share = np.minimum((number + 1) / self._growth, 1.0) ** (1.0 / sample_size)
-        grown = np.clip(np.ceil(counts[:, None] * share).astype(np.intp), sample_size, counts[:, None])
+        # The samples from the best n of N matches are a fraction (n / N)^k of all: so n grows by the k-th root.
+        fraction = np.minimum((number + 1) / self._growth, 1.0) ** (1.0 / sample_size)
+        grown = np.clip(np.ceil(counts[:, None] * fraction).astype(np.intp), sample_size, counts[:, None])
         return _distinct(self._numbers[number], np.where(ordered[:, None] & (number % 2 == 0), grown, counts[:, None]))
 
 

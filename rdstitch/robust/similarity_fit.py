@@ -38,8 +38,8 @@ def fit_similarity(source: Points, target: Points, std: float) -> SimilarityFit:
     count = len(source)
     anchors = evenly_spaced(count, _ANCHORS)
     one, two = (anchors[side] for side in np.triu_indices(len(anchors), 1))
-    apart = source[two] - source[one]
-    scale = np.divide(target[two] - target[one], apart, out=np.zeros_like(apart), where=apart != 0)
+    offset = source[two] - source[one]
+    scale = np.divide(target[two] - target[one], offset, out=np.zeros_like(offset), where=offset != 0)
     residuals = np.abs(target - scale[:, None] * (source - source[one][:, None]) - target[one][:, None])
     # Two points always agree: the quantile is one of all that are not needed to fit.
     quantile = np.sort(residuals, axis=1)[:, (count + 3) // 2 - 1]

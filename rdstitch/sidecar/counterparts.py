@@ -11,6 +11,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import MatchBy
 from rdstitch.errors import InputError
+from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.frame import Frame, files_of
 from rdstitch.inputs.measurements import metres_around_median
@@ -149,16 +150,15 @@ def _by_measurement(
     here, there = measure([_known_of(image) for image in saved.images], theirs)
     used = np.array([image.to_plane is not None for image in saved.images])
     here = np.where(used[:, None], here, np.nan)
-    distance = np.linalg.norm(here[:, None] - there[None], axis=2)
-    between = np.linalg.norm(here[:, None] - here[None], axis=2)
-    np.fill_diagonal(between, np.nan)
-    if not (np.isfinite(distance).any() and np.isfinite(between).any()):
+    known, given = (np.flatnonzero(np.isfinite(one).all(axis=1)) for one in (here, there))
+    if len(known) < 2 or not len(given):
         return None
-    reach = np.min(np.where(np.isfinite(between), between, np.inf), axis=1) / 2.0
-    nearest = np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=1)
-    fits = distance[np.arange(len(here)), nearest] < reach
-    counts = Counter(nearest[fits].tolist())
-    chosen = [frames[k] if fit and counts[k] == 1 else None for k, fit in zip(nearest.tolist(), fits, strict=True)]
+    reach = nearest_points(here[known], here[known], 2)[0][:, 1] / 2.0
+    distance, index = (found[:, 0] for found in nearest_points(there[given], here[known], 1))
+    nearest = dict(zip(known[distance < reach].tolist(), given[index[distance < reach]].tolist(), strict=True))
+    counts = Counter(nearest.values())
+    taken = (nearest.get(k) for k in range(len(here)))
+    chosen = [None if k is None or counts[k] > 1 else frames[k] for k in taken]
     return chosen if 2 * sum(frame is not None for frame in chosen) > used.sum() else None
 
 

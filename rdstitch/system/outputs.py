@@ -215,8 +215,9 @@ class Outputs:
     """
 
     def __init__(self, overwrite: bool) -> None:
-        self._overwrite = overwrite
+        self.overwrite = overwrite
         self._folders: dict[Path, TemporaryFolder] = {}
+        self._made: list[Path] = []  # folders for outputs, the inner ones first
         self._items: list[_Item] = []
         self._number = 0  # of what is staged next, also after something was dropped
 
@@ -241,6 +242,18 @@ class Outputs:
         finally:
             for folder in self._folders.values():
                 folder.close()
+            for made in self._made:
+                with suppress(OSError):  # something is in it
+                    made.rmdir()
+
+    def make_folder(self, folder: Path) -> None:
+        """Make a folder for outputs, which goes again at the end if nothing is in it."""
+        missing = [place for place in (folder, *folder.parents) if not place.exists()]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
+        self._made[:0] = missing
 
     @contextmanager
     def writing(self, path: str | Path, *, is_folder: bool = False) -> Iterator[Path]:
@@ -309,7 +322,7 @@ class Outputs:
         """Before anything is replaced: what is there may be, and keeps its permissions."""
         if not item.place.exists():
             return
-        if not self._overwrite:
+        if not self.overwrite:
             raise _appeared(item.name)
         if not item.is_folder:
             item.staged.chmod(item.place.stat().st_mode & 0o777)
@@ -321,7 +334,7 @@ class Outputs:
     def _place(self, item: _Item) -> None:
         if item.is_folder:
             self._place_folder(item)
-        elif self._overwrite:
+        elif self.overwrite:
             item.staged.replace(item.place)
         else:
             # A link replaces nothing; where a file system has none, the check a moment ago must do.
@@ -332,7 +345,7 @@ class Outputs:
                 item.staged.replace(item.place)
 
     def _place_folder(self, item: _Item) -> None:
-        if self._overwrite:
+        if self.overwrite:
             replace_folder(item.staged, item.place)
             return
         try:

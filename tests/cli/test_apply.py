@@ -160,6 +160,17 @@ def test_images_of_one_name_in_two_folders(rdstitch: Run, frames: list[Path], tm
     _apply(rdstitch, _sidecar(output), folders[1], tmp_path / "one.png", told=f"left out {folders[0] / 'x.png'}")
 
 
+def test_layers_are_called_as_was_checked(rdstitch: Run, place: Path) -> None:
+    """Of images that are left out, too, names tell others apart; a dry run makes no folder."""
+    (place / "a.jpg").write_bytes(b"no image")
+    wanted = ("mosaic", place, "-o", place / "o.tif", "--layers", place / "new" / "layers", *CACHED)
+    rdstitch(*wanted, "--dry-run")
+    assert not (place / "new").exists()
+    rdstitch(*wanted, told="a.jpg")
+    names = {file.name for file in (place / "new" / "layers").iterdir()}
+    assert names == {"a.png.tif", "a.png_mask.tif", "b.png.tif", "b.png_mask.tif"}
+
+
 def test_layers_whose_masks_would_be_called_like_another(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     for name, frame in zip(("a.png", "a_mask.png"), frames, strict=False):
         shutil.copy(frame, tmp_path / name)

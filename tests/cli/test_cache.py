@@ -48,7 +48,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     watch(detect_features, "detect_view")
     watch(two_view, "estimate_radial_homographies")
     # The package has a function of the module's name.
-    watch(import_module("rdstitch.alignment.align"), "_lens_and_model")
+    watch(import_module("rdstitch.alignment.recipe"), "_lens_and_model")
     watch(overlap_check, "overlap_agreement")
     return called
 

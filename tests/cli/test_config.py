@@ -40,7 +40,7 @@ def test_the_documented_example_is_read(tmp_path: Path) -> None:
     common |= {"overwrite": True, "workers": "2"}
     assert read_config(file, cli.load_all(), "calibrate") == common
     # The parameter of --format is called otherwise.
-    assert read_config(file, cli.load_all(), "trajectory") == {**common, "layout": "tum", "height": "0.42"}
+    assert read_config(file, cli.load_all(), "trajectory") == {**common, "file_format": "tum", "height": "0.42"}
     assert read_config(file, cli.load_all(), "undistort") == {"camera": "camera.json", "overwrite": True}
 
 

@@ -12,6 +12,7 @@ import pytest
 import yaml
 from PIL import Image
 
+from rdstitch.export import map_server
 from rdstitch.pipeline import recipes
 from rdstitch.pipeline.register import register
 from tests.cli.running import CACHED, Run, rows_of, sidecar_of
@@ -46,7 +47,8 @@ def test_map_poses_and_odometry_lie_in_one_frame(rdstitch: Run, frames: list[Pat
     highlevel = pytest.importorskip("rosbags.highlevel")
     as_bag = ("-o", tmp_path / "odom", "--format", "bag")
     rdstitch("trajectory", *frames[:2], *as_bag, *known)
-    rdstitch("trajectory", *frames, *as_bag, *known, "--overwrite")
+    drive = ("--follow", "--idle", "0.1", "--overwrite")
+    rdstitch("trajectory", frames[0].parent, *as_bag, *known, *drive)
     with highlevel.AnyReader([tmp_path / "odom"]) as reader:
         messages = [reader.deserialize(data, connection.msgtype) for connection, _, data in reader.messages()]
     for message, (x, y, yaw) in zip(messages, poses, strict=True):
@@ -98,6 +100,16 @@ def test_of_several_bands_the_first_one_is_the_map(rdstitch: Run, frames: list[P
     for suffix in (".dzi", ".zarr"):
         tiled = ("mosaic", *frames, "-o", tmp_path / f"f{suffix}", "--map-server", tmp_path / "maps")
         rdstitch(*tiled, status=2, told=f"instead of {suffix}")
+
+
+def test_what_a_map_needs_costs_no_mosaic(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_server, "default_memory", lambda: 10**6)
+    wanted = ("-o", tmp_path / "f.png", "--map-server", tmp_path / "maps", "--height", "1", "--focal", "380")
+    rdstitch("mosaic", *frames, *wanted, *CACHED, told="MB of memory")
+    assert (tmp_path / "f.png").exists()
+    assert not (tmp_path / "maps").exists()
 
 
 def test_a_folder_that_is_no_bag_is_not_replaced(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

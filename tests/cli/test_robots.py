@@ -166,6 +166,10 @@ def test_the_calibration_in_a_bag_is_used(rdstitch: Run, frames: list[Path], tmp
     assert "/camera_info" in done.err
     assert float(done.out) == pytest.approx(DISTORTION, abs=0.01)
     assert "(given)" in done.made
+    live = rdstitch("trajectory", bag, "-o", tmp_path / "live.csv", "--follow", *CACHED)
+    assert "/camera_info" in live.err
+    *_, last, _ = map(json.loads, live.out.splitlines())
+    assert last["x"] == pytest.approx(float(rows_of(tmp_path / "path.csv")[-1]["x"]), rel=0.05)
     same = rdstitch("trajectory", *frames, "--camera", bag, "-o", tmp_path / "files.csv", *CACHED)
     assert same.out == done.out
 

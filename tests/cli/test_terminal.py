@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from rdstitch_cli.main import run
 from rdstitch_cli.terminal import Reporter, spell_out
 
 from rdstitch.io import read_image
+from rdstitch.pipeline import recipes
 from rdstitch.synthetic import ground
 from tests.cli.running import CACHED, DISTORTION, FAST, Outcome, Run, finished, start, state_of
 from tests.sampled import sampled
@@ -188,6 +190,16 @@ def _children(process: int) -> list[int]:
     """Processes that any thread of a process has started."""
     threads = Path(f"/proc/{process}/task").iterdir()
     return [int(child) for thread in threads for child in (thread / "children").read_text().split()]
+
+
+def test_an_interrupt_says_that_there_is_a_cache(
+    rdstitch: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "c.toml").write_text('[common]\ncache = "kept"\n', encoding="utf-8")
+    monkeypatch.setattr(recipes, "calibrate", Mock(side_effect=KeyboardInterrupt))
+    wanted = ("calibrate", tmp_path, "-o", tmp_path / "camera.json")
+    rdstitch(*wanted, "--config", tmp_path / "c.toml", status=130, told="goes on from the cache")
+    assert rdstitch(*wanted, "--", "--debug", status=130).line == "rdstitch: interrupted"
 
 
 @pytest.mark.skipif(not Path(f"/proc/self/task/{os.getpid()}/children").exists(), reason="needs Linux's /proc")

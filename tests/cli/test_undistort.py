@@ -126,7 +126,7 @@ def test_what_fails_leaves_no_folder(rdstitch: Run, frames: list[Path], tmp_path
     twice = tmp_path / "twice"
     twice.mkdir()
     (twice / broken.name).write_bytes(b"x")
-    for inputs in ([broken], [frames[0], twice / broken.name]):
+    for inputs in ([frames[0], broken], [frames[0], twice / broken.name]):
         rdstitch("undistort", *inputs, "--lambda", "-0.1", "-o", tmp_path / "a" / "b", status=3)
         assert not (tmp_path / "a").exists()
 

@@ -56,7 +56,7 @@ def calibrate(
 
     paths = resolve(inputs)
     beside = files_beside(given)
-    wanted = stitch_options(reporter, given, save_camera=output)
+    wanted = stitch_options(given, save_camera=output)
     registration = recipe(paths, wanted, every=every, progress=reporter, beside=beside)
     report_registration(registration, reporter, (lambda: camera_json(registration.camera)) if as_json else None)
     for line in (

@@ -1,24 +1,20 @@
 """``rdstitch mosaic``: a folder of frames becomes one rectified image."""
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import click
 
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.option import Option
 from rdstitch.options.shared_options import Every
+from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import shortened
 from rdstitch_cli.flags import ImageFile, Inputs, PrintSidecar, command, flags_of
 from rdstitch_cli.following import FOLLOWING, followed, print_result
-from rdstitch_cli.stitching import STITCHING, files_beside, report_applied, resolve, stitch_options, summarize
+from rdstitch_cli.stitching import STITCHING, files_beside, report_applied, report_result, resolve, stitch_options
 from rdstitch_cli.terminal import Reporter
-
-if TYPE_CHECKING:
-    from rdstitch.inputs.frame import Named
-    from rdstitch.results.stitch_result import StitchResult
 
 
 @command(
@@ -43,7 +39,7 @@ def mosaic(
         Option(
             "Images of several bands by their names: the first one is registered, and the lenses of the others to it; "
             "each becomes a file, OUTPUT with - and the band's name before its suffix, and a TIFF of all becomes "
-            "OUTPUT.",
+            "OUTPUT. --json prints the sidecar of the first band.",
             "NAME=PATTERN,…",
         ),
     ] = None,
@@ -51,7 +47,7 @@ def mosaic(
         bool,
         Option(
             "Stitch every block of overlapping images: the largest becomes OUTPUT, the others OUTPUT with -2, -3, … "
-            "before its suffix."
+            "before its suffix. --json prints a sidecar for each."
         ),
     ] = False,
     refresh: Annotated[
@@ -74,49 +70,59 @@ def mosaic(
     list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
-    from rdstitch.pipeline.blocks import mosaic_blocks
-    from rdstitch.pipeline.recipes import mosaic as recipe
-
     if all_blocks and (following or given["strict"]):
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
     if bands is not None and (all_blocks or following or given["dry_run"]):
         raise click.UsageError("--bands goes neither with --all-blocks, --follow nor --dry-run")
     beside = files_beside(given)
-    options = stitch_options(reporter, given, pose_covariance=beside.poses is not None)
-    with ExitStack() as stack:
-        paths: Sequence[Named]
-        if following:
-            arrived = followed(
-                inputs, options, reporter, output=output, every=every, idle=idle, refresh=refresh, beside=beside
-            )
-            paths = stack.enter_context(arrived)
-        else:
-            paths = resolve(inputs)
-        if bands is not None:
-            from rdstitch.pipeline.bands import mosaic_bands, parse_bands  # with all that reads an earlier result
+    options = stitch_options(given, pose_covariance=beside.poses is not None)
+    how: dict[str, Any] = {"every": every, "progress": reporter, "beside": beside}
+    if following:
+        _follow(inputs, output, options, reporter, idle=idle, refresh=refresh, as_json=as_json, **how)
+    elif bands is not None:
+        from rdstitch.pipeline.bands import mosaic_bands, parse_bands  # with all that reads an earlier result
 
-            patterns = parse_bands(bands)
-            first, others = mosaic_bands(
-                paths, output, patterns, options, every=every, progress=reporter, beside=beside
-            )
-            _report(first, reporter, as_json=as_json)
-            for other in others:
-                report_applied(other, reporter)
-        elif all_blocks:
-            for block in mosaic_blocks(paths, output, options, every=every, progress=reporter, beside=beside):
-                _report(block, reporter, as_json=as_json, images=f" ({shortened(block.registration.used_names)})")
-        else:
-            result = recipe(paths, output, options, every=every, progress=reporter, beside=beside)
-            _report(result, reporter, as_json=as_json, line_of=output if following else None)
+        first, others = mosaic_bands(resolve(inputs), output, parse_bands(bands), options, **how)
+        report_result(first, reporter, as_json=as_json)
+        for other in others:
+            report_applied(other, reporter)
+    elif all_blocks:
+        from rdstitch.pipeline.blocks import mosaic_blocks
 
-
-def _report(
-    result: "StitchResult", reporter: Reporter, *, as_json: bool, images: str = "", line_of: Path | None = None
-) -> None:
-    """What came of the images: the last line of JSON of a run that followed them, the sidecar, or λ."""
-    if line_of is not None and not as_json:
-        print_result(result.registration, reporter, line_of)
+        for block in mosaic_blocks(resolve(inputs), output, options, **how):
+            names = shortened(block.registration.used_names)
+            report_result(block, reporter, as_json=as_json, more=f" ({names})")
     else:
-        summarize(result, reporter, as_json=as_json)
-    if result.plan is None:
-        reporter.made(f"{result.summary}{images}")
+        from rdstitch.pipeline.recipes import mosaic as recipe
+
+        report_result(recipe(resolve(inputs), output, options, **how), reporter, as_json=as_json)
+
+
+def _follow(
+    inputs: Sequence[Path],
+    output: Path,
+    options: StitchOptions,
+    reporter: Reporter,
+    *,
+    every: int | None,
+    idle: float | None,
+    refresh: float,
+    as_json: bool,
+    beside: FilesBeside,
+    progress: Reporter,
+) -> None:
+    """Print a line for each frame as it arrives, then stitch all, and print what came of it."""
+    from rdstitch.pipeline.recipes import mosaic as recipe
+    from rdstitch.pipeline.run import Run
+    from rdstitch.pipeline.run_files import RunFiles
+
+    preview = output.with_suffix(".preview.jpg") if refresh else None
+    run = Run.of(inputs, options, output, beside)
+    files = RunFiles.of_images(run, inputs, more_files=[] if preview is None else [preview])
+    with followed(inputs, run, files, reporter, every=every, idle=idle, preview=preview, refresh=refresh) as paths:
+        result = recipe(paths, output, run.options, every=every, progress=progress, beside=beside)
+        if as_json:
+            report_result(result, reporter, as_json=True)
+        else:
+            print_result(result.registration, reporter, output)
+            reporter.made(result.summary)

@@ -5,7 +5,7 @@ from typing import Any
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.shared_options import Every
 from rdstitch_cli.flags import ImageFile, Inputs, PrintSidecar, command, flags_of
-from rdstitch_cli.stitching import STITCHING, files_beside, resolve, stitch_options, summarize
+from rdstitch_cli.stitching import STITCHING, files_beside, report_result, resolve, stitch_options
 from rdstitch_cli.terminal import Reporter
 
 
@@ -34,10 +34,6 @@ def pano(
     """
     from rdstitch.pipeline.recipes import pano as recipe
 
-    paths = resolve(inputs)
-    beside = files_beside(given)
-    stitch = stitch_options(reporter, given)
-    result = recipe(paths, output, stitch, every=every, progress=reporter, beside=beside)
-    summarize(result, reporter, as_json=as_json)
-    if result.plan is None:
-        reporter.made(result.summary)
+    beside, options = files_beside(given), stitch_options(given)
+    result = recipe(resolve(inputs), output, options, every=every, progress=reporter, beside=beside)
+    report_result(result, reporter, as_json=as_json)

@@ -12,7 +12,7 @@ from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.option import Option
 from rdstitch.options.tile_options import TileOptions, measured_samples
 from rdstitch_cli.flags import Inputs, PrintSidecar, command, flags_of, values_of
-from rdstitch_cli.stitching import files_beside, report_registration, resolve, summarize
+from rdstitch_cli.stitching import files_beside, report_registration, report_result, resolve
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
@@ -80,9 +80,7 @@ def tiles(
         _check_placed(tiled)
         return
     result = recipe(paths, output, chosen, positions_file=positions_only, progress=reporter, beside=beside)
-    summarize(result, reporter, as_json=as_json)
-    if result.plan is None:
-        reporter.made(result.summary)
+    report_result(result, reporter, as_json=as_json)
     _check_placed(result.registration.tiles)
 
 

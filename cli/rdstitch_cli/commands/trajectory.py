@@ -34,7 +34,7 @@ def trajectory(
     inputs: Inputs,
     output: Annotated[Path, Option("File to write.", "FILE", "-o --output", writes=True)],
     *,
-    layout: Annotated[
+    file_format: Annotated[
         TrajectoryFormat,
         Option(
             "csv: a table with names, time stamps, x, y, yaw_deg, height and their covariances. tum: time, position "
@@ -67,28 +67,30 @@ def trajectory(
     from rdstitch.export.trajectory_files import frame_of
     from rdstitch.pipeline.along_odometry import with_odometry_of_bag
     from rdstitch.pipeline.recipes import trajectory as recipe
+    from rdstitch.pipeline.run import Run
+    from rdstitch.pipeline.run_files import RunFiles
     from rdstitch.results.pose import FollowedPoses
 
-    options = stitch_options(reporter, given)
+    options = stitch_options(given)
     with ExitStack() as stack:
         paths: Sequence[Named]
         if following:
-            options = with_odometry_of_bag(inputs, options)
-            arrived = followed(
-                inputs,
-                options,
-                reporter,
-                output=output,
-                plot=plot,
-                every=every,
-                idle=idle,
-                poses=FollowedPoses(height, frame or frame_of(layout)),
-            )
-            paths = stack.enter_context(arrived)
+            run = Run.of(inputs, with_odometry_of_bag(inputs, options))
+            files, options = RunFiles.of_path(run, inputs, output, plot, file_format), run.options
+            poses = FollowedPoses(height, frame or frame_of(file_format))
+            paths = stack.enter_context(followed(inputs, run, files, reporter, every=every, idle=idle, poses=poses))
         else:
             paths = resolve(inputs)
         _, registration = recipe(
-            paths, output, options, layout=layout, plot=plot, height=height, frame=frame, every=every, progress=reporter
+            paths,
+            output,
+            options,
+            layout=file_format,
+            plot=plot,
+            height=height,
+            frame=frame,
+            every=every,
+            progress=reporter,
         )
         if following:
             print_result(registration, reporter, output)

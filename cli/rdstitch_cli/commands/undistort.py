@@ -10,7 +10,7 @@ from rdstitch.options.option import Option
 from rdstitch.options.shared_options import Distortion, Overwrite, Topic
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch_cli.flags import Inputs, command, flags, flags_of
-from rdstitch_cli.stitching import read_lens, resolve
+from rdstitch_cli.stitching import resolve
 from rdstitch_cli.terminal import Reporter
 
 
@@ -49,10 +49,8 @@ def undistort(
 
     if (camera is None) == (given["distortion"] is None):
         raise click.UsageError("give either --camera FILE or --lambda L")
-    lens, paths = read_lens(camera, reporter), resolve(inputs)
-    written = recipe(
-        paths, output, camera=lens, warn=reporter.tell, progress=reporter, view=view, image_format=image_format, **given
-    )
+    how = {"camera": camera, "view": view, "image_format": image_format, **given}
+    written = recipe(resolve(inputs), output, warn=reporter.tell, progress=reporter, **how)
     reporter.finish()
     noun = "image" if len(written) == 1 else "images"
     reporter.made(f"{output}: {len(written)} {noun} undistorted")

@@ -10,8 +10,9 @@ from rdstitch.arrays import FloatArray
 _POINTS_PER_SIDE = 8
 _REFERENCES_AT_ONCE = 32
 
-_MAX_STRETCH = 10.0
-"""Ratio of areas of what an image shows; seen from above a plane has up to 7."""
+MAX_STRETCH = 10.0
+"""Ratio of areas from which on a layout is not believed. A plane seen from above has up to 7, one seen under 35 degrees
+6 to 15, by the focal length."""
 
 
 def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
@@ -28,14 +29,14 @@ def frontal_reference(alignment: Alignment) -> int:
     used = np.flatnonzero(alignment.used)
     borders = np.stack([_border_on_plane(alignment, int(k)) for k in used])
     present = _nearest_to_horizon(borders, alignment.homographies[[alignment.reference]])
-    if present.min() > _MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
+    if present.min() > MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
         return alignment.reference
-    crossing, least = np.empty(len(used)), np.empty(len(used))
+    crossing, nearest = np.empty(len(used)), np.empty(len(used))
     for start in range(0, len(used), _REFERENCES_AT_ONCE):
         part = slice(start, start + _REFERENCES_AT_ONCE)
         nearness = _nearest_to_horizon(borders, alignment.homographies[used[part]])
-        crossing[part], least[part] = (nearness <= 0.0).sum(axis=0), nearness.min(axis=0)
-    return int(used[np.lexsort((-least, crossing))[0]])
+        crossing[part], nearest[part] = (nearness <= 0.0).sum(axis=0), nearness.min(axis=0)
+    return int(used[np.lexsort((-nearest, crossing))[0]])
 
 
 def _border_on_plane(alignment: Alignment, image: int) -> FloatArray:

@@ -19,7 +19,7 @@ from rdstitch.system.late_imports import csgraph, sparse
 _UNDIVIDED = 20
 """Images that are eliminated at once: what dense matrices do in less time than further division."""
 
-_SHARES = (0.4, 0.5, 0.6)
+_FRACTIONS = (0.4, 0.5, 0.6)
 """Of the images of a part on one side, where it may be divided."""
 
 _HALVED = 16
@@ -228,10 +228,10 @@ def dissection(count: int, image1: IntArray, image2: IntArray) -> tuple[IntArray
         of, size = part[images], np.bincount(part[images])
         # Of some ways to divide each part in two the one by the fewest images.
         fewest, second, eliminated = size.copy(), np.zeros(count, dtype=np.bool_), np.ones(count, dtype=np.bool_)
-        for values, share in product(along.T, _SHARES):
+        for values, fraction in product(along.T, _FRACTIONS):
             order, half = images[np.lexsort((values[images], of))], np.zeros(count, dtype=np.bool_)
             half[order] = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size) >= np.repeat(
-                share * size, size
+                fraction * size, size
             )
             cut = np.unique(links[:, half[links[0]] != half[links[1]]])
             ends = np.stack([np.bincount(part[cut[half[cut] == side]], minlength=len(size)) for side in (0, 1)])

@@ -1,7 +1,7 @@
 """Global adjustment: all poses, the shared tilt and focal length, and the lens, from all correspondences at once.
 
 Levenberg-Marquardt on a robust loss of the transfer errors in measured pixels, generic in the motion model. The width
-of the loss follows the scatter of the errors, from wide to narrow, so that good links are not lost to a rough start.
+of the loss follows the scatter of the errors, from wide to narrow, so that good links are not lost to a poor start.
 """
 
 from functools import cached_property
@@ -17,7 +17,7 @@ from rdstitch.alignment.least_squares.link_equations import (
     trial_errors,
     whitened_errors,
 )
-from rdstitch.alignment.least_squares.normal_equations import ImageEquations, SparseNormalEquations, chain
+from rdstitch.alignment.least_squares.normal_equations import ImageEquations, SparseNormalEquations, assemble
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel
@@ -31,7 +31,7 @@ from rdstitch.system.dataclasses import dataclass, replace
 MIN_GAIN = 1e-5
 """Expected relative fall of the loss that is worth another step: a hundredth of the noise."""
 
-FEW_GAIN, ROUGH_GAIN = 1e-4, 1e-3
+FEW_GAIN, LOOSE_GAIN = 1e-4, 1e-3
 """The same of a few matches of each pair; and where another descent goes on from there."""
 
 WIDEST_START = 0.05
@@ -170,17 +170,17 @@ class BundleAdjuster:
     max_iterations: int = 60  # linearizations at most
     min_gain: float = MIN_GAIN  # expected relative fall of the cost that is worth another step
 
-    def run(self, start: Parameters, *, rough: bool = False) -> BundleAdjustmentResult:
+    def run(self, start: Parameters, *, wide_start: bool = False) -> BundleAdjustmentResult:
         """Adjust.
 
-        From a ``rough`` start the loss is as wide in the beginning as most links need; otherwise the scatter of the
+        With a ``wide_start`` the loss is as wide in the beginning as most links need; otherwise the scatter of the
         first errors decides.
         """
         squared = self.squared(start)
         half_diagonal = float(np.median(self.observations.scale2))  # of errors from which a descent may find back
         sigma = min(self.observations.sigma(squared), half_diagonal)
         damping, parameters, iterations = _FIRST_DAMPING, start, 0
-        width = max(self._rough_width(squared) if rough else 0.0, ALIGNMENT_WIDTH * sigma)
+        width = max(self._wide_width(squared) if wide_start else 0.0, ALIGNMENT_WIDTH * sigma)
         while True:
             last = width <= ALIGNMENT_WIDTH * sigma * _NARROW
             descent = self._descend(parameters, sigma, width, damping, _LAST_STEPS if last else _STEPS)
@@ -267,7 +267,7 @@ class BundleAdjuster:
             product: FloatArray = matrices.matrices[j] @ inverses(matrices.matrices)[i]
         return product
 
-    def _rough_width(self, squared: FloatArray) -> float:
+    def _wide_width(self, squared: FloatArray) -> float:
         """Width of the loss, pixels, at which most links still count, as far off as a chain may have put them."""
         medians = self.observations.medians(np.sqrt(squared))
         of_most_links = 1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95))
@@ -295,7 +295,7 @@ class BundleAdjuster:
 
     def _normal_equations(self, state: _State, sigma: float) -> SparseNormalEquations:
         """Of the data at ``state``, and of the priors."""
-        normal = chain(
+        normal = assemble(
             state.equations,
             self.observations,
             state.matrices,

@@ -172,7 +172,7 @@ class ImageEquations:
         np.add.at(gradient, (link[:, None], column), np.einsum("mip,mi->mp", weighted, self.errors[chosen]))
 
 
-def chain(
+def assemble(
     equations: LinkEquations,
     observations: Observations,
     model: ModelMatrices,

@@ -249,7 +249,7 @@ def test_any_image_can_become_the_frame_after_the_adjustment(monkeypatch: pytest
     poses = jittered(grid(3, 2, (0.4, 0.3), 1.2, rng), 0.2, 0.0, rng)
     given = scene(poses, tilt=(0.05, -0.04), rng=rng)
     adjusted: list[AdjustedImages] = []
-    recipe = import_module("rdstitch.alignment.align")  # the package has a function of the module's name
+    recipe = import_module("rdstitch.alignment.recipe")
     monkeypatch.setattr(recipe, "build_alignment", adjusted.append)
     aligned(given, model="similarity", reference=0)
     for reference in range(len(poses)):

@@ -274,7 +274,7 @@ def pair(seed: int, *, distortion: float = 0.0, noise: float = 0.5, count: int =
 
 def unweighed(given: Scene, monkeypatch: pytest.MonkeyPatch) -> Alignment:
     with monkeypatch.context() as without:
-        without.setattr(importlib.import_module("rdstitch.alignment.align"), "weigh_lens", lambda problem, fit, _: fit)
+        without.setattr(importlib.import_module("rdstitch.alignment.recipe"), "weigh_lens", lambda problem, fit, _: fit)
         return aligned(given)
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from examples.worlds.alignment_scenes import Scene, aligned, fitted, grid, scene
-from rdstitch.alignment.align import from_another_start
 from rdstitch.alignment.motion_models import SIMILARITY
+from rdstitch.alignment.recipe import from_another_start
 from rdstitch.alignment.relief_field import _spectrum
 from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
 from rdstitch.alignment.select import ModelChoice, best_of
@@ -39,12 +39,12 @@ def test_over_a_plane_and_of_two_images_nothing_changes() -> None:
     """Of two images tilts do what heights do."""
     problem, fit = fitted(_scene(0.0))
     choice = ModelChoice(fit, "")
-    assert weighted_by_relief(problem, fit) is problem
+    assert weighted_by_relief(problem, fit) is None
     assert choose_over_relief(problem, choice, ["similarity", "tilting"], Purpose.MOSAIC) is choice
     given = _scene(0.08)
     pair = replace(given, cameras=given.cameras[:2], links=[k for k in given.links if max(k.image1, k.image2) == 1])
     problem, fit = fitted(pair)
-    assert weighted_by_relief(problem, fit) is problem
+    assert weighted_by_relief(problem, fit) is None
 
 
 def test_heights_are_found_as_they_scatter() -> None:

@@ -158,9 +158,11 @@ def test_the_command_decides_between_what_is_as_good(monkeypatch: pytest.MonkeyP
 
     def spy(problem: Problem, names: list[str], *rest: object) -> ModelChoice:
         choice = select_model(problem, ["rotation"])
-        scores.append([Posterior(problem, purpose).of(choice.fit).score for purpose in (Purpose.PANO, Purpose.MOSAIC)])
+        scores.append(
+            [Posterior(problem, purpose).scored(choice.fit).score for purpose in (Purpose.PANO, Purpose.MOSAIC)]
+        )
         return choice
 
-    monkeypatch.setattr(import_module("rdstitch.alignment.align"), "select_model", spy)
+    monkeypatch.setattr(import_module("rdstitch.alignment.recipe"), "select_model", spy)
     align(*_turn(20.0))
     assert 2.0 < scores[0][1] - scores[0][0] < 10.0

@@ -431,12 +431,12 @@ def test_that_there_are_more_pixels_is_no_contrast(frames: list[NDArray[np.uint8
     hazy = _hazy(frames)[0]
     options = FeatureOptions(max_features=800, work_megapixels=hazy.shape[0] * hazy.shape[1] / 1e6)
     small, large = (detect(np.kron(hazy, np.ones((k, k, 1), np.uint8)), options) for k in (1, 2))
-    assert small.shown == large.shown
-    assert small.faint
-    assert large.faint
+    assert small.detected_count == large.detected_count
+    assert small.low_contrast
+    assert large.low_contrast
     blank = detect(np.zeros((40, 40), np.uint8), options)
-    assert blank.shown == 0
-    assert blank.faint
+    assert blank.detected_count == 0
+    assert blank.low_contrast
     clear = detect(frames[0], options)
-    assert (clear.shown or 0) > 400
-    assert not clear.faint
+    assert (clear.detected_count or 0) > 400
+    assert not clear.low_contrast

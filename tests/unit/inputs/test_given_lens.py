@@ -8,11 +8,13 @@ import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import load_camera, read_camera_file
+from rdstitch.errors import OutputError
 from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.inputs.source import read_sources
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.read_inputs import with_camera_read
+from rdstitch.pipeline.given_camera import with_camera
+from rdstitch.pipeline.recipes import mosaic
 
 K, D = [214.0, 0.0, 156.8, 0.0, 216.0, 122.6, 0.0, 0.0, 1.0], [-0.29, 0.09, -0.0009, 0.0008, -0.0135]
 EQUIDISTANT = [-0.01, 0.03, -0.02, 0.004]
@@ -56,7 +58,12 @@ def test_the_lens_goes_with_its_camera_everywhere(tmp_path: Path, model: str, d:
     file = echoed(tmp_path, model, d)
     camera = load_camera(file)
     for named in (file, str(file)):
-        assert with_camera_read(StitchOptions(camera=named)).known_camera == camera
+        with pytest.raises(OutputError, match="is read as input"):
+            mosaic(
+                [np.zeros((60, 80, 3), np.uint8)] * 2,
+                options=StitchOptions(camera=named, save_camera=Path(named), overwrite=True),
+            )
+        assert with_camera(StitchOptions(camera=named), of_bag=False)[0].known_camera == camera
     camera.save(tmp_path / "own.json")
     assert read_camera_file(tmp_path / "own.json").camera.lens_model == camera.lens_model
     points = np.array([[10.0, 20.0], [300.0, 200.0], [160.0, 10.0]])

@@ -14,11 +14,13 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.map_grid import read_grid
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
+from rdstitch.inputs.find import find_images
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.bands import mosaic_bands
 from rdstitch.pipeline.recipes import mosaic
+from rdstitch.sidecar.read import mismatch_with_image, read_sidecar
 from tests.cli.running import flight, sidecar_of
 
 _SHIFT = np.array([-7.0, 9.0])
@@ -107,6 +109,10 @@ def test_all_bands_of_a_rig_at_once(rig: Path, tmp_path: Path) -> None:
         assert valid[nir.dataset_mask() > 0].mean() > 0.95
         assert stack.colorinterp[-1] == rasterio.enums.ColorInterp.alpha
         assert stack.overviews(1)
+    # No band is taken as input again, and all of them together no image to stitch.
+    with pytest.raises(InputError, match="no images but those that rdstitch wrote"):
+        find_images([tmp_path])
+    assert not mismatch_with_image(read_sidecar(tmp_path / "f.tif.json"))
     with pytest.raises(ArgumentError, match="no image has a name like"):
         mosaic_bands([rig / "red"], tmp_path / "g.tif", bands, options)
     cogeo = pytest.importorskip("rio_cogeo.cogeo")

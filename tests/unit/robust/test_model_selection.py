@@ -126,7 +126,7 @@ def test_descents_in_lockstep_do_not_notice_each_other() -> None:
 def test_what_is_only_a_start_takes_fewer_steps() -> None:
     valley = _Valleys(np.ones(1), np.arange(1), np.zeros(1, dtype=np.intp))
     start = np.full((1, 1), 1.003)
-    assert descend(valley, start, 30, rough=True)[0] == start
+    assert descend(valley, start, 30, loose=True)[0] == start
     assert abs(descend(valley, start, 30)[0] - 1.0) < 1e-3
 
 

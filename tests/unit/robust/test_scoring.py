@@ -9,7 +9,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import transfer
 from rdstitch.robust import estimate_radial_homography
-from rdstitch.robust.chance import MIN_PLACES, binomial_tail, places, rejection_reason
+from rdstitch.robust.chance import MIN_OCCUPIED_CELLS, binomial_tail, occupied_cells, rejection_reason
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
@@ -138,7 +138,7 @@ def test_chance_is_that_of_a_wrong_match_near_its_place(matches: int, threshold:
     points = _apart(matches)
     for count, reliable in ((enough, True), (enough - 1, False)):
         reason = rejection_reason(points, points, np.arange(matches) < count, (SIZE, SIZE), threshold)
-        if count >= MIN_PLACES:
+        if count >= MIN_OCCUPIED_CELLS:
             assert (reason is None) is reliable, count
 
 
@@ -154,17 +154,17 @@ def test_neighbouring_matches_count_once() -> None:
     def reason(points: FloatArray) -> str | None:
         return rejection_reason(points, points, np.ones(len(points), dtype=np.bool_), (SIZE, SIZE), 3.0)
 
-    points = np.repeat(_apart(MIN_PLACES - 1), 50, axis=0)
+    points = np.repeat(_apart(MIN_OCCUPIED_CELLS - 1), 50, axis=0)
     assert reason(points) == "350 of 350 matches agree, but they lie in 7 places of the image only"
-    assert reason(np.vstack([points, _apart(MIN_PLACES)[-1:]])) is None
+    assert reason(np.vstack([points, _apart(MIN_OCCUPIED_CELLS)[-1:]])) is None
     # Few that all agree are no chance.
-    assert reason(_apart(MIN_PLACES)) is None
+    assert reason(_apart(MIN_OCCUPIED_CELLS)) is None
 
 
 def test_places_are_those_of_the_image_with_fewer() -> None:
-    assert places(_apart(30), _apart(30), SIZE, SIZE) == 30
-    assert places(_apart(30), np.full((30, 2), 7.0), SIZE, SIZE) == 1
-    assert places(_apart(30)[:0], _apart(30)[:0], SIZE, SIZE) == 0
+    assert occupied_cells(_apart(30), _apart(30), SIZE, SIZE) == 30
+    assert occupied_cells(_apart(30), np.full((30, 2), 7.0), SIZE, SIZE) == 1
+    assert occupied_cells(_apart(30)[:0], _apart(30)[:0], SIZE, SIZE) == 0
 
 
 @pytest.mark.parametrize(

@@ -102,45 +102,55 @@ def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
     return int(full[np.argmax(trust)])
 
 
-def _lens_and_model(task: GivenImages) -> AdjustedImages:
+def _lens_and_model(given: GivenImages) -> AdjustedImages:
     """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
-    options, known = task.options, task.options.camera_priors(task.cameras)
-    all_matches, relations = _observations(task.links, task.cameras, _matches_of_a_link(len(task.links), options))
-    sample = all_matches.thinned(_matches_for_selection(len(task.links)))
-    lens = choose_observable_lens(task, sample, relations, known)
-    wrong, confirmed = cycle_consistency(lens.pairwise, sample, len(task.cameras))
-    all_links = _problem_of_all_links(task, sample, lens, _tree_ranks(sample, confirmed), known, wrong)
+    options, messages = given.options, list[Message]()
+    known = options.camera_priors(given.cameras)
+    all_matches, relations = _observations(given.links, given.cameras, _matches_of_a_link(len(given.links), options))
+    sample = all_matches.thinned(_matches_for_selection(len(given.links)))
+    lens = choose_observable_lens(given, sample, relations, known)
+    wrong, confirmed = cycle_consistency(lens.pairwise, sample, len(given.cameras))
+    all_links = _problem_of_all_links(given, sample, lens, _tree_ranks(sample, confirmed), known, wrong)
     problem, images = all_links.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
     all_links, problem = (replace(one, overdispersion=shared) for one in (all_links, problem))
-    if (contradiction := check_attitudes(problem, options)) is not None:
-        better_options, message = contradiction
-        without = _lens_and_model(replace(task, options=better_options))
-        return replace(without, messages=(message, *without.messages))
+    while (contradiction := check_attitudes(problem, options)) is not None:
+        options, message = contradiction
+        messages.append(message)
+        all_links = replace(all_links, camera_priors=options.camera_priors(given.cameras))
+        problem, _ = all_links.part(~wrong)
     choice = select_model(problem, options.models, lens.refinements, options.purpose)
-    choice, images, wrong = _drop_wrong_pairs(all_links, problem, images, choice, wrong)
+    choice, images, wrong = _drop_wrong_pairs(all_links, images, choice, wrong)
     problem, _ = all_links.part(~wrong, images)
     choice = choose_over_relief(problem, choice, options.models, options.purpose)
+    if options.reference is not None and options.reference not in images:
+        messages.append(_REFERENCE_LEFT_OUT)
     free = choice.fit.free_lens
-    all_links = replace(all_links, observations=all_matches, free_lens=free, min_gain=MIN_GAIN)
-    problem, refined = replace(problem, free_lens=free), lens.refined(free)
-    unused = () if options.reference is None or options.reference in images else (_REFERENCE_LEFT_OUT,)
-    return AdjustedImages(task, images, ~wrong, all_links, problem, choice, refined, messages=unused)
+    return AdjustedImages(
+        replace(given, options=options),
+        images,
+        ~wrong,
+        replace(all_links, observations=all_matches, free_lens=free, min_gain=MIN_GAIN),
+        replace(problem, free_lens=free),
+        choice,
+        lens.refined(free),
+        messages=tuple(messages),
+    )
 
 
 def _problem_of_all_links(
-    task: GivenImages, sample: Observations, lens: LensChoice, trust: FloatArray, known: CameraPriors, wrong: BoolArray
+    given: GivenImages, sample: Observations, lens: LensChoice, trust: FloatArray, known: CameraPriors, wrong: BoolArray
 ) -> Problem:
     """The problem of all images, with the reference that was asked for, or else a good one of those not ``wrong``."""
-    pairwise, reference = lens.pairwise, task.options.reference
-    count, start = len(task.cameras), pairwise.parameters.lens
+    pairwise, reference = lens.pairwise, given.options.reference
+    count, start = len(given.cameras), pairwise.parameters.lens
     all_links = Problem(
         sample, pairwise.homographies, trust, count, reference, start, lens.free, known, min_gain=FEW_GAIN
     )
     if reference is None:
         problem, images = all_links.part(~wrong)
-        reference = int(images[_full_size_reference(problem, [task.cameras[k] for k in images])])
+        reference = int(images[_full_size_reference(problem, [given.cameras[k] for k in images])])
     return replace(all_links, fixed=reference)
 
 
@@ -183,25 +193,25 @@ def from_another_start(problem: Problem, fit: Fit) -> Fit:
     return min((fit, fit_model(problem, fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
 
 
-def _with_checked_focal(adjusted: AdjustedImages, given: AlignmentOptions) -> Alignment:
+def _with_checked_focal(adjusted: AdjustedImages, stated: AlignmentOptions) -> Alignment:
     """The alignment; without a given focal length that gave way where the images by themselves show another one."""
     if adjusted.covariance is None or not is_strained(adjusted.all_links.camera_priors, adjusted.choice.fit):
         return build_alignment(adjusted)
-    task = adjusted.given
-    cameras = [camera.without_focal().with_focal() for camera in task.cameras]
+    given = adjusted.given
+    cameras = [camera.without_focal().with_focal() for camera in given.cameras]
     # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
-    only_tilt = task.options.attitudes is None and task.options.tilt is not None
-    options = replace(task.options, tilt=None) if only_tilt else task.options
+    only_tilt = given.options.attitudes is None and given.options.tilt is not None
+    options = replace(given.options, tilt=None) if only_tilt else given.options
 
     def by_themselves(options: AlignmentOptions) -> tuple[AdjustedImages, Message | None]:
-        free = _adjusted(_lens_and_model(GivenImages(cameras, task.links, options)))
-        return free, check_focal(task.cameras[free.images[0]], free.choice.fit, free.covariance)
+        free = _adjusted(_lens_and_model(GivenImages(cameras, given.links, options)))
+        return free, check_focal(given.cameras[free.images[0]], free.choice.fit, free.covariance)
 
     try:
         free, contradiction = by_themselves(options)
         # What seemed to be wrong may have been so with the wrong focal length only.
-        if contradiction is not None and options is not given:
-            free, contradiction = by_themselves(given)
+        if contradiction is not None and options is not stated:
+            free, contradiction = by_themselves(stated)
         if contradiction is not None:
             return build_alignment(replace(free, messages=(*free.messages, contradiction)))
     except (RegistrationError, ImpossibleCameraError, np.linalg.LinAlgError):
@@ -255,7 +265,7 @@ def _tree_ranks(observations: Observations, confirmed: IntArray) -> FloatArray:
 
 
 def _drop_wrong_pairs(
-    all_links: Problem, problem: Problem, images: IntArray, choice: ModelChoice, wrong: BoolArray
+    all_links: Problem, images: IntArray, choice: ModelChoice, wrong: BoolArray
 ) -> tuple[ModelChoice, IntArray, BoolArray]:
     """Test all links against the adjusted poses, and adjust again without those that do not fit."""
     all_links = replace(all_links, free_lens=choice.fit.free_lens)

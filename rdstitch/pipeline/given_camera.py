@@ -1,0 +1,63 @@
+"""The camera that the user gives, in a file or in a ROS bag."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from rdstitch.errors import InputError
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.exif_orientation import inverse, turned_size
+from rdstitch.inputs.find import find_images
+from rdstitch.inputs.frame import Frame, Named
+from rdstitch.inputs.rosbag import camera_in, camera_in_bag, is_bag
+from rdstitch.io.metadata import read_metadata
+from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.results.messages import Message
+
+
+def read_camera(file: str | Path, inputs: Sequence[Named] = ()) -> tuple[Camera, list[Message]]:
+    """The camera of a file or bag, and, where λ is fitted to another lens model, how well it describes that.
+
+    Some files do not say the size of the images, which is then that of ``inputs``.
+    """
+    if is_bag(Path(file)):
+        return camera_in(file), []
+    from rdstitch.camera_files import read_camera_file  # with all formats, which most runs have no use for
+
+    read = read_camera_file(file, partial(_stored_size, file, inputs))
+    if read.fit is None:
+        return read.camera, []
+    left = f"rms {read.fit.rms:.2f} pixels, at most {read.fit.largest:.2f} pixels"
+    left += ", by which images are corrected" if read.camera.lens_model is not None else ""
+    text = f"λ = {read.camera.nearest_distortion:.6f} was fitted to the {read.kind} lens model, {left}"
+    return read.camera, [Message(f"{file}: {text}")]
+
+
+def _stored_size(file: str | Path, inputs: Sequence[Named]) -> tuple[int, int]:
+    """Width and height of the first input image as it is stored."""
+    try:
+        first = find_images(inputs).frames[0]
+        if first.image is not None:
+            return first.image.pixels.shape[1], first.image.pixels.shape[0]
+        metadata = read_metadata(first.path)
+    except (InputError, IndexError) as error:
+        raise InputError(f"{file}: has no image size; add image_width and image_height") from error
+    return turned_size(metadata.size, inverse(metadata.orientation))
+
+
+def with_camera(
+    options: StitchOptions, inputs: Sequence[Named] = (), *, of_bag: bool
+) -> tuple[StitchOptions, list[Message]]:
+    """Options with the camera whose file they name; without any, if wanted, with that of a bag; what to know of it."""
+    if isinstance(options.camera, str | Path):
+        camera, messages = read_camera(options.camera, inputs)
+        return replace(options, camera=camera), messages
+    named = [Path(item) for item in inputs if not isinstance(item, Frame)]
+    if not of_bag or options.known_distortion is not None or len(named) != 1 or not is_bag(named[0]):
+        return options, []
+    if (found := camera_in_bag(named[0], options.topic)) is None:
+        return options, []
+    text = f"the calibration in the bag, {found[1]}, is used; --camera FILE takes another one"
+    note = Message(text, (str(named[0]),), "note")
+    return replace(options, camera=found[0].camera, lens="auto", solver="auto"), [note]
