@@ -226,8 +226,7 @@ def _outline_on_plane(camera: Camera, matrix: FloatArray, near: NearPart | None,
 
 def _resolution(camera: Camera, matrix: FloatArray) -> float:
     """Image pixels per plane unit at the image's centre, negative where the image is mirrored."""
-    width, height = camera.image_size
-    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    middle = np.array(camera.image_center)
     left, right, top, bottom = to_plane(camera, matrix, middle + np.array([(-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5)]))
     (ax, ay), (bx, by) = right - left, bottom - top
     area = ax * by - ay * bx

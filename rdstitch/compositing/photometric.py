@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Float32Array
-from rdstitch.compositing.warp import LATTICE_STEPS, Geometry, interpolated
+from rdstitch.compositing.lattice import LATTICE_STEPS, interpolated
+from rdstitch.compositing.warp import Geometry
 from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import nodes_around
 from rdstitch.system.dataclasses import dataclass, field, replace

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.photometric import Exposure, full_scale
+from rdstitch.compositing.resample import border_weight
 from rdstitch.compositing.survey import Survey
-from rdstitch.compositing.warp import border_weight, locate
+from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean
 from rdstitch.system.dataclasses import dataclass, replace
 

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection, overlapping_pairs
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, likeness, measure_seams
+from rdstitch.compositing.likeness import likeness
+from rdstitch.compositing.resample import sample, sample_opacity
+from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, measure_seams
 from rdstitch.compositing.source_images import ImageReader, LoadedImage, PlacedImage
-from rdstitch.compositing.warp import Warp, locate, plan_warps, sample, sample_opacity
+from rdstitch.compositing.warp import Warp, locate, plan_warps
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.system.dataclasses import dataclass, replace
 

@@ -16,8 +16,8 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.photometric import DEPTHS, full_scale
 from rdstitch.compositing.preparation import decide, prepare_composite
 from rdstitch.compositing.render import Layer
+from rdstitch.compositing.resample import INTERPOLATION, remap, sample_places
 from rdstitch.compositing.source_images import LoadedImage, PlacedImage, smoothed
-from rdstitch.compositing.warp import INTERPOLATION, remap, sample_places
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.system.dataclasses import dataclass, replace

@@ -52,8 +52,8 @@ def views_of(
 ) -> Views:
     """The cameras of images that ``to_output`` (N, 3, 3) takes to the output; straight down by each one's attitude."""
     each = list(zip(cameras, to_output, strict=True))
-    middle = np.array([_in_output(c, h, _middle(c)) for c, h in each])
-    next_pixel = np.array([_in_output(c, h, _middle(c) + np.array([1.0, 0.0])) for c, h in each])
+    middle = np.array([_in_output(c, h, np.array(c.image_center)) for c, h in each])
+    next_pixel = np.array([_in_output(c, h, np.array(c.image_center) + np.array([1.0, 0.0])) for c, h in each])
     right = (next_pixel - middle) / np.abs(next_pixel - middle)
     pixel = float(np.median(np.abs(next_pixel - middle)))
     focal = np.array([np.nan if c.focal is None else c.focal for c in cameras])
@@ -72,12 +72,6 @@ def views_of(
         foot = np.array([_in_output(*one, pixel) for one, pixel in zip(each, below, strict=True) if pixel is not None])
         return Views(middle, foot, height, right, "attitudes", pixel, 0.0, _TILT_STD)
     return Views(middle, middle, height, right, "centres", pixel, 0.0, _TILT_STD)
-
-
-def _middle(camera: Camera) -> FloatArray:
-    """The centre of an image, pixels."""
-    width, height = camera.image_size
-    return np.array([(width - 1) / 2, (height - 1) / 2])
 
 
 def _in_output(camera: Camera, homography: FloatArray, pixel: FloatArray) -> complex:

@@ -12,13 +12,8 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
 from rdstitch.compositing.canvas import plan_canvas
 from rdstitch.compositing.near_part import NearPart, near_parts
-from rdstitch.compositing.panorama_canvas import (
-    center_of_view,
-    choose_projection,
-    field_of_view,
-    photo_sphere_xmp,
-    seen_directions,
-)
+from rdstitch.compositing.panorama_canvas import center_of_view, choose_projection, field_of_view, seen_directions
+from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.projection import PLANE, PROJECTIONS
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError, LimitError

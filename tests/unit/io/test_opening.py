@@ -266,7 +266,7 @@ def test_what_a_decoder_warns_of_reaches_the_host(tmp_path: Path, monkeypatch: p
         return 8
 
     Image.new("L", (8, 8)).save(tmp_path / "a.png")
-    monkeypatch.setattr("rdstitch.io.metadata._bit_depth", bit_depth)
+    monkeypatch.setattr("rdstitch.io.metadata.stored_bits", bit_depth)
     with pytest.warns(UserWarning, match="an odd file"):
         read_metadata(tmp_path / "a.png")
     with warnings.catch_warnings():
