@@ -36,13 +36,13 @@ def sample(image: LoadedImage, geometry: Geometry, interpolation: str = "cubic")
 
     The image is prepared for ``geometry.warp.shrink``; the result is (h, w) or (h, w, C), in its sample type.
     """
-    map_x, map_y = _mirrored(image, geometry)
+    map_x, map_y = _mirrored(image.reduction, geometry)
     return _remap_whole(image.pixels, map_x, map_y, INTERPOLATION[interpolation])
 
 
-def sample_places(image: LoadedImage, geometry: Geometry) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+def sample_places(reduction: int, geometry: Geometry) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
     """Where :func:`sample` takes pixels from, as ``cv2.remap`` takes it quickest: (h, w, 2), and parts of a pixel."""
-    places, parts = cv2.convertMaps(*_mirrored(image, geometry), cv2.CV_16SC2)
+    places, parts = cv2.convertMaps(*_mirrored(reduction, geometry), cv2.CV_16SC2)
     return np.asarray(places, dtype=np.int16), np.asarray(parts, dtype=np.uint16)
 
 
@@ -50,14 +50,14 @@ def sample_opacity(image: LoadedImage, geometry: Geometry) -> Float32Array | Non
     """Opacity (h, w), 0 where the image is masked out; None for an image without a mask."""
     if image.opacity is None:
         return None
-    map_x, map_y = _mirrored(image, geometry)
+    map_x, map_y = _mirrored(image.reduction, geometry)
     opacity = _remap_whole(image.opacity, map_x, map_y, cv2.INTER_LINEAR) * np.float32(1.0 / OPAQUE)
     # The outer half of the last opaque pixel is outside.
     return np.where(opacity >= np.float32(0.5 * image.opacity_step), opacity, np.float32(0.0))
 
 
-def _mirrored(image: LoadedImage, geometry: Geometry) -> tuple[Float32Array, Float32Array]:
-    """Pixels of the (reduced) image, all inside it."""
+def _mirrored(reduction: int, geometry: Geometry) -> tuple[Float32Array, Float32Array]:
+    """Pixels of the image, reduced by so much, all inside it."""
     map_x, map_y = geometry.maps
     if not geometry.inside.all():
         # Mirroring rounds: what is inside keeps its coordinates, whatever else the box holds.
@@ -65,8 +65,8 @@ def _mirrored(image: LoadedImage, geometry: Geometry) -> tuple[Float32Array, Flo
         for values, exact in zip(mirrored, (map_x, map_y), strict=True):
             np.copyto(values, exact, where=geometry.inside)
         map_x, map_y = mirrored
-    if image.reduction > 1:
-        half, factor = np.float32(0.5), np.float32(image.reduction)
+    if reduction > 1:
+        half, factor = np.float32(0.5), np.float32(reduction)
         map_x, map_y = ((m + half) / factor - half for m in (map_x, map_y))
     return map_x, map_y
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.export.camera_views import Views, views_of
+from rdstitch.export.camera_views import Views, as_complex, views_of
 from rdstitch.export.georeference import CONTROL, GPS, Georeference, PositionKind, Residual
 from rdstitch.export.georeference_text import metres
 from rdstitch.export.map_fit import MapFit, Measured, fit_map
@@ -77,8 +77,8 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
     shown: dict[tuple[str, bool], list[tuple[GroundControl, complex]]] = {}
     for k, points in enumerate(located.control):
         for point in points:
-            x, y = to_plane(located.cameras[k], located.to_output[k], np.array([point.pixel])).reshape(2)
-            shown.setdefault((point.name, point.check), []).append((point, complex(x, -y)))
+            pixel = as_complex(to_plane(located.cameras[k], located.to_output[k], np.array([point.pixel])))[0]
+            shown.setdefault((point.name, point.check), []).append((point, complex(pixel)))
     means = {key: (same[0][0], complex(np.mean([pixel for _, pixel in same]))) for key, same in shown.items()}
     control = [mean for (_, check), mean in means.items() if not check]
     checks = [mean for (_, check), mean in means.items() if check]

@@ -14,7 +14,7 @@ from PIL import Image
 from rdstitch.errors import InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
-from rdstitch.inputs.keyframes import Wanted, wanted_frames
+from rdstitch.inputs.keyframes import FrameSelection, wanted_frames
 from rdstitch.inputs.odometry import Odometry, odometry_of, yaw_of
 from rdstitch.io.video import write_frame
 from rdstitch.system.dataclasses import dataclass
@@ -82,7 +82,7 @@ def opened_bag(path: Path) -> "Iterator[Any]":
 
 def extract_images(
     path: Path, folder: Path, every: int | None = 1, topic: str | None = None
-) -> tuple[list[Frame], Wanted]:
+) -> tuple[list[Frame], FrameSelection]:
     """Write images of a topic to a folder, losslessly, with number and time stamp (s) of the header."""
     with opened_bag(path) as reader:
         messages = _Messages.of(reader, path, topic)
@@ -93,7 +93,7 @@ def extract_images(
 def images_in_bag(path: Path, folder: Path, every: int, topic: str | None = None) -> Iterator[Frame]:
     """The same one after the other, every n-th one."""
     with opened_bag(path) as reader:
-        yield from _Messages.of(reader, path, topic).frames(folder, Wanted(every))
+        yield from _Messages.of(reader, path, topic).frames(folder, FrameSelection(every))
 
 
 def camera_in_bag(path: Path, topic: str | None = None) -> "tuple[CameraFile, str] | None":
@@ -194,7 +194,7 @@ class _Messages:
                 pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))
             yield None if pixels is None else _eight_bits(pixels)
 
-    def frames(self, folder: Path, wanted: Wanted) -> Iterator[Frame]:
+    def frames(self, folder: Path, wanted: FrameSelection) -> Iterator[Frame]:
         """Those that are wanted, written to a folder."""
         for number, (connection, time_ns, data) in enumerate(self.reader.messages(connections=self.connections)):
             if number not in wanted:

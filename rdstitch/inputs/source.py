@@ -102,6 +102,7 @@ class Source:
         usual = self.reduction(WORK_MEGAPIXELS)
         if reduction % usual:
             return self._within_circle(self._load(reduction), reduction)
+        # Frames of videos are files of their own by now, so that the path names the frame too.
         key = (self.path, self.mask, self.flat_field, self.camera.lens_model)
         image = self.decoded_images.take(key) or self._load(usual)
         if keep:

@@ -25,7 +25,7 @@ _MAX_PENDING = 256  # names that are read ahead
 
 
 @dataclass(frozen=True)
-class Arrivals:
+class FrameStream:
     """Iterates over the frames of one source, each once it is complete."""
 
     frames: Iterator[Frame]
@@ -37,7 +37,7 @@ class Arrivals:
         return self.frames
 
 
-def open_arrivals(
+def open_frame_stream(
     source: str | Path,
     *,
     frames_folder: Callable[[], Path],
@@ -45,7 +45,7 @@ def open_arrivals(
     every: int = 1,
     idle: float | None = None,
     topic: str | None = None,
-) -> Arrivals:
+) -> FrameStream:
     """The frames of a folder, a video, a bag, a camera by its index, a stream, or of ``names``, one a line, for "-".
 
     They end with a video or bag, with the list of names, and after ``idle`` seconds without a new one; those of a
@@ -56,16 +56,16 @@ def open_arrivals(
     if name == "-":
         if names is None:
             raise ArgumentError("there is no list of names to follow")
-        return Arrivals(_of_names(names, idle, kept), kept)
+        return FrameStream(_of_names(names, idle, kept), kept)
     if is_bag(path):
-        return Arrivals(images_in_bag(path, frames_folder(), every, topic), [name])
+        return FrameStream(images_in_bag(path, frames_folder(), every, topic), [name])
     if path.is_dir():
         folder = GrowingFolder(path, idle)
-        return Arrivals(folder.frames(), [name], folder.comes_again)
+        return FrameStream(folder.frames(), [name], folder.comes_again)
     if path.suffix.lower() in VIDEO_SUFFIXES and path.exists():
-        return Arrivals(_of_video(path, every), [name])
+        return FrameStream(_of_video(path, every), [name])
     if name.isdecimal() or "://" in name or path.is_char_device():
-        return Arrivals(_of_stream(name, every, idle, frames_folder, kept), kept)
+        return FrameStream(_of_stream(name, every, idle, frames_folder, kept), kept)
     raise InputError(
         f"{name}: cannot be followed; name a folder, a video, the index of a camera or a stream, or - "
         "for names on standard input"
