@@ -212,7 +212,6 @@ class Renderer:
         return locate(self.warps[index], intersection(self.support(part), box) or part).on(part)
 
     def _opacity(self, index: int, geometry: Geometry) -> Float32Array | None:
-        """Opacity of an image that has a mask."""
         if not self.images.masked(index):
             return None
         return sample_opacity(self.images.get(index), geometry)

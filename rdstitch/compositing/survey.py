@@ -102,7 +102,6 @@ def seen_reduction(canvas: Canvas, shrinks: Sequence[float]) -> float:
 
 
 def _survey_tile(reader: ImageReader, enlarged: float, index: int, warp: Warp) -> SurveyTile | None:
-    """One image, small."""
     geometry = locate(warp, warp.box)
     finer = warp.enlarged(enlarged)
     image, larger = reader.prepared_twice(index, warp.shrink, finer.shrink)

@@ -32,11 +32,7 @@ def layer_files(names: Sequence[str], folder: str | Path) -> dict[str, tuple[Pat
 
 @one_native_thread()
 def write_layers(
-    result: OutputImage,
-    folder: str | Path,
-    *,
-    whole: bool = False,
-    overwrite: bool = False,
+    result: OutputImage, folder: str | Path, *, whole: bool = False, overwrite: bool = False
 ) -> list[Path]:
     """Write each image of a result as a layer, and its mask, as TIFF.
 

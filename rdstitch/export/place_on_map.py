@@ -119,7 +119,6 @@ class _MeasuredPlaces:
 def _placed(
     located: Located, views: Views, measured: _MeasuredPlaces, epsg: int | None, force: bool
 ) -> tuple[Georeference | None, str]:
-    """Place the output by some positions."""
     latitude, longitude = np.array([(place.latitude, place.longitude) for place in measured.places]).T
     crs = Crs.nearest(latitude, longitude) if epsg is None else Crs(epsg)
     map_scale = crs.map_scale(*middle(latitude, longitude))

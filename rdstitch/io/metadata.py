@@ -141,7 +141,6 @@ def _tiff_metadata(file: Path, stream: BinaryIO) -> Metadata:
 
 
 def _raw_metadata(file: Path) -> Metadata:
-    """Metadata of a raw file, which is read upright."""
     size = raw_size(file)
     # A small image carries the tags; its focal length is in its own pixels.
     header = Image.new("L", (max(1, size[0] // _HEADER), max(1, size[1] // _HEADER)))

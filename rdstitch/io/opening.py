@@ -219,7 +219,6 @@ def _imported(name: str) -> Factory:
 
 
 def _avif_factory(path: Path) -> Factory:
-    """What opens AVIF: Pillow, since version 11.3."""
     try:
         return _imported("PIL.AvifImagePlugin.AvifImageFile")
     except ImportError:

@@ -140,6 +140,5 @@ def _interpolate(values: HeightMap, x: NDArray[np.float32], y: NDArray[np.float3
 
 
 def _scaled(ground: HeightMap, height: float) -> HeightMap:
-    """Heights from 0 to ``height``."""
     low, high = float(ground.min()), float(ground.max())
     return ((ground - np.float32(low)) * np.float32(height / max(high - low, 1e-12))).astype(np.float32)

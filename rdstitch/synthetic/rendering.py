@@ -123,13 +123,7 @@ class Sequence:
         return [self.frame(index) for index in range(len(self))]
 
     def write(self, folder: str | Path, name: str = "frame_{:04d}.png") -> list[Path]:
-        """Render all images into a folder, one at a time.
-
-        Parameters
-        ----------
-        name : str
-            Format of the file names, with the suffix of the file type.
-        """
+        """Render all images into a folder, one at a time; ``name`` is the format of the file names, with a suffix."""
         paths = []
         for index in range(len(self)):
             path = Path(folder) / name.format(index)

@@ -227,13 +227,11 @@ class Outputs:
         return cls(overwrite) if outputs is None else nullcontext(outputs)
 
     def __enter__(self) -> Self:
-        """Begin; nothing is made before it is needed."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Put everything in its place, or throw it away."""
         try:
             for act in (self._check, self._place) if kind is None else ():
                 for item in self._items:
