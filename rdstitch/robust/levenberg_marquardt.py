@@ -70,11 +70,7 @@ class Problems(Protocol[Equations]):
 
 
 def descend(
-    problems: Problems[Equations],
-    start: FloatArray,
-    iterations: int,
-    *,
-    loose: bool = False,
+    problems: Problems[Equations], start: FloatArray, iterations: int, *, loose: bool = False
 ) -> tuple[FloatArray, Equations]:
     """Where at most so many steps lead to, parameters of shape (B, K), and the equations there.
 

@@ -151,10 +151,7 @@ def focal_prior(log_focal: float, std: float, source: str) -> Prior:
     return Prior(((0.9, log_focal, std), (0.1, math.log(1.5), 0.7)))
 
 
-LENS = (
-    Prior(((0.9, 0.0, 0.04), (0.1, -0.35, 0.12))),
-    *(Prior(((1.0, 0.0, std),)) for std in LENS_STD[1:].tolist()),
-)
+LENS = (Prior(((0.9, 0.0, 0.04), (0.1, -0.35, 0.12))), *(Prior(((1.0, 0.0, std),)) for std in LENS_STD[1:].tolist()))
 """Priors on :data:`rdstitch.geometry.camera.LENS_PARAMETERS`."""
 
 WRONG_GIVEN_FOCAL = 0.02, 0.2
