@@ -1,8 +1,8 @@
 """Whether images are aligned locally, and how: decided by matches that are held out of the fit."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import Literal
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -14,17 +14,15 @@ from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
 from rdstitch.system.dataclasses import dataclass
 
-# Of a grid that finds what is far from the plane, and of the one that is used; and how many nodes the grids of all
-# images together may have: of more than some 70 images the finer one is coarser, of more than 800 both, to bound time
-# and memory.
+# Cells of a grid that finds what is far from the plane, and of the one that is used; nodes of all images together, by
+# which the finer one is coarser for more than some 70 images, and both for more than 800.
 _COARSE, _FINE = (12, 120_000), (24, 40_000)
 _SLOPES = (0.2, 0.06, 0.02)
 _HELD_OUT = 5  # every fifth match
 # Share by which what a person sees must get less for local alignment to be worth while.
 _WORTHWHILE = 0.15
-# What a person sees of seams: edges that do not go on, as far as this percentile of the held-out residuals. What a
-# person sees of fields: straight edges, of a tenth of the diagonal or more, that are bent up to this percentile: a
-# single one is seen.
+# A person sees edges that do not go on across seams, as far as this percentile of the held-out residuals, and straight
+# edges, of a tenth of the diagonal or more, that fields bend up to this percentile: a single one is seen.
 _SEAMS, _BENDS, _EDGE = 75.0, 98.0, 0.1
 _MAX_IMAGES = 24  # whose edges are looked at
 _MIN_MATCHES = 60  # of 60 planes with so many matches and noise, none was bent; with 40, five were
@@ -77,29 +75,13 @@ def align_locally(
     on_sphere: bool = False,
     edges: Callable[[list[int]], Iterable[FloatArray]] = lambda images: [np.empty((0, 2, 2)) for _ in images],
 ) -> LocalAlignment:
-    """Smooth displacement fields that bring matches of overlapping images together.
+    """Smooth displacement fields that bring putative matches of all overlapping images together.
 
-    Parameters
-    ----------
-    matches : iterable of Match
-        Putative matches of all pairs, right and wrong; ``image1`` and ``image2`` count the cameras.
-    homographies : ndarray of shape (N, 3, 3)
-        Undistorted coordinates, in half diagonals, to the plane, or to directions.
-    choice : "auto" or int
-        "auto": only where matches that are held out of the fit come nearer by more than fields bend what is straight,
-        and by 15 % of their distance or more. A number: always, with so many cells along the longer side of an image.
-    pairs : int, optional
-        How many ``matches`` there are, where these come one by one.
-    on_sphere : bool
-        Whether the camera turned on the spot, so that ``homographies`` lead to directions.
-    edges : callable
-        Gives the ends of straight edges in each of some images, (K, 2, 2) measured pixels. It is called once, where
-        fields may be used.
-
-    Raises
-    ------
-    ArgumentError
-        When a number of cells is less than 1.
+    By ``choice`` "auto" only where matches that are held out of the fit come nearer by more than fields bend what is
+    straight, and by 15 % of their distance or more; a number: always, with so many cells along the longer side of an
+    image. ``homographies`` (N, 3, 3) are of undistorted coordinates, in half diagonals, to the plane, or to directions;
+    ``pairs``: how many ``matches`` there are, where these come one by one; ``edges`` gives the ends (K, 2, 2) of
+    straight edges in each of some images, measured pixels.
     """
     if choice != "auto" and choice < 1:
         raise ArgumentError(f"local alignment takes at least one cell, not {choice}")
@@ -116,27 +98,37 @@ def align_locally(
     coarse, fine = (max(2, min(cells, math.isqrt(nodes // len(cameras)))) for cells, nodes in (_COARSE, _FINE))
     cells = max(coarse, fine) if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
-    fitted, tested = placed.take(~held_out), placed.take(held_out)
-    before, off = HeldOut.of(tested.residual), _seen(tested.residual)
-    # The freest on a coarse grid finds what is far from the plane; the others start from there.
-    tried: list[tuple[float, PlacedFields, FloatArray]] = []
-    fields = fit_fields(fitted, images, Stiffness(min(coarse, cells), _SLOPES[0]))
-    for slope in _SLOPES:
-        if fields.stiffness != Stiffness(cells, slope):
-            fields = fit_fields(fitted, images, Stiffness(cells, slope), fields)
-        left = fields.explain(tested)[0]
-        tried.append((_seen(left), fields, left))
-    enough = (1.0 - _WORTHWHILE) * off if choice == "auto" else math.inf
-    if min(seen for seen, *_ in tried) <= enough:
+    tested = placed.take(held_out)
+    candidates = list(_candidates(placed.take(~held_out), tested, images, min(coarse, cells), cells))
+    costs = [_seam_residual(candidate.residual) for candidate in candidates]
+    limit = (1.0 - _WORTHWHILE) * _seam_residual(tested.residual) if choice == "auto" else math.inf
+    if min(costs) <= limit:
         straight = _long_edges(edges, cameras)
-        tried = [(seen + _bend(fields, straight), fields, left) for seen, fields, left in tried]
-    seen, start, left = min(tried, key=lambda one: one[0])
-    after = HeldOut.of(left)
+        costs = [cost + _bend(one.fields, straight) for cost, one in zip(costs, candidates, strict=True)]
+    best = candidates[int(np.argmin(costs))]
+    before, after = HeldOut.of(tested.residual), HeldOut.of(best.residual)
     text = f"matches held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} pixels with it"
-    if seen > enough:
+    if min(costs) > limit:
         return LocalAlignment((), f"not worth while; {text}", 0, before, after)
-    final = fit_fields(placed, images, start.stiffness, start)
-    return LocalAlignment(tuple(map(final.of_image, range(len(cameras)))), text, cells, before, after)
+    final = fit_fields(placed, images, best.fit.stiffness, best.fit)
+    return LocalAlignment(final.delivered, text, cells, before, after)
+
+
+class _Candidate(NamedTuple):
+    fit: PlacedFields
+    fields: tuple[DisplacementField, ...]  # as they would be delivered
+    residual: FloatArray  # (M, D): what these leave of held-out matches, pixels of the median image
+
+
+def _candidates(
+    fitted: PlacedMatches, tested: PlacedMatches, images: ImagesOnSurface, coarse: int, cells: int
+) -> Iterator[_Candidate]:
+    """Fields of each slope; the freest on a coarse grid finds what is far off the plane, the others start there."""
+    fit = fit_fields(fitted, images, Stiffness(coarse, _SLOPES[0]))
+    for slope in _SLOPES:
+        if fit.stiffness != Stiffness(cells, slope):
+            fit = fit_fields(fitted, images, Stiffness(cells, slope), fit)
+        yield _Candidate(fit, fit.delivered, tested.residual_with(fit.delivered, images))
 
 
 def _agreement_of_neighbours(matches: PlacedMatches) -> float:
@@ -150,13 +142,13 @@ def _agreement_of_neighbours(matches: PlacedMatches) -> float:
     return float((residual * residual[matches.neighbours]).sum()) / max(float((residual**2).sum()), 1e-300)
 
 
-def _seen(residual: FloatArray) -> float:
-    """Length of residuals (M, D) as a person sees them along a seam."""
+def _seam_residual(residual: FloatArray) -> float:
+    """How far edges across seams do not go on, as a percentile of the lengths of residuals (M, D)."""
     return float(np.percentile(np.linalg.norm(residual, axis=1), _SEAMS))
 
 
 def _long_edges(edges: Callable[[list[int]], Iterable[FloatArray]], cameras: Sequence[Camera]) -> dict[int, FloatArray]:
-    """Those that a person sees to be straight, of some images."""
+    """Those of some images that are long enough to be seen to be straight."""
     chosen = evenly_spaced(len(cameras), _MAX_IMAGES).tolist()
     return {
         k: ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > _EDGE * 2.0 * cameras[k].scale]
@@ -164,7 +156,7 @@ def _long_edges(edges: Callable[[list[int]], Iterable[FloatArray]], cameras: Seq
     }
 
 
-def _bend(fields: PlacedFields, edges: dict[int, FloatArray]) -> float:
-    """How far fields bend edges, as a person sees it; 0 where there are none."""
-    bent = np.concatenate([fields.of_image(k).bends(ends) for k, ends in edges.items()])
+def _bend(fields: Sequence[DisplacementField], edges: dict[int, FloatArray]) -> float:
+    """How far fields bend the edges of some images, as a high percentile; 0 where there are none."""
+    bent = np.concatenate([fields[k].bends(ends) for k, ends in edges.items()])
     return float(np.percentile(bent, _BENDS)) if len(bent) else 0.0

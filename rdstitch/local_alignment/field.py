@@ -12,13 +12,12 @@ from rdstitch.errors import ArgumentError
 from rdstitch.system.dataclasses import dataclass
 
 _DECIMALS = 3  # pixels; what a sidecar stores is what was used
-# Nodes by which a field goes on as it does at the border, so that a spline, which is level at its end, is so beyond it.
-_APRON = 8
-# Nodes beyond the border up to which it is evaluated: who interpolates across the border would find a kink there, and
-# take many times as many places for it.
-_BEYOND = 4
+_APRON = 8  # nodes by which a field goes on as at the border: a spline is level at its end
+_BEYOND = 4  # nodes beyond the border up to which it is evaluated: interpolating across it would find a kink there
 _EDGE_POINTS = 9  # at which a bent edge is measured
 _PROBES = 4  # of the steepness, along a side of a cell
+_INVERSIONS = 12  # steps of a fixed-point iteration; where the steepness is a half, each halves the error
+_LEVELLINGS = 200  # times that nodes of steep cells near their neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,15 +28,12 @@ class DisplacementField:
     """
 
     image_size: tuple[int, int]  # width and height of the image, pixels
-    # (m, n, 2): displacement, pixels, at nodes spread evenly from the first to the last pixel of each row and column, m
-    # rows of n
-    values: FloatArray
+    values: FloatArray  # (m, n, 2): pixels, at nodes spread evenly from the first to the last pixel, m rows of n
 
     def __post_init__(self) -> None:
-        if self.values.ndim != 3 or self.values.shape[2] != 2 or min(self.values.shape[:2]) < 2:
-            raise ArgumentError(
-                f"a displacement field has shape (m, n, 2), m and n at least 2, not {self.values.shape}"
-            )
+        shape = self.values.shape
+        if len(shape) != 3 or shape[2] != 2 or min(shape[:2]) < 2:
+            raise ArgumentError(f"a displacement field has shape (m, n, 2), m and n at least 2, not {shape}")
         if not np.isfinite(self.values).all():
             raise ArgumentError("displacements must be finite")
 
@@ -48,7 +44,9 @@ class DisplacementField:
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Displacement (..., 2) at measured pixels (..., 2), also beside the image; far out as there, 0 at NaN."""
-        place = self._grid_coordinates(points) + _APRON
+        last = np.array([self.values.shape[1] - 1, self.values.shape[0] - 1])
+        place = np.nan_to_num(np.asarray(points, dtype=np.float64) * (last / _extent(self.image_size)))
+        place = np.clip(place, -_BEYOND, last + _BEYOND) + _APRON
         cell = place.astype(np.intp)
         across, down = np.moveaxis(_cubic_weights(place - cell), -2, 0)
         weights = (down[..., :, None] * across[..., None, :]).reshape(*cell.shape[:-1], 16)
@@ -56,7 +54,14 @@ class DisplacementField:
         patches = np.lib.stride_tricks.sliding_window_view(self._coefficients, (4, 4), axis=(0, 1))
         patches = patches.reshape(*patches.shape[:3], 16)
         moved = np.einsum("...ck,...k->...c", patches[cell[..., 1] - 1, cell[..., 0] - 1], weights)
-        return np.asarray(moved, dtype=np.float64)
+        return np.where(np.isnan(points).any(axis=-1, keepdims=True), 0.0, moved)
+
+    def expected(self, points: FloatArray) -> FloatArray:
+        """Where the alignment expects what is at measured pixels (..., 2), for a field that folds nothing."""
+        expected = points
+        for _ in range(_INVERSIONS):
+            expected = points - self(expected)
+        return expected
 
     def resized(self, image_size: tuple[int, int]) -> "DisplacementField":
         """The same for an image of another size that shows the same."""
@@ -68,16 +73,39 @@ class DisplacementField:
         """Length of the largest displacement of a node, pixels."""
         return float(np.linalg.norm(self.values, axis=-1).max())
 
-    @cached_property
+    @property
     def steepest(self) -> float:
         """Largest change of the displacement per pixel in any direction; below 1 the image does not fold."""
+        return float(self._steepness.max())
+
+    def levelled(self, steepest: float) -> "DisplacementField":
+        """The same with changes of at most ``steepest`` per pixel: nodes of steeper cells near their neighbours.
+
+        Only a field that is too steep nearly everywhere becomes smaller everywhere.
+        """
+        field = self
+        for _ in range(_LEVELLINGS):
+            steep = np.pad(field._steepness > steepest, 1)
+            if not steep.any():
+                return field
+            chosen = (steep[:-1, :-1] | steep[:-1, 1:] | steep[1:, :-1] | steep[1:, 1:])[..., None]
+            near = np.pad(field.values, ((1, 1), (1, 1), (0, 0)), mode="edge")
+            mean = (near[:-2, 1:-1] + near[2:, 1:-1] + near[1:-1, :-2] + near[1:-1, 2:]) / 4.0
+            field = DisplacementField(self.image_size, np.where(chosen, (field.values + mean) / 2.0, field.values))
+        return DisplacementField(self.image_size, field.values * min(1.0, steepest / field.steepest))
+
+    @cached_property
+    def _steepness(self) -> FloatArray:
+        """Largest change of the displacement per pixel in any direction, of each cell (m - 1, n - 1)."""
         down, across = (_evaluation(n) for n in self.values.shape[:2])
         # Rows, then columns: (2, rows, columns).
         moved = down @ np.moveaxis(self.values, -1, 0) @ across.T
         spacing = _extent(self.image_size) / (moved.shape[2] - 1, moved.shape[1] - 1)
         (a, c), (b, d) = np.diff(moved, axis=2)[:, :-1] / spacing[0], np.diff(moved, axis=1)[:, :, :-1] / spacing[1]
         # The larger singular value of each matrix of two rows and columns.
-        return float((np.hypot(a + d, c - b) + np.hypot(a - d, c + b)).max()) / 2.0
+        steepness = (np.hypot(a + d, c - b) + np.hypot(a - d, c + b)) / 2.0
+        rows, columns = self.values.shape[0] - 1, self.values.shape[1] - 1
+        return np.asarray(steepness.reshape(rows, _PROBES, columns, _PROBES).max(axis=(1, 3)))
 
     def bends(self, edges: FloatArray) -> FloatArray:
         """How far straight edges with such ends (K, 2, 2) are bent, measured pixels (K,)."""
@@ -93,12 +121,6 @@ class DisplacementField:
         """Of the B-spline, with the apron around, (rows, columns, 2)."""
         down, across = (_prefilter(n) for n in self.values.shape[:2])
         return np.moveaxis(down @ np.moveaxis(self.values, -1, 0) @ across.T, 0, -1)
-
-    def _grid_coordinates(self, points: FloatArray) -> FloatArray:
-        """Column and row (..., 2) in units of the grid, within it or not far from it."""
-        last = np.array([self.values.shape[1] - 1, self.values.shape[0] - 1])
-        place = np.asarray(points, dtype=np.float64) * (last / _extent(self.image_size))
-        return np.clip(np.nan_to_num(place), -_BEYOND, last + _BEYOND)
 
 
 def _extent(image_size: tuple[int, int]) -> FloatArray:

@@ -4,11 +4,12 @@ A match of the images i and j that the alignment puts ``r`` apart is explained b
 ``d_i(e_i) - d_j(e_j)``, where ``e`` is the pixel at which the alignment expects what is at the measured one: fields say
 for each place of the output where its content is, so ``e`` is found anew from round to round. Fields rise and bend
 little, and vanish where nothing supports them; that alone fixes what the matches leave open, a displacement of all
-images together, at zero. All coordinates have the same normal equations.
+images together, at zero. All coordinates have the same normal equations. Between nodes the fit is bilinear, which
+keeps its equations sparse; the field that is delivered, and judged, is a spline through the same nodes.
 """
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -27,21 +28,15 @@ from rdstitch.system.late_imports import sparse, sparse_linalg
 # many rounds at the end.
 _ROBUST, _MIN_SCALE = 2.0, 0.3
 _WIDEST, _SHARPENED, _SHARP_ROUNDS = 95.0, 0.5, 2
-# A field vanishes over about this share of an image where nothing supports it.
-_FADE = 0.2
-# Fixed-point iterations from where an image shows something to where the alignment expects it; each leaves the
-# gradient's share of the error.
-_STEPS = 4
-# Limit of the displacement's change per pixel: half of what would fold an image.
-_MAX_GRADIENT = 0.5
+_FADE = 0.2  # share of an image over which a field vanishes where nothing supports it
+_STEPS = 4  # of a fixed-point iteration to where the alignment expects something; each leaves the gradient's share
+_MAX_GRADIENT = 0.5  # change of the displacement per pixel: half of what would fold an image
 # Nodes of all images up to which equations are factorized as they are, cells of a grid from which on there is a coarser
 # one, and the residual of the equations that is left, as a share of their right side: a thousandth of a pixel.
 _FACTORIZED, _MIN_HALVED, _TOLERANCE = 5000, 8, 1e-6
-# A residual leads from the second image to the first.
-_SIGNS = np.array([1.0, -1.0])
+_SIGNS = np.array([1.0, -1.0])  # a residual leads from the second image to the first
 
-Shapes = tuple[tuple[int, int], ...]
-"""Rows and columns of the grid of each image."""
+Shapes = tuple[tuple[int, int], ...]  # rows and columns of the grid of each image
 
 
 @dataclass(frozen=True)
@@ -61,7 +56,7 @@ class PlacedFields:
     shapes: Shapes  # rows and columns of nodes of each image
     values: tuple[FloatArray, ...]  # (m n, D): pixels of the median image
 
-    def explain(self, matches: PlacedMatches) -> tuple[FloatArray, FloatArray]:
+    def unexplained(self, matches: PlacedMatches) -> tuple[FloatArray, FloatArray]:
         """What they leave over at matches, (M, D), and pixels (2 M, 2) where the alignment expects these."""
         values, expected = np.concatenate(self.values), matches.points.reshape(-1, 2)
         for _ in range(_STEPS):
@@ -69,17 +64,19 @@ class PlacedFields:
             expected = _expected(matches, self.images, design, values)
         return matches.residual - design @ values, expected
 
-    def of_image(self, k: int) -> DisplacementField:
-        """The displacement in measured pixels of an image, limited so that nothing folds."""
+    @cached_property
+    def delivered(self) -> tuple[DisplacementField, ...]:
+        """What each image is displaced by in the output."""
+        return tuple(map(self._of_image, range(len(self.shapes))))
+
+    def _of_image(self, k: int) -> DisplacementField:
+        """The displacement in measured pixels of an image, levelled where it is so steep that it might fold."""
         size = self.images.cameras[k].image_size
         points = node_points(size, self.shapes[k])
         with np.errstate(invalid="ignore"):
             shown = self.images.from_surface(k, self.images.to_surface(k, points) + self.values[k])
         displaced = np.where(np.isfinite(shown), shown - points, 0.0).reshape(*self.shapes[k], 2)
-        field = DisplacementField.of(size, displaced)
-        if field.steepest <= _MAX_GRADIENT:
-            return field
-        return DisplacementField.of(size, field.values * (_MAX_GRADIENT / field.steepest))
+        return DisplacementField.of(size, DisplacementField(size, displaced).levelled(_MAX_GRADIENT).values)
 
 
 def fit_fields(
@@ -99,7 +96,7 @@ def fit_fields(
         left, expected = matches.residual, matches.points.reshape(-1, 2)
         scale = float(np.percentile(np.linalg.norm(left, axis=1), _WIDEST))
     else:
-        left, expected, scale = *start.explain(matches), 0.0
+        left, expected, scale = *start.unexplained(matches), 0.0
     sharp = 0 if start is None else 1
     while sharp < _SHARP_ROUNDS:
         length = np.linalg.norm(left, axis=1)

@@ -12,11 +12,11 @@ from rdstitch.arrays import FloatArray, Rows
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
+from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.system.dataclasses import dataclass, replace
 
-# Matches that the alignment expects farther away than this share of the image's diagonal are taken to be wrong; where
-# the ground rises by a tenth of the camera's height, and the alignment is that of the valleys, right ones are nearly as
-# far apart.
+# Share of the image's diagonal: matches farther off are taken to be wrong. Where the ground rises by a tenth of the
+# camera's height, and the alignment is that of the valleys, right ones are nearly as far off.
 _SEARCH_RADIUS = 0.15
 _MIN_MATCHES = 8
 
@@ -93,6 +93,14 @@ class PlacedMatches(Rows):
     def residual(self) -> FloatArray:
         """From where the second image puts them to where the first does, (M, D)."""
         return np.asarray(self.places[:, 0] - self.places[:, 1])
+
+    def residual_with(self, fields: Sequence[DisplacementField], images: ImagesOnSurface) -> FloatArray:
+        """The same between images displaced by their fields; as it is where one of them shows no such place."""
+        points, places = self.points.reshape(-1, 2), self.places.reshape(2 * len(self), -1).copy()
+        for k, chosen in self.of_image:
+            places[chosen] = images.to_surface(k, fields[k].expected(points[chosen]))
+        first, second = np.moveaxis(places.reshape(self.places.shape), 1, 0)
+        return np.where(np.isfinite(first + second), first - second, self.residual)
 
     @cached_property
     def of_image(self) -> tuple[tuple[int, NDArray[np.intp]], ...]:

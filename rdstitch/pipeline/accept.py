@@ -62,7 +62,7 @@ def accept(registration: Registration, run: Run) -> Registration:
         return _Checked(candidate, judge(evidence))
 
     first = last = check(registration)
-    repairs = iter(()) if options.force else _repairs(first, check, undamaged, aligner)
+    repairs = iter(()) if options.force else _repairs(first, check, undamaged, aligner, options.threads)
     for last in chain([first], repairs):
         if not last.failures:
             break
@@ -76,13 +76,17 @@ def accept(registration: Registration, run: Run) -> Registration:
 
 
 def _repairs(
-    first: _Checked, check: Callable[[Registration], _Checked], undamaged: Registration | None, aligner: Aligner
+    first: _Checked,
+    check: Callable[[Registration], _Checked],
+    undamaged: Registration | None,
+    aligner: Aligner,
+    threads: int,
 ) -> Iterator[_Checked]:
     """What may pass where ``first`` fails: without damaged files, the plane of most images, without what fails."""
     if undamaged is not None and not (checked := check(undamaged)).failures:
         yield checked
     start = first
-    plane = None if aligner.options.purpose.lens_only else plane_of_most(first.registration, aligner)
+    plane = None if aligner.options.purpose.lens_only else plane_of_most(first.registration, aligner, threads)
     if plane is not None and not (checked := check(plane)).fails_as_whole:
         yield (start := checked)
     current, offenders = start, dict[tuple[int, ...], Message]()
@@ -148,7 +152,7 @@ def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
 
 def scale_uncertainty(alignment: Alignment) -> list[Message]:
     """A warning where the focal length, and with it the length of every step, is hardly known."""
-    if not alignment.length_std > Limits.length_std.value:
+    if not alignment.length_std > Limits.max_length_std.value:
         return []
     off = f"all lengths may be off together by {alignment.length_std:.0%}"
     text = f"{off}: the images hardly show the focal length; give --focal"

@@ -117,7 +117,7 @@ def _plane_behind(
     registration: Registration, first: LaidOut | LimitError, trials: _Trials, aligner: Aligner
 ) -> tuple[Registration, LaidOut | LimitError]:
     """The plane behind what moves of its own, with its layout, where its images look more alike; else what is given."""
-    plane = plane_of_most(registration, aligner)
+    plane = plane_of_most(registration, aligner, trials.options.threads)
     if plane is None or not _joins(plane, registration, aligner.threshold):
         return registration, first
     behind = trials.attempt(plane)

@@ -86,6 +86,7 @@ def detect_batch(
     sources: Sequence[Source], *, options: FeatureOptions, store: Cache
 ) -> list[StoredFeatures | InputError]:
     """The features of each image, or why it cannot be read."""
+    reuse_freed_memory()  # also in a worker, whose later tasks return it
     detected: list[StoredFeatures | InputError] = []
     for source in sources:
         try:
@@ -128,7 +129,6 @@ def detect_by_contrast(
     progress: Progress,
 ) -> DetectedFeatures:
     """Detect the features of all images, if necessary once more; see :func:`detect_features`."""
-    reuse_freed_memory()
     detect = partial(detect_features, executor=executor, store=store, guard=guard, skip_bad=skip_bad, progress=progress)
     stretch_of = partial(_stretch_of, options=options, executor=executor, store=store, guard=guard)
     depths = {source.metadata.bit_depth > 8 for source in sources}

@@ -42,11 +42,11 @@ def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Al
         return None
 
 
-def plane_of_most(registration: Registration, aligner: Aligner) -> Registration | None:
+def plane_of_most(registration: Registration, aligner: Aligner, threads: int) -> Registration | None:
     """Of two motions in the images that which may fill most of them; None where that is not to be seen."""
     if registration.static_background:
         return None
-    pairs = planes_of_pairs(registration, aligner.threshold)
+    pairs = planes_of_pairs(registration, aligner.threshold, threads)
     if pairs is None:
         return None
     plane = _with_pairs(registration, pairs, aligner)

@@ -33,7 +33,7 @@ from rdstitch.results.messages import Message, left_out
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.stage.axes import with_axes_shown
-from rdstitch.stage.correlation import coarse_tile
+from rdstitch.stage.coarse_tile import coarse_tile
 from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.pair_candidates import SearchPlan

@@ -21,10 +21,11 @@ _GENEROUS = 20.0  # widths of the robust loss in the first round; it is halved u
 _WIDTH = 4.0  # standard deviations at which a link counts a quarter: Geman and McClure's loss
 _MEDIAN = 1.386  # median of the sum of two squared standard normal numbers
 _PAIR_STD = 0.03  # standard deviation of an error that all blocks of a pair share, pixels, before it is estimated
+_AGREEING_WEIGHT = 0.1  # of a block from which on the noise is also by it
 _MIN_NOISE = 0.1  # of the variances that blocks are said to have
 _SAMPLES = 16  # draws from the posterior, to estimate the variances of the stage
 _RESULT_SAMPLES = 64  # draws in the result, so that every ± that is made of them is itself known to 9 %
-_HOLDS = 0.25  # weight of a block from which on it holds its tiles
+HOLDING_WEIGHT = 0.25  # of a block, or a pair, from which on it holds its tiles
 _TAILS = 4.0  # degrees of freedom of the places about the stage's model: a few tiles may be far off
 _MIN_LINES = 4  # rows or columns whose errors show what rows or columns are off
 
@@ -36,11 +37,9 @@ class StageModel:
     matrix: FloatArray  # (2, 2): from pixels of the nominal places to pixels of the camera
     rows: FloatArray  # rows, columns: (R, 2) and (C, 2): what each line is off as a whole, pixels
     columns: FloatArray
-    # row_std, column_std: standard deviations of those, where enough rows or columns show them; std: of what is left of
-    # each tile
-    row_std: float | None
+    row_std: float | None  # row_std, column_std: standard deviations of those, where enough lines show them
     column_std: float | None
-    std: float
+    std: float  # of what is left of each tile
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +47,8 @@ class Adjustment:
     """All places."""
 
     places: FloatArray  # (N, 2): of the undistorted tiles, pixels
-    # distortion, distortion_std: λ in the half-diagonal frame, and its standard deviation; inf where nothing shows it,
-    # 0 where it was given
-    distortion: float
-    distortion_std: float
+    distortion: float  # λ in the half-diagonal frame
+    distortion_std: float  # inf where nothing shows it
     weights: FloatArray  # (P,): of each pair, 0 for one that contradicts the others, 1 for one that agrees
     residuals: FloatArray  # (M, 2): undistorted pixels
     squared: FloatArray  # (M,): squared errors of the blocks, in variances by their information
@@ -80,7 +77,7 @@ class Adjustment:
 def adjust(
     grid: TileGrid, links: LinkedPoints, stage_std: float, distortion: float = 0.0, *, free_lens: bool = False
 ) -> Adjustment:
-    """Adjust all places; to begin with a tile may be ``stage_std`` pixels off."""
+    """Adjust all places by λ, held unless the lens is free; at first a tile may be ``stage_std`` pixels off."""
     equations = StageEquations(grid, links, free_lens=free_lens)
     state = equations.start(distortion)
     usual = Variances(stage_std**2, stage_std**2, stage_std**2, _PAIR_STD**2)
@@ -90,30 +87,36 @@ def adjust(
     for _ in range(_ROUNDS):
         state, draws = equations.solve(state, weights, noise, variances, _SAMPLES)
         variances = _variances(equations, state, draws, weights, usual)
-        squared = equations.squared(state)
-        agreeing, of_blocks = weights > 0.1, equations.squared(state, of_blocks=True)
-        noise, excess = (
-            max(float(np.median(values[agreeing])) / _MEDIAN if agreeing.any() else 1.0, least)
-            for values, least in ((of_blocks, _MIN_NOISE), (squared, 1.0))
-        )
         width = max(width / 2.0, 1.0)
-        scale = excess * (width * _WIDTH) ** 2
-        pair_weights = 1.0 / (1.0 + links.medians(squared) / scale) ** 2
-        weights = pair_weights[links.pair] / (1.0 + squared / scale) ** 2
+        weights, pair_weights, noise = _reweighted(equations, state, weights, width)
     _, draws = equations.solve(state, weights, noise, variances, _RESULT_SAMPLES)
-    known = 0.0 if distortion != 0.0 else math.inf
     return Adjustment(
-        state[equations.place_slice].reshape(-1, 2) + equations.middle,
-        float(state[-1]),
-        float(draws[:, -1].std()) if free_lens else known,
-        pair_weights,
-        equations.errors(state)[0],
-        equations.squared(state),
-        noise,
-        _stage_model(equations, state, variances),
-        equations.off_stage(state),
-        draws[:, equations.place_slice].reshape(len(draws), -1, 2),
+        places=state[equations.place_slice].reshape(-1, 2) + equations.middle,
+        distortion=float(state[-1]),
+        distortion_std=float(draws[:, -1].std()) if free_lens else math.inf,
+        weights=pair_weights,
+        residuals=equations.errors(state)[0],
+        squared=equations.squared(state),
+        noise=noise,
+        stage=_stage_model(equations, state, variances),
+        off_stage=equations.off_stage(state),
+        deviations=draws[:, equations.place_slice].reshape(len(draws), -1, 2),
     )
+
+
+def _reweighted(
+    equations: StageEquations, state: FloatArray, weights: FloatArray, width: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Weights of blocks and of pairs by a loss of a width, and the noise of the blocks that agreed by the weights."""
+    squared, of_blocks = equations.squared(state), equations.squared(state, of_blocks=True)
+    agreeing = weights > _AGREEING_WEIGHT
+    noise, excess = (
+        max(float(np.median(values[agreeing])) / _MEDIAN if agreeing.any() else 1.0, least)
+        for values, least in ((of_blocks, _MIN_NOISE), (squared, 1.0))
+    )
+    scale = excess * (width * _WIDTH) ** 2
+    pair_weights = 1.0 / (1.0 + equations.links.medians(squared) / scale) ** 2
+    return pair_weights[equations.links.pair] / (1.0 + squared / scale) ** 2, pair_weights, noise
 
 
 def _variances(
@@ -123,7 +126,7 @@ def _variances(
 
     The fewer they are, the more counts what is usual.
     """
-    agreeing = weights > _HOLDS
+    agreeing = weights > HOLDING_WEIGHT
 
     def squared(values: FloatArray, spread: FloatArray, shown: IntArray) -> FloatArray:
         """Expected squares of vectors (K, 2), of which ``spread`` (S, K, 2) are draws of the errors."""

@@ -7,14 +7,13 @@ from itertools import product
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.stage.correlation import CoarseTile, wide_peaks
-from rdstitch.stage.evidence_limits import HUNDRED_TO_ONE, MIN_AXES_EVIDENCE
+from rdstitch.stage.coarse_tile import CoarseTile
+from rdstitch.stage.evidence import HUNDRED_TO_ONE, MIN_AXES_EVIDENCE, wide_peaks
 from rdstitch.stage.grid import TileGrid
 from rdstitch.system.dataclasses import dataclass, replace
 
 _TRIED, _ENOUGH = 48, 8  # pairs of an axis that are compared at most, and those with evidence that are enough
-# factor of evidence that other axes must have: of two where one is right, the pairs along it agree in both
-_MIN_RATIO = 1.2
+_MIN_RATIO = 1.2  # of evidence for other axes to that as told: where one is right its pairs agree in both
 _ACROSS = 2.0  # times as far as along a step neighbours may be off across it
 _MAX_SKEW = 0.1  # radians that the two axes may be off it
 _SIMILAR = 0.2  # share by which the steps of pairs may differ to be compared with each other

@@ -7,20 +7,19 @@ from typing import NamedTuple
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.stage.adjustment import Adjustment, adjust
-from rdstitch.stage.evidence_limits import ANYWHERE, HUNDRED_TO_ONE
+from rdstitch.stage.adjustment import HOLDING_WEIGHT, Adjustment, adjust
+from rdstitch.stage.evidence import ANYWHERE, HUNDRED_TO_ONE
 from rdstitch.stage.linked_points import LinkedPoints
 from rdstitch.stage.pair_candidates import Candidates, SearchPlan
 from rdstitch.stage.refinement import BlockMatches
 
 _ROUNDS = 4  # by which what is certain of the stage decides about what was not
-AGREES = 0.25  # weight of a pair from which on it holds its tiles
 
 
 def choose_places(
     pairs: IntArray, candidates: Sequence[Candidates], plan: SearchPlan, lens: float
-) -> tuple[dict[int, FloatArray], Adjustment]:
-    """Where the second tile of a pair is in the first, by pair, where one place stands out; and all places by that.
+) -> dict[int, FloatArray]:
+    """Where the second tile of a pair is in the first, by pair, where one place stands out.
 
     What is certain teaches what the stage does, and that decides among the places of the other pairs.
     """
@@ -28,7 +27,7 @@ def choose_places(
     fitted = adjust(plan.grid, LinkedPoints.of(pairs, {}), plan.stage_std, lens)
     for count in range(_ROUNDS):
         before = dict(chosen)
-        doubted = {number for number, weight in zip(chosen, fitted.weights, strict=True) if weight < AGREES}
+        doubted = {number for number, weight in zip(chosen, fitted.weights, strict=True) if weight < HOLDING_WEIGHT}
         for number, of_pair in enumerate(candidates):
             if not len(of_pair.nats) or (number in chosen and number not in doubted):
                 continue
@@ -42,7 +41,7 @@ def choose_places(
         if count > 0 and {k: v.tolist() for k, v in chosen.items()} == {k: v.tolist() for k, v in before.items()}:
             break
         fitted = adjust(plan.grid, _coarse_links(pairs, chosen, plan), plan.stage_std, lens)
-    return chosen, fitted
+    return chosen
 
 
 def _most_likely(

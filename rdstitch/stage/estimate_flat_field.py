@@ -55,7 +55,7 @@ class _Statistics:
             factor = max(1, round(max(tile.shape[:2]) / _SIDE))
             small = block_mean(tile, factor).reshape(-(-tile.shape[0] // factor), -(-tile.shape[1] // factor), -1)
             ground.append(np.median(_cells(small.astype(np.float32)), axis=-1))
-            mean, noise = _noise(tile.reshape(*tile.shape[:2], -1))
+            mean, noise = _noise_of_ground(tile.reshape(*tile.shape[:2], -1))
             light.append(mean)
             variance.append(noise)
             largest = max(largest, float(tile.max()))
@@ -77,7 +77,7 @@ def _cell_grid(side: int) -> tuple[int, int]:
     return side // pixels, pixels
 
 
-def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+def _noise_of_ground(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of the noise of the ground in each cell of a tile (h, w, C), by second differences in rows.
 
     The ground is the half of the samples next to which, in the rows between, the light is nearest to its median: noise
@@ -158,10 +158,8 @@ def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Il
 
 def _sure_dark_level(light: FloatArray, variance: FloatArray) -> tuple[float, float]:
     """D of a channel and its standard deviation, by parts of the tiles; 0 and 0 where they do not show it."""
-    dark, parts = (
-        _dark_level(light, variance),
-        [_dark_level(light[k::_PARTS], variance[k::_PARTS]) for k in range(_PARTS)],
-    )
+    dark = _dark_level(light, variance)
+    parts = [_dark_level(light[k::_PARTS], variance[k::_PARTS]) for k in range(_PARTS)]
     error = float(np.std(parts, ddof=1)) / math.sqrt(_PARTS)
     return (dark, error) if all(parts) and dark >= _KNOWN * error else (0.0, 0.0)
 
@@ -177,10 +175,7 @@ def agrees_with_overlaps(field: FlatField, overlaps: Iterable[tuple[NDArray[Any]
         (h1, w1), (h2, w2) = first.shape[:2], second.shape[:2]
         here = np.s_[max(0, y) : min(h1, y + h2), max(0, x) : min(w1, x + w2)]
         there = np.s_[max(0, -y) : min(h2, h1 - y), max(0, -x) : min(w2, w1 - x)]
-        parts = [
-            tile[cut].reshape(*tile[cut].shape[:2], -1) - field.dark[0, 0]
-            for tile, cut in ((first, here), (second, there))
-        ]
+        parts = [np.atleast_3d(part) - field.dark[0, 0] for part in (first[here], second[there])]
         height, width = parts[0].shape[:2]
         for rows in np.array_split(np.arange(height), max(1, round(height / h1 * _CELLS))):
             for columns in np.array_split(np.arange(width), max(1, round(width / w1 * _CELLS))):
@@ -224,10 +219,8 @@ def _fitted(light: FloatArray) -> FloatArray:
     logarithm = np.log(np.maximum(light, max(1e-3 * float(np.median(light)), 1e-9)))
     values = [np.median(np.diff(logarithm, axis=axis), axis=0).ravel() for axis in (1, 2)]
     x, y = np.meshgrid(_middles(light.shape[2]), _middles(light.shape[1]))
-    columns = [x**i * y**k for i, k in _powers()]
-    matrix = np.stack(
-        [np.concatenate([np.diff(c, axis=0).ravel(), np.diff(c, axis=1).ravel()]) for c in columns], axis=1
-    )
+    powers = np.array([x**i * y**k for i, k in _powers()])
+    matrix = np.hstack([np.diff(powers, axis=axis).reshape(len(powers), -1) for axis in (1, 2)]).T
     right = np.concatenate(values)
     weights = np.ones(len(right))
     for _ in range(5):

@@ -46,7 +46,10 @@ class TileGrid:
         return _lines(self.places[:, 0], _SAME_LINE * self.size[0])
 
     def neighbours(self, reach: float) -> NDArray[np.intp]:
-        """Pairs of tiles that overlap along a good part of a side, or come so near that they may, (M, 2)."""
+        """Pairs of tiles that overlap along a good part of a side, or come so near that they may, (M, 2).
+
+        They follow one another along the grid, whatever the order of the tiles: few tiles are needed at a time.
+        """
         sizes = self.sizes.astype(np.float64)
         order = np.argsort(self.places[:, 1], kind="stable")
         y = self.places[order, 1]
@@ -59,7 +62,9 @@ class TileGrid:
             common, least = high - low, np.minimum(sizes[others], sizes[first]).min(axis=1)
             near = (common > -reach / 2).all(axis=1) & (common.max(axis=1) > _MIN_OVERLAP * least)
             pairs += [(min(first, k), max(first, k)) for k in others[near].tolist()]
-        return np.array(sorted(pairs), dtype=np.intp).reshape(-1, 2)
+        rank = np.empty(len(self), dtype=np.intp)
+        rank[np.lexsort([self.places[:, 0], self.columns, self.rows])] = np.arange(len(self))
+        return np.array(sorted(pairs, key=lambda pair: sorted(rank[[*pair]])), dtype=np.intp).reshape(-1, 2)
 
 
 def _lines(values: FloatArray, tolerance: float) -> IntArray:

@@ -9,19 +9,13 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.parabola import parabola_peak
 from rdstitch.robust.loss import normal_std
-from rdstitch.stage.correlation import (
-    CoarseTile,
-    Overlap,
-    coarse_tile,
-    correlate,
-    log_evidence,
-    peak_threshold,
-    peaks,
-    wide_peaks,
-)
-from rdstitch.stage.evidence_limits import HUNDRED_TO_ONE, WRONG_PEAK
+from rdstitch.stage.coarse_tile import CoarseTile, coarse_tile
+from rdstitch.stage.evidence import HUNDRED_TO_ONE, WRONG_PEAK, log_evidence, wide_peaks
 from rdstitch.stage.grid import TileGrid
+from rdstitch.stage.overlap import Overlap
+from rdstitch.stage.phase_correlation import Surfaces, correlate, peak_threshold, peaks
 from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.progress import Progress
 
@@ -102,43 +96,43 @@ class PairFinder:
 
     def candidates(self, read: Reader, known: float | None, progress: Progress) -> tuple[list[Candidates], float]:
         """Candidates of all pairs, and the λ by which they were found; where that is unknown, twice if need be."""
-        heights = np.zeros((2, len(_LENSES)))
-        lens = known or 0.0
-        found = self._each(read, lens, progress, heights if known is None and self.grid.own_sizes is None else None)
-        middle = len(_LENSES) // 2
-        best = int(heights.sum(axis=0).argmax())
+        lens, scans = known or 0.0, known is None and self.grid.own_sizes is None
+        found, heights = self._each(read, lens, progress, scans=scans)
+        middle, best = len(_LENSES) // 2, int(heights.sum(axis=0).argmax())
         if best != middle and (heights[:, best] > heights[:, middle]).all():
             lens = float(_LENSES[best])
-            found = self._each(read, lens, progress, None)
+            found, _ = self._each(read, lens, progress, scans=False)
         return found, lens
 
-    def _each(self, read: Reader, lens: float, progress: Progress, heights: FloatArray | None) -> list[Candidates]:
+    def _each(
+        self, read: Reader, lens: float, progress: Progress, *, scans: bool
+    ) -> tuple[list[Candidates], FloatArray]:
+        """Candidates of all pairs for a λ; of the lenses, the sums of peaks (2, L) along rows and along columns."""
+        camera, heights = self.coarse.with_coefficients(lens), np.zeros((2, len(_LENSES)))
         found = []
         pairs = in_pairs(lambda index: coarse_tile(read(index), self.factor), self.pairs)
         for number, tiles in enumerate(pairs):
-            found.append(self._of_pair(number, tiles, self.coarse.with_coefficients(lens), heights))
+            overlap = self.overlap(number)
+            surfaces = correlate(tiles[0].pixels, tiles[1].pixels, overlap, self.radius + self.spare)
+            if scans:
+                heights[int(np.abs(overlap.offset).argmax())] += self._heights(surfaces, overlap)
+            found.append(self._of_pair(number, tiles, surfaces, camera))
             progress("correlating", number + 1, len(self.pairs))
-        return found
+        return found, heights
+
+    def _heights(self, surfaces: Surfaces, overlap: Overlap) -> FloatArray:
+        """The highest peak of a pair by each of the lenses (L,); 0 where all of them are noise."""
+        lenses = [self.coarse.with_coefficients(lens) for lens in _LENSES]
+        totals = np.array([surfaces.total(_shifts(overlap, lens), self.radius) for lens in lenses])
+        heights = totals.max(axis=(1, 2))
+        return np.asarray(heights * (heights.max() > _threshold(totals[len(_LENSES) // 2], self.radius)))
 
     def _of_pair(
-        self, number: int, tiles: tuple[CoarseTile, CoarseTile], lens: Camera, heights: FloatArray | None
+        self, number: int, tiles: tuple[CoarseTile, CoarseTile], surfaces: Surfaces, lens: Camera
     ) -> Candidates:
-        overlap = self.overlap(number)
-        surface = correlate(tiles[0].pixels, tiles[1].pixels, overlap, self.radius + self.spare)
-        total = surface.total(_shifts(overlap, lens), self.radius)
-        if heights is not None:
-            tops = [
-                surface.total(_shifts(overlap, self.coarse.with_coefficients(v)), self.radius).max() for v in _LENSES
-            ]
-            if max(tops) > _threshold(total, self.radius):
-                heights[int(np.abs(overlap.offset).argmax())] += tops
-        inner = slice(self.spare, self.spare + 2 * self.radius + 1)
-        plain = surface.plain[inner, inner].astype(np.float64)
-        likely = [_vertex(total, *at) for at in peaks(total, _threshold(total, _NARROW), _CANDIDATES)]
-        # Of a repeated pattern all places are alike, whichever of them a whitened correlation makes higher.
-        others = [_vertex(plain, *at) for at in peaks(plain, 0.0, _CANDIDATES)]
-        grain = min(tile.grain for tile in tiles)
-        others = [at for at in others if all(np.abs(at - other).max() > grain for other in likely)]
+        """Peaks of the correlation by their evidence; of any place in the tiles where none of them has much."""
+        overlap, grain = self.overlap(number), min(tile.grain for tile in tiles)
+        likely, others = self._peaks(surfaces, _shifts(overlap, lens), grain)
         offsets: list[FloatArray] = []
         nats: list[float] = []
         for at in (*likely, *others):
@@ -153,15 +147,23 @@ class PairFinder:
             offsets, nats = [*offsets, *places], [*nats, *values.tolist()]
         return Candidates(self.factor * np.array(offsets).reshape(-1, 2), np.array(nats), self.factor * grain)
 
+    def _peaks(self, surfaces: Surfaces, shifts: FloatArray, grain: float) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Places (2,) in the window of the peaks of the whitened correlation, and of other ones of the plain one."""
+        total, inner = surfaces.total(shifts, self.radius), slice(self.spare, self.spare + 2 * self.radius + 1)
+        plain = surfaces.plain[inner, inner].astype(np.float64)
+        likely = [_vertex(total, *at) for at in peaks(total, _threshold(total, _NARROW), _CANDIDATES)]
+        # Of a repeated pattern all places are alike, whichever of them a whitened correlation makes higher.
+        others = [_vertex(plain, *at) for at in peaks(plain, 0.0, _CANDIDATES)]
+        return likely, [at for at in others if all(np.abs(at - other).max() > grain for other in likely)]
+
 
 def _vertex(surface: FloatArray, x: int, y: int) -> FloatArray:
-    """Place of a peak to a fraction of a pixel, by a parabola through its neighbours along each axis."""
-    place = np.array([x, y], dtype=np.float64)
-    for axis, (line, k) in enumerate(((surface[y], x), (surface[:, x], y))):
-        if 0 < k < len(line) - 1:
-            before, at, after = line[k - 1 : k + 2]
-            place[axis] += 0.5 * (before - after) / min(before + after - 2.0 * at, -1e-9)
-    return place
+    """Place of a peak to a fraction of a pixel along each axis."""
+    lines = (surface[y], x), (surface[:, x], y)
+    return np.array(
+        [k + float(parabola_peak(*line[k - 1 : k + 2])[0]) if 0 < k < len(line) - 1 else k for line, k in lines],
+        dtype=np.float64,
+    )
 
 
 def in_pairs(read: Callable[[int], _Tile], pairs: IntArray) -> Iterator[tuple[_Tile, _Tile]]:

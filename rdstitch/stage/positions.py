@@ -53,32 +53,15 @@ def grid_from_names(
     names: Sequence[str], pattern: str, overlap: float, size: tuple[int, int], scan: Scan | None = None
 ) -> TileGrid:
     """Places by rows and columns, or running numbers, in file names."""
-    scan = scan or Scan()
-    parts = re.findall(r"\{(\w+)\}", pattern)
-    if set(parts) not in _PATTERNS or len(parts) > len(set(parts)):
-        raise ArgumentError(
-            f"the grid '{pattern}' must have {{row}} and {{col}} once each, as in 'r{{row}}c{{col}}', or {{letter}} "
-            "and {col}, or {number}"
-        )
     if not 0.0 <= overlap < 100.0:
         raise ArgumentError(f"tiles overlap by 0 to less than 100 %, not {overlap:g} %")
-    expression = re.escape(pattern).replace(r"\*", ".*")
-    for part in parts:
-        expression = expression.replace(rf"\{{{part}\}}", f"(?P<{part}>{_PARTS[part]})")
-    # A number is whole: not the end of another one.
-    wanted = re.compile(rf"(?<!\d){expression}" if pattern.startswith("{") else expression)
-    found = []
+    scan, wanted, found = scan or Scan(), _compiled(pattern), []
     for name in names:
         fitting = wanted.search(name)
         if fitting is None:
             raise ArgumentError(f"{name}: does not fit the grid '{pattern}'")
         found.append(fitting.groupdict())
-    if "number" in parts:
-        numbers = [int(item["number"]) for item in found]
-        first = min(numbers)
-        cells = [scan.cell(number - first, max(numbers) - first + 1) for number in numbers]
-    else:
-        cells = [(int(item["col"]), int(item["row"]) if "row" in item else _number(item["letter"])) for item in found]
+    cells = _cells(found, scan)
     if len(set(cells)) < len(cells):
         twice = next(cell for cell in cells if cells.count(cell) > 1)
         raise ArgumentError(f"several tiles are row {twice[1]}, column {twice[0]}; name those of one channel only")
@@ -86,6 +69,30 @@ def grid_from_names(
     vertical, horizontal = scan.origin.split("-")
     places *= (1.0 if horizontal == "left" else -1.0, 1.0 if vertical == "top" else -1.0)
     return TileGrid(places - places.min(axis=0), size, None, f"file names, {overlap:g} % overlap")
+
+
+def _compiled(pattern: str) -> re.Pattern[str]:
+    """What finds the parts of a pattern, such as ``r{row}c{col}``, in a name."""
+    parts = re.findall(r"\{(\w+)\}", pattern)
+    if set(parts) not in _PATTERNS or len(parts) > len(set(parts)):
+        raise ArgumentError(
+            f"the grid '{pattern}' must have {{row}} and {{col}} once each, as in 'r{{row}}c{{col}}', or {{letter}} "
+            "and {col}, or {number}"
+        )
+    expression = re.escape(pattern).replace(r"\*", ".*")
+    for part in parts:
+        expression = expression.replace(rf"\{{{part}\}}", f"(?P<{part}>{_PARTS[part]})")
+    # A number is whole: not the end of another one.
+    return re.compile(rf"(?<!\d){expression}" if pattern.startswith("{") else expression)
+
+
+def _cells(found: Sequence[Mapping[str, str]], scan: Scan) -> list[tuple[int, int]]:
+    """Column and row of each tile by what its name says: a running number, or either."""
+    if "number" not in found[0]:
+        return [(int(item["col"]), int(item["row"]) if "row" in item else _number(item["letter"])) for item in found]
+    numbers = [int(item["number"]) for item in found]
+    first, count = min(numbers), max(numbers) - min(numbers) + 1
+    return [scan.cell(number - first, count) for number in numbers]
 
 
 def _number(letters: str) -> int:

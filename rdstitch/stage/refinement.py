@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.stage.coarse_tile import Image
 from rdstitch.system.dataclasses import dataclass
 
 _SMOOTHING = 1.2  # standard deviation of the filter before derivatives are taken, pixels
@@ -20,9 +21,7 @@ _MIN_SIDE = 12  # pixels of a block
 _SIGNIFICANT = 5.0  # standard deviations by which the correlation of a block must exceed that of noise
 _CORRELATED = 4.0 * np.pi * _SMOOTHING**2  # pixels that share their noise after the filter
 
-
-Transfer = Callable[[FloatArray], FloatArray]
-Image = NDArray[np.float32]
+PointMap = Callable[[FloatArray], FloatArray]
 Gradient = list[Image]
 
 
@@ -51,7 +50,7 @@ class BlockMatches:
 
 
 def refine(
-    first: NDArray[Any], second: NDArray[Any], blocks: IntArray, transfer: Transfer, tolerance: float
+    first: NDArray[Any], second: NDArray[Any], blocks: IntArray, transfer: PointMap, tolerance: float
 ) -> BlockMatches:
     """Refine where blocks (K, 4) of the first tile (h, w) are in the second; ``tolerance`` pixels off at most."""
     matches = [match for block in blocks if (match := _refined(first, second, block, transfer, tolerance)) is not None]
@@ -62,7 +61,7 @@ def refine(
 
 
 def _refined(
-    first: NDArray[Any], second: NDArray[Any], block: IntArray, transfer: Transfer, tolerance: float
+    first: NDArray[Any], second: NDArray[Any], block: IntArray, transfer: PointMap, tolerance: float
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Places of a block's content in both tiles and their information; None where it shows nothing."""
     pair = _sampled_pair(first, second, block, transfer)
@@ -84,7 +83,7 @@ class _SampledPair:
 
 
 def _sampled_pair(
-    first: NDArray[Any], second: NDArray[Any], block: IntArray, transfer: Transfer
+    first: NDArray[Any], second: NDArray[Any], block: IntArray, transfer: PointMap
 ) -> _SampledPair | None:
     """As far as both tiles have what the search may need; None where that is too small."""
     sides = np.array([first.shape[::-1], second.shape[::-1]])

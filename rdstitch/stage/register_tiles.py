@@ -6,14 +6,15 @@ from typing import Literal
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
-from rdstitch.stage.adjustment import Adjustment, adjust
-from rdstitch.stage.choose_places import AGREES, choose_places
-from rdstitch.stage.correlation import Overlap
+from rdstitch.stage.adjustment import HOLDING_WEIGHT, Adjustment, adjust
+from rdstitch.stage.choose_places import choose_places
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.linked_points import LinkedPoints
+from rdstitch.stage.overlap import Overlap
 from rdstitch.stage.pair_candidates import PairFinder, Reader, SearchPlan, in_pairs
-from rdstitch.stage.refinement import BlockMatches, Transfer, refine
+from rdstitch.stage.refinement import BlockMatches, PointMap, refine
 from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.late_imports import csgraph, sparse
 from rdstitch.system.progress import Progress, silent
@@ -70,13 +71,13 @@ def register_tiles(
     ``distortion`` is λ where it is known, "auto" where it is to be estimated; otherwise it is 0 unless pairs along rows
     and pairs along columns show the same.
     """
+    if distortion == "auto" and plan.grid.own_sizes is not None:
+        raise ArgumentError("tiles of different sizes do not show λ; give a number with --distortion, or leave it out")
     pairs = plan.grid.neighbours(plan.search)
     known = distortion if isinstance(distortion, float | int) else None
     finder = PairFinder(plan, pairs)
     candidates, lens = finder.candidates(read, known, progress)
-    chosen, rough = choose_places(pairs, candidates, plan, lens)
-    if not chosen:
-        return _result(plan, pairs, LinkedPoints.of(pairs, {}), rough)
+    chosen = choose_places(pairs, candidates, plan, lens)
     matches: dict[int, BlockMatches] = {}
     camera = Camera(plan.grid.size, lens)
     tiles = in_pairs(read, pairs[list(chosen)])
@@ -100,7 +101,7 @@ def _with_lens(
     """All places, with λ where it is asked for, or where it is there."""
     grid, std = plan.grid, plan.stage_std
     if isinstance(wanted, float | int):
-        return adjust(grid, links, std, float(wanted))
+        return replace(adjust(grid, links, std, float(wanted)), distortion_std=0.0)
     straight = adjust(grid, links, std)
     if not len(links.pair) or grid.own_sizes is not None:
         return straight
@@ -127,7 +128,7 @@ def _lens_is_there(grid: TileGrid, links: LinkedPoints, std: float, lens: float)
     return apart and a * b > 0.0 and all(abs(value) > _LENS_SHOWN * deviation for value, deviation in shown)
 
 
-def _transfer(overlap: Overlap, offset: FloatArray, camera: Camera) -> Transfer:
+def _transfer(overlap: Overlap, offset: FloatArray, camera: Camera) -> PointMap:
     """Map points of the first tile to the second, whose blocks are off by an offset in the mean."""
     if camera.distortion == 0.0:
         return lambda points: points - offset
@@ -138,7 +139,7 @@ def _transfer(overlap: Overlap, offset: FloatArray, camera: Camera) -> Transfer:
 
 def _result(plan: SearchPlan, pairs: IntArray, links: LinkedPoints, fitted: Adjustment) -> TileRegistration:
     grid = plan.grid
-    held = links.tiles[fitted.weights[: len(links.tiles)] > AGREES]
+    held = links.tiles[fitted.weights[: len(links.tiles)] > HOLDING_WEIGHT]
     joined = sparse.coo_matrix((np.ones(len(held)), held.T), shape=(len(grid),) * 2)
     count, label = csgraph.connected_components(joined, directed=False)
     groups = [np.flatnonzero(label == k) for k in range(count)]

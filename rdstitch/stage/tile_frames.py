@@ -52,8 +52,9 @@ def tile_frames(
         notes.append(f"files hold {depth} z planes: of each pixel the brightest is taken; --z N takes one plane")
     if times > 1 and time is None:
         notes.append(f"files hold {times} times: the first is taken; --time N takes another")
-    if z not in (None, "max", 0) and depth == 1:
-        raise ArgumentError(f"no file has a z plane with the number {z}: each has one, 0")
+    for what, wanted, count in (("z plane", z, depth), ("time", time, times)):
+        if wanted not in (None, "max", 0) and count == 1:
+            raise ArgumentError(f"no file has a {what} with the number {wanted}: each has one, 0")
     return tiles, stored, [Message(text, severity="note") for text in notes]
 
 

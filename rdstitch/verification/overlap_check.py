@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import chain
+from threading import Lock
 
 import numpy as np
 
@@ -26,18 +27,12 @@ from rdstitch.verification.photometric_agreement import (
 from rdstitch.verification.self_similarity import SLACK, Ambiguity, drawing_scale, find_ambiguity
 from rdstitch.verification.unique_places import unique_shifts
 
-_MAX_LINKS = 40
-"""Links up to which all are looked at; of more, so many of the least confirmed ones, and some of all at random."""
-
+_MAX_LINKS = 40  # up to which all are looked at; of more, so many of the least confirmed, and some of all at random
+# Links that are taken at random, and their share of all at the most. If none of 300 is wrong, with a confidence of 95 %
+# less than one in a hundred is, however many there are.
 _MOST_SAMPLED, _SAMPLED = 300, 0.05
-"""Links that are taken at random, and their share of all at the most. If none of 300 is wrong, with a confidence of
-95 % less than one in a hundred is, however many there are."""
-
-_CONFIDENCE = 1.645
-"""Standard deviations that a normal variable exceeds with a probability of 5 %."""
-
-_IMAGES_AT_ONCE = 128
-"""Images that are kept while pairs are compared, 1 MB each."""
+_CONFIDENCE = 1.645  # standard deviations that a normal variable exceeds with a probability of 5 %
+_IMAGES_AT_ONCE = 128  # that are kept while pairs are compared, 1 MB each
 
 
 @dataclass(frozen=True)
@@ -65,6 +60,7 @@ class ComparedImages:
 
     def __init__(self, sources: Sequence[Source], stretch: tuple[float, float] | None, threads: int = 1) -> None:
         self.threads = threads
+        self._locks = [Lock() for _ in sources]  # links of one image are compared at the same time
 
         @lru_cache(_IMAGES_AT_ONCE)
         def read(k: int) -> ComparedImage:
@@ -75,7 +71,8 @@ class ComparedImages:
 
     def placed(self, k: int, camera: Camera, homography: FloatArray) -> ComparedImage:
         """One of them, where a homography puts it with a camera of any size."""
-        image = self._read(k)
+        with self._locks[k]:
+            image = self._read(k)
         return replace(image, camera=camera.resized(image.camera.image_size), homography=homography)
 
     def aligned(self, alignment: Alignment, images: Iterable[int]) -> dict[int, ComparedImage]:
@@ -113,7 +110,7 @@ def check_overlaps(registration: Registration, images: ComparedImages, cache: Ca
         doubtful = chain.from_iterable(link.pair for link in checked if link.ambiguity.ambiguous)
         return _by_what_is_unique(images.aligned(alignment, doubtful), checked)
 
-    inputs = (described, chosen, registration.stretch)
+    inputs = (described, chosen, registration.stretch, alignment.on_sphere, alignment.poses is None)
     return cache.recall("overlaps", inputs, compute)
 
 
@@ -125,7 +122,7 @@ def share_alike(checked: Sequence[CheckedLink]) -> float:
 
 def wrong_at_most(checked: Sequence[CheckedLink]) -> float:
     """Share of all links that may look unlike, by those taken at random (Wilson's upper bound, 95 %); 1 without any."""
-    cells, unlike = Limits.cells.value, Limits.unlike.value
+    cells, unlike = Limits.min_cells.value, Limits.max_unlike_fraction.value
     sampled = [link.agreement for link in checked if link.sampled and link.agreement.cells >= cells]
     if not sampled:
         return 1.0

@@ -25,6 +25,9 @@ from rdstitch.io.reduction import mean_of_channels
 from rdstitch.system.dataclasses import dataclass
 from rdstitch.verification.limits import Limits
 
+# Boxes, interpolated places and the likeness of two greys are shared with the compositor: none of them knows where a
+# registration puts images, so that what judges it is still not what made it.
+
 Grey = NDArray[np.float32]
 
 COMPARED_SIDE = 512  # pixels of the longer side of the images that are compared
@@ -149,7 +152,7 @@ def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
 
 def _have_texture(cells: Grey) -> NDArray[np.bool_]:
     """Which cells (N, h, w) are distinctive; not those with transparent pixels, whose deviation is NaN."""
-    return np.asarray(cells.std(axis=(1, 2)) > Limits.texture.value)
+    return np.asarray(cells.std(axis=(1, 2)) > Limits.min_texture.value)
 
 
 def _confirms(cell: Grey, window: Grey) -> bool:
@@ -157,6 +160,6 @@ def _confirms(cell: Grey, window: Grey) -> bool:
     scores = np.asarray(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(scores.argmax()), scores.shape)
     return bool(
-        scores[row, column] >= Limits.correlation.value
-        and np.hypot(row - _SEARCH_RADIUS, column - _SEARCH_RADIUS) <= Limits.offset.value
+        scores[row, column] >= Limits.min_correlation.value
+        and np.hypot(row - _SEARCH_RADIUS, column - _SEARCH_RADIUS) <= Limits.max_offset.value
     )

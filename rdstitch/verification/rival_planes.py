@@ -9,7 +9,7 @@ part only, and may fill all that is not seen there.
 import math
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -20,30 +20,36 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import PAIRS_ESTIMATED_AT_ONCE, Pair, PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
+from rdstitch.system.dataclasses import replace
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, overlap_agreement
 
 
-def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRegistration] | None:
+def planes_of_pairs(registration: Registration, threshold: float, threads: int = 1) -> list[PairRegistration] | None:
     """Every pair by that of its two strongest motions which may fill more than half of its images.
 
     Each pair decides for itself: where two motions are about as strong, some pairs were registered by one and some by
-    the other, and no alignment holds both. None where no pair has a motion that fills less.
+    the other, and no alignment holds both. None where no pair has a motion that fills less. ``threads``: pairs whose
+    images are compared at the same time.
     """
     pairs = [pair for pair in registration.pairs if pair.relation]
-    images = ComparedImages(registration.sources, registration.stretch)
+    images = ComparedImages(registration.sources, registration.stretch, threads)
 
-    def fills(pair: Pair, motion: RadialHomography) -> float:
+    def fills(pair: Pair, motion: RadialHomography) -> tuple[float, RadialHomography]:
         first = images.placed(pair[0], motion.camera, motion.homography)
-        return fills_at_most([overlap_agreement(first, images.placed(pair[1], motion.camera2, np.eye(3)))])
+        return fills_at_most([overlap_agreement(first, images.placed(pair[1], motion.camera2, np.eye(3)))]), motion
 
-    half = Limits.filled_by_plane.value
-    found = {pair.images: (fills(pair.images, pair.relation), pair.relation) for pair in pairs}
+    def filled_by(motions: Mapping[Pair, RadialHomography]) -> dict[Pair, tuple[float, RadialHomography]]:
+        with ThreadPoolExecutor(threads) as pool:
+            return dict(zip(motions, pool.map(fills, motions, motions.values()), strict=True))
+
+    half = Limits.min_plane_fraction.value
+    found = filled_by({pair.images: pair.relation for pair in pairs})
     if all(share >= half for share, _ in found.values()):
         return None
-    for pair, motion in second_motions(registration.alignment.cameras, pairs, threshold).items():
-        found[pair] = max(found[pair], (fills(pair, motion), motion), key=lambda each: each[0])
+    for pair, filled in filled_by(second_motions(registration.alignment.cameras, pairs, threshold)).items():
+        found[pair] = max(found[pair], filled, key=lambda each: each[0])
     needed = _least_needed({pair: share for pair, (share, _) in found.items() if share >= half})
     return [
         replace(pair, relation=found[pair.images][1] if found[pair.images][0] >= needed else _no_plane(pair))
@@ -75,7 +81,7 @@ def second_motions(
     """
     result = {}
     rests = {pair.images: np.flatnonzero(~pair.relation.inliers) for pair in pairs}
-    enough = [pair for pair in pairs if len(rests[pair.images]) >= Limits.motion_inliers.value]
+    enough = [pair for pair in pairs if len(rests[pair.images]) >= Limits.min_motion_inliers.value]
     for batch in batches(enough, PAIRS_ESTIMATED_AT_ONCE):
         given = []
         for pair in batch:
@@ -85,7 +91,7 @@ def second_motions(
             given.append(PairMatches(matches.points1, matches.points2, camera, other, -matches.ratio))
         motions = estimate_radial_homographies(given, EstimationOptions(threshold=threshold))
         for pair, motion in zip(batch, motions, strict=True):
-            if motion and int(motion.inliers.sum()) >= Limits.motion_inliers.value:
+            if motion and int(motion.inliers.sum()) >= Limits.min_motion_inliers.value:
                 inliers = np.zeros(len(pair.matches), dtype=np.bool_)
                 inliers[rests[pair.images][motion.inliers]] = True
                 result[pair.images] = replace(motion, inliers=inliers)

@@ -12,20 +12,20 @@ from rdstitch.alignment.result import LinkFit, links_by_image
 from rdstitch.alignment.unaligned import few_features
 from rdstitch.choices import Purpose
 from rdstitch.inputs.source import Source
+from rdstitch.results.messages import Severity
 from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind, Measured
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import wrong_at_most
 from rdstitch.verification.rival_planes import fills_at_most
 
-MAX_WARNINGS = 3
-"""Lines of one run."""
 
-
-def disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
+def _disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
     """Pairs of whose matches most do not fit into the whole."""
     for fit in evidence.used:
-        if fit.inliers < Limits.pair_inliers.value * fit.count and not evidence.explained_by_depth(fit.images):
+        if fit.inliers < Limits.min_pair_inlier_fraction.value * fit.count and not evidence.explained_by_depth(
+            fit.images
+        ):
             reason = _reason(evidence, fit.images, [fit], "stitch them on their own")
             yield Finding(Kind.PAIR_MISFITS, fit.images, values={**_counts([fit]), "reason": reason})
 
@@ -33,16 +33,18 @@ def disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
 def _misfitting_images(evidence: ResultEvidence) -> Iterator[Finding]:
     """Images of whose matches too many do not fit into the whole, over all pairs that do."""
     for k, links in sorted(links_by_image(evidence.used).items()):
-        fits = [fit for fit in links if fit.inliers >= Limits.pair_inliers.value * fit.count]
+        fits = [fit for fit in links if fit.inliers >= Limits.min_pair_inlier_fraction.value * fit.count]
         counts = _counts(fits)
-        few = counts["inliers"] < Limits.image_inliers.value * counts["count"]
+        few = counts["inliers"] < Limits.min_image_inlier_fraction.value * counts["count"]
         if few and not evidence.explained_by_depth((k,)):
             yield Finding(Kind.IMAGE_MISFITS, (k,), values={**counts, "reason": _reason(evidence, (k,), fits)})
 
 
 def _matches_disagree(evidence: ResultEvidence) -> Iterator[Finding]:
     counts = _counts(evidence.used)
-    if counts["inliers"] < Limits.pair_inliers.value * counts["count"] and not evidence.explained_by_depth(()):
+    if counts["inliers"] < Limits.min_pair_inlier_fraction.value * counts["count"] and not evidence.explained_by_depth(
+        ()
+    ):
         yield Finding(Kind.MATCHES_DISAGREE, values=counts)
 
 
@@ -75,29 +77,42 @@ def _errors(evidence: ResultEvidence) -> Iterator[Finding]:
     """Errors of all pairs together; of a picture its seams say whether they are seen."""
     alignment, threshold = evidence.alignment, evidence.threshold
     rms, relief = alignment.rms, alignment.relief
-    if rms <= Limits.error.value * threshold:
+    if rms <= Limits.max_rms.value * threshold:
         return
-    largest = Limits.relief_error.value * 2.0 * max(camera.scale for camera in alignment.cameras)
+    largest = Limits.max_relief_rms.value * 2.0 * max(camera.scale for camera in alignment.cameras)
     # Without what neighbours have in common, errors are those of a plane.
-    explained = rms <= largest and rms**2 - relief.size**2 <= (Limits.error.value * threshold) ** 2
+    explained = rms <= largest and rms**2 - relief.size**2 <= (Limits.max_rms.value * threshold) ** 2
     # Where the pixels agree, depth that one surface does not explain has been found a place all the same.
-    rough = (rms <= Limits.rough_error.value * threshold and evidence.alike >= Limits.alike.value) or (
-        relief.found and explained and evidence.alike >= Limits.clearly_alike.value
+    rough = (rms <= Limits.max_rough_rms.value * threshold and evidence.alike >= Limits.min_alike_fraction.value) or (
+        relief.found and explained and evidence.alike >= Limits.min_clearly_alike_fraction.value
     )
     values: Measured = {"rms": rms, "threshold": threshold}
     if rough or evidence.purpose.picture:
-        yield Finding(Kind.ROUGH, max(evidence.used, key=lambda fit: fit.rms).images, "warning", values)
+        severity = _warning_if(evidence.flat or _depth_seen(evidence))
+        yield Finding(Kind.ROUGH, max(evidence.used, key=lambda fit: fit.rms).images, severity, values)
     else:
         yield Finding(Kind.ERRORS, values=values)
 
 
 def _depth(evidence: ResultEvidence) -> Iterator[Finding]:
     """Errors that neighbouring matches have in common, and where they are largest."""
-    if evidence.alignment.relief.found:
+    relief = evidence.alignment.relief
+    if relief.found:
         fit = max(evidence.used, key=lambda fit: fit.rms)
-        what = evidence.alignment.relief.explanation
         kind = Kind.DEPTH_OF_A_TURN if evidence.alignment.on_sphere else Kind.RELIEF
-        yield Finding(kind, (fit.image1, fit.image2), "warning", {"what": what, "rms": fit.rms})
+        # Even where seams hold a bent plane adds up from image to image, and tilts take most of it up.
+        bent = not evidence.purpose.picture or relief.size > Limits.max_shared_error.value * evidence.threshold
+        severity = _warning_if((evidence.flat and bent) or _depth_seen(evidence))
+        yield Finding(kind, fit.images, severity, {"what": relief.explanation, "rms": fit.rms})
+
+
+def _depth_seen(evidence: ResultEvidence) -> bool:
+    """Whether depth leaves the images unlike; pictures have their seams."""
+    return not evidence.purpose.picture and evidence.alike < Limits.min_alike_fraction.value
+
+
+def _warning_if(warns: bool) -> Severity:
+    return "warning" if warns else "detail"
 
 
 def _free_homographies(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -105,7 +120,7 @@ def _free_homographies(evidence: ResultEvidence) -> Iterator[Finding]:
     alignment = evidence.alignment
     if evidence.flat and alignment.focal is None:
         fit = max(evidence.used, key=lambda fit: fit.rms)
-        yield Finding(Kind.FREE_HOMOGRAPHIES, fit.images, "warning" if alignment.relief.found else "detail")
+        yield Finding(Kind.FREE_HOMOGRAPHIES, fit.images, _warning_if(alignment.relief.found))
 
 
 def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -113,8 +128,12 @@ def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
     as depth shifts what it shows by a little nearly everywhere.
     """
     for link in evidence.checked:
-        coarsely = evidence.purpose.picture and link.agreement.coarsely >= Limits.filled_by_plane.value
-        if link.agreement.cells >= Limits.cells.value and link.agreement.share < Limits.unlike.value and not coarsely:
+        coarsely = evidence.purpose.picture and link.agreement.coarsely >= Limits.min_plane_fraction.value
+        if (
+            link.agreement.cells >= Limits.min_cells.value
+            and link.agreement.share < Limits.max_unlike_fraction.value
+            and not coarsely
+        ):
             values: Measured = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
             yield Finding(Kind.UNLIKE, link.pair, "failure", values)
 
@@ -122,7 +141,7 @@ def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
 def _looked_at(evidence: ResultEvidence) -> Iterator[Finding]:
     """How many of many overlaps were compared in their pixels, and what that says of the others."""
     checked, share = evidence.checked, wrong_at_most(evidence.checked)
-    if share < Limits.wrong_overlaps.value:
+    if share < Limits.max_wrong_overlaps.value:
         sampled = sum(link.sampled for link in checked)
         values: Measured = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": share}
         yield Finding(Kind.LOOKED_AT, (), "detail", values)
@@ -135,7 +154,7 @@ def _ambiguous(evidence: ResultEvidence) -> Iterator[Finding]:
 
 def _pattern(evidence: ResultEvidence) -> Iterator[Finding]:
     """A pattern over so many pairs that leaving some of them out proves nothing; or one in which the unique decided."""
-    if len(evidence.ambiguous) > Limits.pattern.value * len(evidence.checked):
+    if len(evidence.ambiguous) > Limits.max_ambiguous_pairs.value * len(evidence.checked):
         yield Finding(Kind.PATTERN, values={"count": len(evidence.ambiguous), "of": len(evidence.checked)})
     settled = [link for link in evidence.checked if link.unique]
     if settled:
@@ -145,7 +164,7 @@ def _pattern(evidence: ResultEvidence) -> Iterator[Finding]:
 def _rival_motion(evidence: ResultEvidence) -> Iterator[Finding]:
     """Poses by something that fills less than half of the images: what drives ahead, say."""
     share = fills_at_most(link.agreement for link in evidence.checked)
-    if share < Limits.filled_by_plane.value:
+    if share < Limits.min_plane_fraction.value:
         yield Finding(Kind.RIVAL_MOTION, values={"share": share})
 
 
@@ -167,7 +186,7 @@ def _inputs(evidence: ResultEvidence) -> Iterator[Finding]:
     focal = {k: _focal_share(source) for k, source in enumerate(sources) if source.metadata.focal_px is not None}
     if len(bodies) > 1:
         yield Finding(Kind.SEVERAL_CAMERAS, (), "warning", {"bodies": bodies})
-    elif focal and max(focal.values()) > Limits.zoom.value * min(focal.values()):
+    elif focal and max(focal.values()) > Limits.max_focal_ratio.value * min(focal.values()):
         near, far = min(focal, key=lambda k: focal[k]), max(focal, key=lambda k: focal[k])
         yield Finding(Kind.ZOOMED, (), "warning", {"ratio": focal[far] / focal[near], "near": near, "far": far})
     without = [k for k, source in enumerate(sources) if source.mask is None]
@@ -195,53 +214,25 @@ _POSES = frozenset({Purpose.TRAJECTORY})
 OF_MATCHES = Rule(_mixed_lenses), Rule(_matches_disagree), Rule(_misfitting_images)
 """Failures by which the pixels need not be asked: of images that may be left out."""
 
-OF_PAIRS = Rule(disagreeing_pairs, _PLACES), Rule(_unlike, _PLACES), Rule(_ambiguous, _PLACES)
+OF_MATCHED_PAIRS = (Rule(_disagreeing_pairs, _PLACES),)
+"""The same of pairs: failures where images hang on them alone."""
+
+OF_PAIRS = *OF_MATCHED_PAIRS, Rule(_unlike, _PLACES), Rule(_ambiguous, _PLACES)
 """Suspicions of pairs, the last of each counts: a failure where images hang on it alone."""
 
 OF_THE_WHOLE = (
-    Rule(_errors),
-    Rule(_depth),
-    Rule(_free_homographies, _PLACES),
     Rule(_looked_at),
     Rule(_pattern, _PLACES),
     Rule(_rival_motion, _POSES),
     Rule(_two_left),
     Rule(_inputs),
+    Rule(_free_homographies, _PLACES),
+    Rule(_errors),
+    Rule(_depth),
 )
-"""Everything else."""
+"""Everything else, of one topic the gravest first."""
 
 
 def found(rules: Iterable[Rule], evidence: ResultEvidence) -> list[Finding]:
     """What those of some rules find that speak for the recipe."""
     return [finding for rule in rules if evidence.purpose in rule.purposes for finding in rule.find(evidence)]
-
-
-def _bent(evidence: ResultEvidence) -> bool:
-    """Whether what neighbours share shows a bent plane, even where seams hold: it adds up from image to image, and
-    tilts take most of it up.
-    """
-    return evidence.flat and evidence.alignment.relief.size > Limits.bent.value * evidence.threshold
-
-
-def _depth_seen(evidence: ResultEvidence) -> bool:
-    """Whether depth leaves the images unlike; pictures have their seams."""
-    return not evidence.purpose.picture and evidence.alike < Limits.alike.value
-
-
-class Aloud(NamedTuple):
-    """When a warning of a kind is one, and not a detail; of one topic the first is."""
-
-    topic: str
-    speaks: Callable[[ResultEvidence], bool] = lambda evidence: True
-
-
-ALOUD = {
-    Kind.FREE_HOMOGRAPHIES: Aloud("flatness"),
-    Kind.ROUGH: Aloud("flatness", lambda evidence: evidence.flat or _depth_seen(evidence)),
-    Kind.RELIEF: Aloud(
-        "flatness",
-        lambda evidence: _bent(evidence) or (evidence.flat and not evidence.purpose.picture) or _depth_seen(evidence),
-    ),
-    Kind.DEPTH_OF_A_TURN: Aloud("flatness", _depth_seen),
-}
-"""The gravest first; other kinds are always said, and before these."""

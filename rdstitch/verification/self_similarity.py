@@ -11,6 +11,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.parabola import parabola_peak
 from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.verification.limits import Limits
@@ -41,8 +42,10 @@ class Ambiguity:
     def ambiguous(self) -> bool:
         """Whether the images fit elsewhere as well as here."""
         left, left_elsewhere = max(1.0 - self.here**2, _NOISE), 1.0 - self.elsewhere**2
-        as_well = self.elsewhere > max(Limits.correlation.value, Limits.as_well_elsewhere.value * self.here)
-        return as_well and left_elsewhere < Limits.unexplained_elsewhere.value * left
+        as_well = self.elsewhere > max(
+            Limits.min_correlation.value, Limits.ambiguous_correlation_ratio.value * self.here
+        )
+        return as_well and left_elsewhere < Limits.ambiguous_residual_ratio.value * left
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +105,7 @@ def placement_ambiguity(first: Drawing, second: Drawing, longest_side: int = MAX
     score = overlaps.correlation()
     # A peak of its own, not the flank of the one here.
     peak = score >= cv2.dilate(score, np.ones((2 * math.ceil(share * SLACK) + 1,) * 2, dtype=np.uint8))
-    enough = overlaps.area >= Limits.kept_overlap.value * most
+    enough = overlaps.area >= Limits.min_kept_overlap.value * most
     other = np.where(peak & (distance > share * _MIN_SHIFT) & enough, score, np.float32(0.0))
     best = int(other.argmax())
     elsewhere = float(other.flat[best]) and _between_pixels(score, *np.unravel_index(best, score.shape))
@@ -110,12 +113,11 @@ def placement_ambiguity(first: Drawing, second: Drawing, longest_side: int = MAX
 
 
 def _between_pixels(score: Grey, row: np.intp, column: np.intp) -> float:
-    """Height of a peak between pixels, by a parabola across each axis: a period is no whole number of pixels."""
-    top = float(score[row, column])
+    """Height of a peak between pixels, along both axes: a period is no whole number of pixels."""
+    here = top = float(score[row, column])
     for line, at in ((score[:, column], row), (score[row], column)):
         if 0 < at < len(line) - 1:
-            before, after = float(line[at - 1]), float(line[at + 1])
-            top += (after - before) ** 2 / max(8.0 * (2.0 * float(line[at]) - before - after), 1e-12)
+            top += float(parabola_peak(*line[at - 1 : at + 2].astype(np.float64))[1]) - here
     return min(top, 1.0)
 
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.geometry.parabola import parabola_peak
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.verification.limits import Limits
@@ -40,8 +41,8 @@ class UniqueShift:
     @property
     def decides(self) -> bool:
         """Whether the images lie here and nowhere else."""
-        clear = self.matched >= max(Limits.matched_departures.value, Limits.lead.value * self.rival)
-        return clear and self.share >= Limits.same_departures.value
+        clear = self.matched >= max(Limits.min_matched_departures.value, Limits.min_lead.value * self.rival)
+        return clear and self.share >= Limits.min_departure_correlation.value
 
 
 def unique_shifts(
@@ -86,7 +87,7 @@ def departures(pixels: Grey) -> Grey | None:
     peaks = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
     periods = peaks.shift[np.hypot(*peaks.shift.T) > _MIN_SHIFT]
     periods = periods[np.argsort(np.hypot(*periods.T), kind="stable")][:_MAX_PERIODS]
-    if len(periods) < Limits.periods.value:
+    if len(periods) < Limits.min_periods.value:
         return None
     copies = np.stack([_shifted(pixels, shift) for shift in periods])
     count = np.isfinite(copies).sum(axis=0)
@@ -101,7 +102,7 @@ def departures(pixels: Grey) -> Grey | None:
         for values in (pixels - middle, spread)
     )
     relative = departure / np.maximum(usual, max(float(np.median(usual[known])), 1e-6))
-    size = np.clip(np.abs(relative) - Limits.departure.value, 0.0, _MOST)
+    size = np.clip(np.abs(relative) - Limits.min_departure.value, 0.0, _MOST)
     return np.where(known & (inside > 0), np.copysign(size, relative), np.float32(np.nan)).astype(np.float32)
 
 
@@ -139,22 +140,16 @@ def _peaks(overlaps: Overlaps, first: Grey, offset: FloatArray, least_overlap: f
     score = overlaps.correlation()
     kernel = np.ones((2 * _MIN_SHIFT + 1, 2 * _MIN_SHIFT + 1), dtype=np.uint8)
     enough = overlaps.area >= least_overlap * overlaps.area.max()
-    peak = (score >= cv2.dilate(score, kernel)) & enough & (score > Limits.period.value)
+    peak = (score >= cv2.dilate(score, kernel)) & enough & (score > Limits.min_period_correlation.value)
     peak[[0, -1]] = peak[:, [0, -1]] = False
     row, column = np.nonzero(peak)
     x, y = (
-        _vertex(score[row - dy, column - dx], score[row, column], score[row + dy, column + dx])
+        parabola_peak(score[row - dy, column - dx], score[row, column], score[row + dy, column + dx])[0]
         for dx, dy in ((1, 0), (0, 1))
     )
     height, width = first.shape
     shift = np.column_stack([column - (width - 1) - offset[0] + x, row - (height - 1) - offset[1] + y])
     return _Peaks(shift, np.column_stack([row, column]))
-
-
-def _vertex(before: Grey, here: Grey, after: Grey) -> FloatArray:
-    """Where a parabola through three neighbouring values (N,) of a peak is highest, from the middle one on."""
-    curvature = np.minimum(before + after - 2.0 * here, -1e-6).astype(np.float64)
-    return np.clip((before - after) / (2.0 * curvature), -0.5, 0.5)
 
 
 def _shifted(pixels: Grey, shift: FloatArray) -> Grey:

@@ -1,7 +1,6 @@
 """Every run judges itself: can the result be relied on? ResultEvidence, rules, findings."""
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import replace
 
 from rdstitch.alignment.result import LinkFit
 from rdstitch.errors import RegistrationError
@@ -9,9 +8,13 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import Pair
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
+from rdstitch.system.dataclasses import replace
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind
+
+_MAX_WARNINGS = 3  # lines of one run
+_NOT_FLAT = frozenset({Kind.FREE_HOMOGRAPHIES, Kind.ROUGH, Kind.RELIEF, Kind.DEPTH_OF_A_TURN})  # one topic
 
 
 class RefusedError(RegistrationError):
@@ -28,7 +31,7 @@ class RefusedError(RegistrationError):
         first: dict[str, Message] = {}
         for message in registration.failures:
             first.setdefault(message.kind or message.text, message)
-        chosen = list(first.values())[: rules.MAX_WARNINGS]
+        chosen = list(first.values())[:_MAX_WARNINGS]
         reasons = "; ".join(message.clause for message in chosen)
         if rest := len(registration.failures) - len(chosen):
             reasons += f"; and {rest} more like {'these' if len(chosen) > 1 else 'this'}"
@@ -45,7 +48,7 @@ def judge(evidence: ResultEvidence) -> tuple[Finding, ...]:
         return failures
     decisive, outvoted = _by_what_hangs_on_them(rules.found(rules.OF_PAIRS, evidence), evidence)
     whole = rules.found(rules.OF_THE_WHOLE, evidence)
-    return _aloud([*decisive, *whole, *_outvoted(outvoted)], evidence)
+    return _limit_warnings([*decisive, *whole, *_outvoted(outvoted)])
 
 
 def failures_of_matches(evidence: ResultEvidence) -> tuple[Finding, ...]:
@@ -53,7 +56,7 @@ def failures_of_matches(evidence: ResultEvidence) -> tuple[Finding, ...]:
     found = rules.found(rules.OF_MATCHES, evidence)
     if evidence.static:  # matches of what is static in the images agree with nothing
         return tuple(finding for finding in found if not finding.images)
-    return *found, *_by_what_hangs_on_them(rules.disagreeing_pairs(evidence), evidence)[0]
+    return *found, *_by_what_hangs_on_them(rules.found(rules.OF_MATCHED_PAIRS, evidence), evidence)[0]
 
 
 def _by_what_hangs_on_them(
@@ -87,17 +90,12 @@ def _outvoted(suspicions: Iterable[Finding]) -> list[Finding]:
     ]
 
 
-def _aloud(findings: Sequence[Finding], evidence: ResultEvidence) -> tuple[Finding, ...]:
-    """Make details of warnings that their rule silences, of all but the first of a kind, and of more than a few."""
-    rank = {kind: number for number, kind in enumerate(rules.ALOUD)}
-    topics, aloud = set[str](), set[int]()
-    for k in sorted(range(len(findings)), key=lambda k: rank.get(findings[k].kind, -1)):
-        rule = rules.ALOUD.get(findings[k].kind, rules.Aloud(findings[k].kind.name))
-        speaks = findings[k].severity == "warning" and rule.topic not in topics and rule.speaks(evidence)
-        if speaks and len(aloud) < rules.MAX_WARNINGS:
-            aloud.add(k)
-            topics.add(rule.topic)
-    return tuple(
-        replace(finding, severity="detail") if finding.severity == "warning" and k not in aloud else finding
-        for k, finding in enumerate(findings)
-    )
+def _limit_warnings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Make details of all warnings but the first of each topic, and of more than a few."""
+    topics, limited = set[object](), list[Finding]()
+    for finding in findings:
+        topic = _NOT_FLAT if finding.kind in _NOT_FLAT else finding.kind
+        warns = finding.severity == "warning" and topic not in topics and len(topics) < _MAX_WARNINGS
+        topics |= {topic} if warns else set()
+        limited.append(replace(finding, severity="detail") if finding.severity == "warning" and not warns else finding)
+    return tuple(limited)

@@ -43,6 +43,9 @@ def test_planes_that_are_not_there_are_refused_by_name(tmp_path: Path, z: int | 
     frames, _, notes = tile_frames([Frame(file)], None, None)
     assert [frame.path for frame in frames] == [file]
     assert [message.text.partition(":")[0] for message in notes] == ["files hold 3 z planes", "files hold 2 times"]
+    tifffile.imwrite(file, _planes(1, 1)[0, 0])
+    with pytest.raises(ArgumentError, match=r"no file has a (z plane|time) with the number"):
+        tile_frames([Frame(file)], z, time)
 
 
 def _ome(images: str, uuid: str = "urn:uuid:1") -> str:

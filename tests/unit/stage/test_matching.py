@@ -1,5 +1,7 @@
 """How the overlap of two tiles is found: evidence, displacements to a part of a pixel, and the choice of a place."""
 
+from weakref import WeakSet
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -7,10 +9,12 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.stage import SearchPlan
 from rdstitch.stage.choose_places import choose_places
-from rdstitch.stage.correlation import Overlap, coarse_tile, correlate, log_evidence
-from rdstitch.stage.evidence_limits import ANYWHERE, HUNDRED_TO_ONE, WRONG_PEAK
+from rdstitch.stage.coarse_tile import coarse_tile
+from rdstitch.stage.evidence import ANYWHERE, HUNDRED_TO_ONE, WRONG_PEAK, log_evidence
 from rdstitch.stage.grid import TileGrid
-from rdstitch.stage.pair_candidates import Candidates
+from rdstitch.stage.overlap import Overlap
+from rdstitch.stage.pair_candidates import Candidates, in_pairs
+from rdstitch.stage.phase_correlation import correlate
 from rdstitch.stage.refinement import refine
 
 Image = NDArray[np.float32]
@@ -55,6 +59,22 @@ def test_displacements_are_found_as_exactly_as_is_said() -> None:
     assert 0.2 < np.mean(white) < 3.0
 
 
+def test_of_tiles_in_any_order_about_two_rows_are_held() -> None:
+    class Tile:
+        pass
+
+    places = 100.0 * np.stack(np.meshgrid(np.arange(15), np.arange(12)), axis=-1).reshape(-1, 2)
+    shuffled, held = np.random.default_rng(0).permutation(places), WeakSet[Tile]()
+
+    def read(_: int) -> Tile:
+        held.add(tile := Tile())
+        return tile
+
+    pairs = TileGrid(shuffled, (120, 120)).neighbours(5.0)
+    assert len(pairs) == 14 * 12 + 15 * 11
+    assert max(len(held) for _ in in_pairs(read, pairs)) <= 2 * 15
+
+
 @pytest.mark.parametrize("what", ["even", "noise", "too far"])
 def test_what_shows_no_displacement_gives_none(what: str) -> None:
     first, second = _tiles(3)
@@ -73,7 +93,7 @@ def test_the_stage_decides_between_places_and_a_strong_one_against_the_stage() -
 
     def chosen(*candidates: tuple[list[FloatArray], list[float]]) -> dict[int, list[float]]:
         found = [Candidates(np.array(at).reshape(-1, 2), np.array(nats), 2.0) for at, nats in candidates]
-        return {number: at.tolist() for number, at in choose_places(pairs, found, plan, 0.0)[0].items()}
+        return {number: at.tolist() for number, at in choose_places(pairs, found, plan, 0.0).items()}
 
     sure, nothing = ([right], [9.0]), (list[FloatArray](), list[float]())
     assert chosen(sure, ([wrong, right], [9.0, 9.0]), nothing) == {0: right.tolist(), 1: right.tolist()}

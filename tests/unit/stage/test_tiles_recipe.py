@@ -89,6 +89,8 @@ def test_tiles_of_several_sizes_lie_where_they_are(tmp_path: Path) -> None:
     x, y = np.rint(places[4] - places.min(axis=0)).astype(int) + 80
     near = [mosaic[y + v : y + v + 60, x + u : x + u + 60] for v in (-1, 0, 1) for u in (-1, 0, 1)]
     assert any(np.array_equal(part, TILES[4][80:140, 80:140]) for part in near)
+    with pytest.raises(ArgumentError, match="tiles of different sizes do not show λ"):
+        rdstitch.tiles(tmp_path, positions=tmp_path / "positions.csv", distortion="auto")
 
 
 def test_another_channel_keeps_the_frame_whatever_tiles_it_lacks(tmp_path: Path) -> None:

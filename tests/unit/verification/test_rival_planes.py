@@ -1,6 +1,9 @@
 """Of two motions in the same images, which is that of the plane?"""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+from time import sleep
 
 import numpy as np
 import pytest
@@ -9,13 +12,16 @@ from examples.worlds.correspondences import stored
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.inputs.source import Source
+from rdstitch.io import DecodedImage, Metadata
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic.textures import ground
+from rdstitch.verification import rival_planes
 from rdstitch.verification.overlap_check import ComparedImages
-from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey
+from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey, overlap_agreement
 from rdstitch.verification.rival_planes import _least_needed, fills_at_most, planes_of_pairs
-from tests.registrations import registration
+from tests.registrations import registration, source
 
 SIZE = (400, 300)
 LENS = Camera(SIZE)
@@ -76,6 +82,28 @@ def test_every_pair_is_moved_as_its_plane_does(monkeypatch: pytest.MonkeyPatch) 
         assert pair.relation.inliers.tolist() == (np.arange(len(pair.matches)) < 40).tolist()
         moved = pair.relation.transfer([[200.0, 150.0]])
         np.testing.assert_allclose(moved, [[200.0 - STEP, 150.0]], atol=0.5)
+
+
+def test_pairs_are_compared_by_threads_and_each_image_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    together, reads = Barrier(2), list[str]()
+
+    def compared(first: ComparedImage, second: ComparedImage) -> Agreement:
+        together.wait(10.0)
+        return overlap_agreement(first, second)
+
+    def read(own: Source, *_: object, **__: object) -> DecodedImage:
+        reads.append(own.name)
+        sleep(0.02)
+        return DecodedImage(np.zeros(SIZE[::-1], np.uint8), None, Metadata(SIZE))
+
+    monkeypatch.setattr(Source, "read", read)
+    images = ComparedImages([source("a.png"), source("b.png")], None, 8)
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda k: images.placed(k % 2, LENS, np.eye(3)), range(16)))
+    assert sorted(reads) == ["a.png", "b.png"]
+    monkeypatch.setattr(rival_planes, "overlap_agreement", compared)
+    pairs = (_pair(0, 1, 40, 60), _pair(1, 2, 40, 25))
+    assert planes_of_pairs(_registered(monkeypatch, _images(0.35, 3), [0, 0, 0], pairs), 3.0, threads=2) is not None
 
 
 def test_what_drives_ahead_says_nothing_of_the_lens(monkeypatch: pytest.MonkeyPatch) -> None:

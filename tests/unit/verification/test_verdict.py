@@ -85,8 +85,10 @@ def test_a_wrong_pair_beside_enough_right_ones_is_a_warning(good: Registration) 
 @pytest.mark.parametrize(("share", "fails"), [(0.45, True), (0.55, False)])
 def test_matches_of_which_less_than_half_agree_fail(good: Registration, share: float, fails: bool) -> None:
     links = tuple(replace(fit, count=1000, inliers=int(1000 * share)) for fit in good.alignment.links)
-    found = _texts(replace(good, alignment=replace(good.alignment, links=links)), Purpose.CALIBRATE)
-    assert any("matches fit the places that were found" in text for text in found) is fails
+    disagreeing = replace(good, alignment=replace(good.alignment, links=links))
+    for purpose in (Purpose.CALIBRATE, Purpose.TRAJECTORY):
+        found = _texts(disagreeing, purpose)
+        assert any("matches fit the places that were found" in text for text in found) is fails
     assert any("stitch them on their own" in text for text in found) is fails
 
 

@@ -1,0 +1,16 @@
+"""Peaks between samples."""
+
+from typing import Any
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+
+
+def parabola_peak(before: Any, here: Any, after: Any) -> tuple[FloatArray, FloatArray]:
+    """Where parabolas through three neighbouring values (...) of a peak are highest, and how high they are there.
+
+    The place is given from the middle value on, in steps, at most half of one.
+    """
+    rise, curvature = np.subtract(after, before, dtype=np.float64), np.minimum(before + after - 2.0 * here, -1e-9)
+    return np.clip(-rise / (2.0 * curvature), -0.5, 0.5), here - rise**2 / (8.0 * curvature)

@@ -1,0 +1,108 @@
+"""Evidence for where the second of two tiles lies in the first, in nats (logarithms of odds), and what decides by it.
+
+An overlap whose pixels correlate by 0.6 has about 6 nats, one by 0.9 about 10: it counts for 24 independent pixels at
+the most.
+"""
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.robust.loss import normal_std
+from rdstitch.stage.coarse_tile import CORRELATED, CoarseTile, energies, noise_variance
+from rdstitch.stage.overlap import Overlap
+from rdstitch.stage.phase_correlation import peak_threshold, peaks, taper, whiten
+from rdstitch.system.late_imports import fft
+
+HUNDRED_TO_ONE = math.log(100.0)  # by which a place of a pair stands out against another, or against nothing
+WRONG_PEAK = 6.0  # below which a pair is looked for elsewhere: a peak of about 0.6 may be one of a pattern
+MIN_AXES_EVIDENCE = 10.0  # below which tiles show no other axes than told: one overlap that correlates by 0.9
+ANYWHERE = math.log(1e-3)  # prior that a tile is anywhere but where its stage was sent, within its errors
+
+_UNLIKE = 0.2  # share of the variance that two images of the same may differ by: interpolation, bleaching, focus
+_INDEPENDENT = 24  # independent pieces of evidence that the pixels of an overlap count for
+_CONTENT = 0.02  # least share of the variance that is content: the noise is not known better
+_WIDE_PEAKS = 6  # highest peaks of two whole tiles that are compared by their normalized cross-correlation
+_EDGE = 0.02  # the taper of whole tiles, whose overlap is at their border
+_MIN_STEP = 0.35  # displacement of neighbours along one of the axes, at least, share of the side
+_MIN_COMMON = 0.02  # share of the side that neighbours have in common, at least
+
+
+def log_evidence(
+    tiles: Sequence[CoarseTile], overlap: Overlap, place: FloatArray, shifts: FloatArray | None = None
+) -> float:
+    """How much more likely two tiles are with the second at a place (2,) in the first than anywhere else, in nats.
+
+    By their normalized cross-correlation in the blocks of the overlap, each displaced by its shift (K, 2) besides, but
+    for their noise. However many pixels an overlap has, they count as few: neighbours are alike, and what interpolation
+    and bleaching change is not independent.
+    """
+    first, second = (tile.content for tile in tiles)
+    noise = np.array([tile.noise for tile in tiles])
+    shifts = np.zeros((len(overlap.blocks), 2)) if shifts is None else shifts
+    products, pixels, features = np.zeros(3), 0, np.zeros(2)
+    for block, moved in zip(overlap.blocks, place + shifts, strict=True):
+        low = np.maximum(np.maximum(block[:2], np.ceil(moved).astype(np.intp)), 0)
+        high = np.minimum(
+            np.minimum(block[2:], np.floor(moved).astype(np.intp) + second.shape[::-1]), first.shape[::-1]
+        )
+        width, height = (high - low).tolist()
+        if min(width, height) < 2:
+            continue
+        x, y = (low - moved).tolist()
+        a = first[low[1] : high[1], low[0] : high[0]]
+        middle = x + (width - 1) / 2.0, y + (height - 1) / 2.0
+        b = np.asarray(cv2.getRectSubPix(second, (width, height), middle), dtype=np.float32)
+        products += [float(np.vdot(a, a)), float(np.vdot(b, b)), float(np.vdot(a, b))]
+        features += energies(a)
+        pixels += width * height
+    if pixels < CORRELATED or not min(products[:2]) > 0.0:
+        return 0.0
+    content = np.maximum(products[:2] - noise * pixels / CORRELATED, _CONTENT * products[:2])
+    correlation = min(1.0, max(0.0, products[2]) / math.sqrt(float(content.prod())))
+    chance = math.sqrt(CORRELATED / pixels * float((products[:2] / content).prod()))
+    # As many pixels as the energy is spread over, and as are independent: a single bright spot is like any other.
+    count = min(_INDEPENDENT, float(products[0] * features[1] / (2.0 * math.pi * max(features[0], 1e-30))))
+    unlike = _UNLIKE + 2.0 * chance
+    return -0.5 * count * math.log((1.0 - correlation**2 + unlike) / (1.0 + unlike))
+
+
+def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
+    """Places of the second tile in the first (K, 2), wherever along a side, and the evidence for them (K,), nats.
+
+    Of the highest peaks of two whole tiles; where they nearly coincide they share the camera and not the specimen.
+    """
+    first, second = (tile.pixels for tile in tiles)
+    sizes = np.array([first.shape, second.shape])
+    shape = tuple(int(fft.next_fast_len(int(side), real=True)) for side in sizes.sum(axis=0))
+    frames, noise = np.zeros((2, *shape), dtype=np.float32), []
+    for frame, tile in zip(frames, (first, second), strict=True):
+        weights = taper(tile.shape[0], _EDGE)[:, None] * taper(tile.shape[1], _EDGE)
+        frame[: tile.shape[0], : tile.shape[1]] = (tile - tile.mean()) * weights
+        noise.append(noise_variance(tile) * float((weights**2).sum()))
+    spectra = fft.rfft2(frames)
+    product = spectra[0] * np.conj(spectra[1])
+    plain = fft.irfft2(product, s=shape)
+    whiten(product, *np.array(noise))
+    surface = fft.irfft2(product, s=shape)
+    y, x = (
+        np.where(np.arange(n) < side, np.arange(n), np.arange(n) - n) for n, side in zip(shape, sizes[0], strict=True)
+    )
+    height, width = sizes.min(axis=0)
+    common = [np.minimum(s[0], v + s[1]) - np.maximum(0, v) for v, s in ((y, sizes[:, 0]), (x, sizes[:, 1]))]
+    least = [max(2.0, _MIN_COMMON * n) for n in (height, width)]
+    aside = (np.abs(y)[:, None] > _MIN_STEP * height) | (np.abs(x) > _MIN_STEP * width)
+    broad = (common[0][:, None] > 0.5 * height) | (common[1] > 0.5 * width)
+    possible = aside & broad & (common[0][:, None] > least[0]) & (common[1] > least[1])
+    deviation = normal_std(surface[possible]) + 1e-12
+    found: dict[tuple[int, int], None] = {}
+    # A pattern that repeats itself is as high in many places of the plain correlation, and in chance ones of the other.
+    for values, threshold in ((surface, peak_threshold(deviation, surface.size)), (plain, 0.0)):
+        shown = np.where(possible, values, 0.0).astype(np.float32)
+        found |= dict.fromkeys((int(x[column]), int(y[row])) for column, row in peaks(shown, threshold, _WIDE_PEAKS))
+    places = np.array(list(found), dtype=np.float64).reshape(-1, 2)
+    boxes = [Overlap.expected(0, 1, place, sizes[:, ::-1], 1) for place in places]
+    return places, np.array([log_evidence(tiles, box, at) for at, box in zip(places, boxes, strict=True)])
