@@ -74,7 +74,7 @@ def descend(
 ) -> tuple[FloatArray, Equations]:
     """Where at most so many steps lead to, parameters of shape (B, K), and the equations there.
 
-    Damping rises twentyfold or falls tenfold, which suffices for a pair (:func:`damping_by_gain` is for many images together).
+    Damping falls tenfold or rises twentyfold, which suffices for a pair; :func:`damping_by_gain` is for many images.
     A problem that has converged takes no further part, so that each is solved as if it were alone. ``loose``: another
     descent goes on from there.
     """
