@@ -137,7 +137,7 @@ def print_result(registration: "Registration", reporter: Reporter, output: Path)
     reporter.finish()
     warn_of(registration, reporter)
     alignment = registration.alignment
-    observable = alignment.distortion_std < float("inf")
+    observable = alignment.lens_observable
     print_line(
         {
             "output": str(output),

@@ -25,7 +25,7 @@ from rdstitch.io.reduction import fitting_reduction
 from rdstitch.results.registration import Registration
 from rdstitch.system.dataclasses import dataclass, field, replace
 
-_COMPARED, _COMPARED_SIDE = 8, 400
+_STATIC_SAMPLE, _STATIC_SIDE = 8, 400
 """Images, and pixels of their longer side, that are compared to find what is static in them."""
 
 
@@ -88,8 +88,8 @@ class PlacedImages:
         if self.whole or count < MIN_IMAGES:
             return None
         alike = [s for s, camera in zip(self.sources, self.cameras, strict=True) if camera.image_size == size]
-        chosen = evenly_spaced(count, _COMPARED).tolist()
-        reduction = fitting_reduction(max(size) / _COMPARED_SIDE)
+        chosen = evenly_spaced(count, _STATIC_SAMPLE).tolist()
+        reduction = fitting_reduction(max(size) / _STATIC_SIDE)
         return static_pixels([alike[k].read(reduction, keep=True).pixels for k in chosen])
 
     @property
