@@ -16,10 +16,9 @@ from rdstitch.executors.processes import ProcessExecutor
 
 __all__ = ["LOCAL", "DaskExecutor", "ProcessExecutor", "batches", "in_order", "open_executor"]
 
-_PROCESSES_FROM = 60
-"""Images from which on it pays to start worker processes: each takes a second to begin with, and an image a third of
-one, so that the start is at most a twentieth of the work. Threads share the interpreter, which matching and estimation
-keep busy."""
+_PROCESSES_FROM = 24
+"""Images from which on it pays to start worker processes: each takes a second to begin with, and an image half a one.
+Threads share the interpreter, which matching and estimation keep busy: two gain a quarter or less."""
 
 _MAX_PENDING = 256  # tasks that have been submitted and whose results were not taken: enough for that many workers
 

@@ -20,6 +20,7 @@ from rdstitch.matching.links import Link
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.system.cache import Cache
 from rdstitch.system.dataclasses import dataclass, replace
+from rdstitch.system.process_memory import return_freed_memory
 
 Pair = tuple[int, int]
 
@@ -83,6 +84,7 @@ def match_pairs(
     tasks: Sequence[MatchingTask], *, matcher: Matcher, matcher_key: tuple[float | str | None, ...], cache: Cache
 ) -> list[StoredMatches]:
     """Match the features of pairs; the key stands for the matcher in the inputs of results."""
+    return_freed_memory()  # what detection has kept
     # Pairs that follow one another have an image in common, and the next ones its neighbours: a megabyte each.
     load = lru_cache(maxsize=8)(StoredFeatures.load)
     result = []

@@ -1,7 +1,6 @@
 """Stage: check a registration; what fails a check is left out by name, and the rest is aligned anew."""
 
 from collections.abc import Callable, Iterator, Sequence
-from itertools import chain
 
 import numpy as np
 
@@ -10,7 +9,7 @@ from rdstitch.alignment.result import Alignment, LinkFit, links_by_image
 from rdstitch.errors import PartialResultError
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.pipeline.aligner import Aligner, impossible_estimates_fail
-from rdstitch.pipeline.realign import Offenders, aligner_of, left_out_images, plane_of_most, without
+from rdstitch.pipeline.realign import Rejected, aligner_of, left_out_images, plane_of_most, without
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
@@ -61,12 +60,13 @@ def accept(registration: Registration, run: Run) -> Registration:
         evidence = ResultEvidence(candidate, options.threshold, options.threads, aligner.cache, purpose)
         return _Checked(candidate, judge(evidence))
 
-    first = last = check(registration)
+    first = check(registration)
+    tried = [first]
     repairs = iter(()) if options.force else _repairs(first, check, undamaged, aligner, options.threads)
-    for last in chain([first], repairs):
-        if not last.failures:
-            break
+    while tried[-1].failures and (repaired := next(repairs, None)) is not None:
+        tried.append(repaired)
     # Of what no repair mends the first failures are told; where nothing is left to blame, the last ones.
+    last = tried[-1]
     accepted = (last if not last.failures or last.fails_as_whole else first).with_messages()
     if accepted.failures and not options.force:
         raise RefusedError(at_full_size(accepted))
@@ -89,14 +89,14 @@ def _repairs(
     plane = None if aligner.options.purpose.lens_only else plane_of_most(first.registration, aligner, threads)
     if plane is not None and not (checked := check(plane)).fails_as_whole:
         yield (start := checked)
-    current, offenders = start, dict[tuple[int, ...], Message]()
+    current, rejected = start, dict[tuple[int, ...], Message]()
     for _ in range(_MAX_ROUNDS):
         if current.fails_as_whole:
             return
-        offenders |= _worst(current)
-        rest = without(start.registration, offenders, aligner)
+        rejected |= _worst(current)
+        rest = without(start.registration, rejected, aligner)
         # Where as many images fail as pass, nobody can say which of them are right.
-        if rest is None or rest.alignment.used.sum() <= len(left_out_images(offenders)):
+        if rest is None or rest.alignment.used.sum() <= len(left_out_images(rejected)):
             return
         yield (current := check(rest))
 
@@ -122,7 +122,7 @@ def _is_simpler(model: str, former: str) -> bool:
     return {model, former} <= set(by_freedom) and by_freedom.index(model) < by_freedom.index(former)
 
 
-def _worst(checked: _Checked) -> Offenders:
+def _worst(checked: _Checked) -> Rejected:
     """The worst images, no two of them linked, since a bad image spoils its neighbours; else the failing pairs."""
     registration, failures = checked.registration, checked.failures
     single = {finding.images[0]: finding for finding in failures if finding.kind.scope is Scope.IMAGE}

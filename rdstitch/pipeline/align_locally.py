@@ -33,6 +33,7 @@ def align_registration_locally(
     if choice == "off":
         return no_local_alignment("switched off")
     alignment = registration.alignment
+    used, poses = np.flatnonzero(alignment.used), alignment.poses
     position = np.cumsum(alignment.used) - 1
     pairs = [
         pair
@@ -48,12 +49,10 @@ def align_registration_locally(
         with ThreadPoolExecutor(threads) as pool:
             return list(pool.map(edges or (lambda k: straight_edges(registration.sources[k])), used[images].tolist()))
 
-    cameras = [camera for camera, used in zip(alignment.cameras, alignment.used, strict=True) if used]
-    used, poses = np.flatnonzero(alignment.used), alignment.poses
     return align_locally(
         map(match, pairs),
-        cameras,
-        alignment.homographies[alignment.used],
+        [alignment.cameras[k] for k in used],
+        alignment.homographies[used],
         choice,
         pairs=len(pairs),
         on_sphere=alignment.on_sphere,

@@ -152,7 +152,10 @@ class Aligner:
         if not any(pair.relation for pair in pairs):
             raise RegistrationError(_no_overlap(self.paths, pairs))
         copies = copies_of(pairs)
-        related = distinct(pairs, copies) or distinct(pairs, copies := {})
+        related = distinct(pairs, copies)
+        if not related:  # all images show the same
+            copies = {}
+            related = distinct(pairs, copies)
         most, quarters = most_matches_read(len(related), self.options), self._quarters
         cameras = tuple(quarters.stored_camera(camera, k) for k, camera in enumerate(self.cameras))
         named = (replace(pair.link().thinned(most), image1=i, image2=j) for (i, j), pair in related.items())

@@ -17,7 +17,7 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.band_lens import BandLens, band_lens
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.compose import Layout, compose_images
+from rdstitch.pipeline.compose import CanvasPlan, compose_images
 from rdstitch.pipeline.deep_zoom_page import plainly_viewed, write_page
 from rdstitch.pipeline.replacements import Replacements, read_replacements
 from rdstitch.pipeline.run import Run
@@ -29,7 +29,7 @@ from rdstitch.sidecar.counterparts import registered_files
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
 from rdstitch.sidecar.recomposition import Recomposition
 from rdstitch.sidecar.write_applied import applied_sidecar
-from rdstitch.stage.tile_frames import with_position_folders
+from rdstitch.stage.tile_inputs import with_position_folders
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, json_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent
@@ -137,27 +137,27 @@ def apply_found(
     given = read_replacements(saved, listed.frames, options, run.guard, run.options.composite.max_memory)
     if output is not None:
         check_world_files([output], list(given.sources.values()), options.overwrite)
-    layout, run, of_layout = _laid_out(saved, given, run)
-    composed, of_output = compose_images(layout, run, outputs)
-    sources = dict(zip(given.sources, layout.placed.sources, strict=True))
+    plan, run, of_plan = _laid_out(saved, given, run)
+    composed, of_output = compose_images(plan, run, outputs)
+    sources = dict(zip(given.sources, plan.placed.sources, strict=True))
     result = Recomposition(
         saved=saved,
         sources=tuple(map(sources.get, range(len(saved.images)))),
         matched=given.matched,
         left_out=given.left_out,
-        messages=(*given.messages, *of_layout, *listed.messages, *run.guard.messages, *of_output),
+        messages=(*given.messages, *of_plan, *listed.messages, *run.guard.messages, *of_output),
         **composed.fields,
     )
     if options.dry_run or output is None:
         return result
     page = partial(plainly_viewed, result.canvas, [source.name for source in sources.values()])
     result = replace(result, messages=(*result.messages, *write_page(result, outputs, page)))
-    record = applied_sidecar(saved, result, sources, list(layout.placed.homographies), given.left_out, given.matched)
+    record = applied_sidecar(saved, result, sources, list(plan.placed.homographies), given.left_out, given.matched)
     outputs.write(f"{output}.json", json_bytes(record))
     return result
 
 
-def _laid_out(saved: SavedRegistration, given: Replacements, run: Run) -> tuple[Layout, Run, list[Message]]:
+def _laid_out(saved: SavedRegistration, given: Replacements, run: Run) -> tuple[CanvasPlan, Run, list[Message]]:
     """Where the images lie, by the sidecar and the lens of their band, and how they are composed there."""
     sources, composite = given.sources, run.options.composite
     # Channels of a microscope have their places in common, not their content.
@@ -169,7 +169,7 @@ def _laid_out(saved: SavedRegistration, given: Replacements, run: Run) -> tuple[
     if (grid := _same_grid(saved, sources, composite)) is not None:
         placed, composite = replace(placed, grid=grid), replace(composite, crop="none")
     run = replace(run, options=replace(run.options, composite=composite))
-    return Layout.of(placed, composite), run, [*messages, *of_turn]
+    return CanvasPlan.of(placed, composite), run, [*messages, *of_turn]
 
 
 def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions) -> SavedGrid | None:

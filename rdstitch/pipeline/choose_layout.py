@@ -4,6 +4,10 @@ Where those of the most probable layout are seen to break, or it stretches what 
 hypotheses that join the same images are laid out at the size that seams are found at, and the one of which a person
 sees the least is taken: without local alignment, by another surface of the scene, a turn of the camera, a plane, free
 homographies, and, where something fills a good part of the images and moves of its own, what lies behind it.
+
+:func:`choose_layout` has each hypothesis laid out (:func:`rdstitch.pipeline.lay_out.lay_out`), which plans its canvas
+(:meth:`rdstitch.pipeline.compose.CanvasPlan.of`) and then decides its exposure and seams
+(:meth:`~rdstitch.pipeline.compose.CanvasPlan.decided`); what it chooses is composed without deciding again.
 """
 
 import math
@@ -23,7 +27,7 @@ from rdstitch.matching.copies import copies_of, distinct
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.align_locally import align_registration_locally, straight_edges
 from rdstitch.pipeline.aligner import Aligner
-from rdstitch.pipeline.lay_out import IMAGE_GRID, LaidOut, is_stretched, lay_out
+from rdstitch.pipeline.lay_out import IMAGE_GRID, CandidateLayout, is_stretched, lay_out
 from rdstitch.pipeline.realign import by_second_motions, plane_of_most, realigned
 from rdstitch.pipeline.register import with_frontal_reference
 from rdstitch.pipeline.whole_pixels import on_whole_pixels
@@ -42,10 +46,10 @@ _CLEARLY = 0.5
 _MISFIT = 2.0
 """Times the errors of the most probable layout that another one may have."""
 
-_COMPARED = 500
+_SAMPLED_PAIRS = 500
 """Pairs whose matches say how large errors are."""
 
-_ELSEWHERE, _MOST = 3.0 / DIAGONAL, 0.95
+_MIN_SHIFT, _SHIFT_QUANTILE = 3.0 / DIAGONAL, 0.95
 """Of an image's diagonal: by how much another layout must move more than a few places of the overlaps for its seams to
 be others."""
 
@@ -63,7 +67,7 @@ class _Trials:
     pano: bool
     edges_of: Callable[[int], FloatArray]  # straight edges in an image
 
-    def lay_out(self, registration: Registration, local: LocalAlignment | None = None) -> LaidOut:
+    def lay_out(self, registration: Registration, local: LocalAlignment | None = None) -> CandidateLayout:
         """Lay out a registration in pixels of the working size."""
         options = self.options
         whole = on_whole_pixels(with_frontal_reference(at_full_size(registration), options, always=self.pano))
@@ -72,23 +76,23 @@ class _Trials:
         laid_out = lay_out(whole, local, options.composite)
         if options.dry_run:
             return laid_out
-        return replace(laid_out, layout=laid_out.layout.decided(options.compositing))
+        return replace(laid_out, plan=laid_out.plan.decided(options.compositing))
 
-    def attempt(self, registration: Registration) -> LaidOut | None:
-        """The same of an alternative; None where it has no canvas, or none that the options can turn."""
+    def attempt(self, registration: Registration) -> CandidateLayout | None:
+        """Lay out an alternative registration; None where it has no canvas, or none that the options can turn."""
         with suppress(LimitError, ArgumentError):
             return self.lay_out(registration)
         return None
 
 
-def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner) -> LaidOut:
+def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner) -> CandidateLayout:
     """The layout whose seams hold, or break the least; of a panorama always in the frame of an image.
 
     Pixels are those of the working size.
     """
     edges_of = cache(lambda image: straight_edges(registration.sources[image]))
     trials = _Trials(options, aligner.options.purpose is Purpose.PANO, edges_of)
-    first: LaidOut | LimitError
+    first: CandidateLayout | LimitError
     try:
         first = trials.lay_out(registration)
         if options.dry_run:
@@ -97,9 +101,9 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         if options.dry_run:
             raise
         first = error
-    if isinstance(first, LimitError) or first.layout.seams.contradicted:
+    if isinstance(first, LimitError) or first.seams.contradicted:
         registration, first = _plane_behind(registration, first, trials, aligner)
-    tried = [first] if isinstance(first, LaidOut) else []
+    tried = [first] if isinstance(first, CandidateLayout) else []
     for other in _alternatives(registration, tried, trials, aligner):
         tried.append(other)
         # Of those that nothing speaks against, the most probable is taken.
@@ -108,28 +112,28 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
     if isinstance(first, LimitError) and not tried:
         raise first
     best = _least_broken(tried, first)
-    if best.layout.seams.by_chance and not options.force:
+    if best.seams.by_chance and not options.force:
         raise RefusedError(best.registration.with_messages([_BY_CHANCE]))
     return best
 
 
 def _plane_behind(
-    registration: Registration, first: LaidOut | LimitError, trials: _Trials, aligner: Aligner
-) -> tuple[Registration, LaidOut | LimitError]:
+    registration: Registration, first: CandidateLayout | LimitError, trials: _Trials, aligner: Aligner
+) -> tuple[Registration, CandidateLayout | LimitError]:
     """The plane behind what moves of its own, with its layout, where its images look more alike; else what is given."""
     plane = plane_of_most(registration, aligner, trials.options.threads)
     if plane is None or not _joins(plane, registration, aligner.threshold):
         return registration, first
     behind = trials.attempt(plane)
     # What is put where it does not belong is unlike all over what the images show.
-    if behind is None or (isinstance(first, LaidOut) and behind.layout.seams.fills <= first.layout.seams.fills):
+    if behind is None or (isinstance(first, CandidateLayout) and behind.seams.fills <= first.seams.fills):
         return registration, first
     return plane, behind
 
 
 def _alternatives(
-    registration: Registration, tried: Sequence[LaidOut], trials: _Trials, aligner: Aligner
-) -> Iterator[LaidOut]:
+    registration: Registration, tried: Sequence[CandidateLayout], trials: _Trials, aligner: Aligner
+) -> Iterator[CandidateLayout]:
     """Other layouts, the likeliest first, where something speaks against the first one, or it has no canvas."""
     first = tried[0] if tried else None
     if first is not None and not first.faults:
@@ -143,39 +147,41 @@ def _alternatives(
             yield laid_out
 
 
-def _other_surface(registration: Registration, first: LaidOut, trials: _Trials, aligner: Aligner) -> LaidOut | None:
+def _other_surface(
+    registration: Registration, first: CandidateLayout, trials: _Trials, aligner: Aligner
+) -> CandidateLayout | None:
     """By the second motion of the images whose seams break; None where no more of them looks alike then."""
     used = np.flatnonzero(registration.alignment.used).tolist()
-    broken = [(used[one.images[0]], used[one.images[1]]) for one in first.layout.seams.breaks]
+    broken = [(used[one.images[0]], used[one.images[1]]) for one in first.seams.breaks]
     other = by_second_motions(registration, broken, aligner)
     if other is None or not _joins(other, registration, _MISFIT * _error(registration)):
         return None
     reason = f"{other.alignment.model_reason}; by another surface of the scene, where seams break less"
     laid_out = trials.attempt(replace(other, alignment=replace(other.alignment, model_reason=reason)))
-    if laid_out is None or laid_out.layout.seams.fills < first.layout.seams.fills:
+    if laid_out is None or laid_out.seams.fills < first.seams.fills:
         return None
     return laid_out
 
 
-def _least_broken(tried: Sequence[LaidOut], given: LaidOut | LimitError) -> LaidOut:
+def _least_broken(tried: Sequence[CandidateLayout], given: CandidateLayout | LimitError) -> CandidateLayout:
     """The layout that the least speaks against; the one that was given unless another is clearly better."""
     first = tried[0]
     best = min((one for one in tried if one.clipped <= first.clipped), key=lambda one: (one.faults, one.broken))
-    broken = first.broken if first.layout.seams.seen else 0
+    broken = first.broken if first.seams.seen else 0
     clearly = best.faults < first.faults or best.broken <= _CLEARLY * broken
     return best if clearly or isinstance(given, LimitError) else first
 
 
 def _other_models(
-    registration: Registration, first: LaidOut | None, options: StitchOptions, aligner: Aligner
+    registration: Registration, first: CandidateLayout | None, options: StitchOptions, aligner: Aligner
 ) -> Iterator[Registration]:
     """The same images aligned by other models, where every one finds its place."""
     alignment = registration.alignment
     # What breaks along seams may have moved, and proves nothing against a layout that fits; one that is stretched does.
-    stretched = first is None or is_stretched(first.layout)
+    stretched = first is None or is_stretched(first.plan)
     allowed = max(options.threshold * stretched, _MISFIT * _error(registration))
     names = [name for name in _MODELS if name != alignment.model] if options.model == "auto" else []
-    if first is not None and first.layout.placed.has_place:  # a map needs a plane with a metric
+    if first is not None and first.plan.placed.has_place:  # a map needs a plane with a metric
         names = [name for name in names if name == "pose"]
     for name in names:
         by_name = replace(aligner, options=replace(aligner.options, model=name))
@@ -202,7 +208,7 @@ def _error(registration: Registration) -> float:
     used, transfer = registration.alignment.used, registration.alignment.transfer
     distinct_pairs = distinct(registration.pairs, copies_of(registration.pairs)).values()
     pairs = [pair for pair in distinct_pairs if used[pair.image1] and used[pair.image2]]
-    some = [pairs[k] for k in evenly_spaced(len(pairs), _COMPARED).tolist()]
+    some = [pairs[k] for k in evenly_spaced(len(pairs), _SAMPLED_PAIRS).tolist()]
     errors = np.concatenate([np.zeros(0), *(pair.errors(transfer)[pair.relation.inliers] for pair in some)])
     return float(np.median(np.nan_to_num(errors, nan=np.inf))) if len(errors) else math.inf
 
@@ -220,4 +226,4 @@ def _differs(registration: Registration, allowed: float, other: Alignment, *, st
         before, after = (one.transfer(i, j, points) for one in (alignment, other))
         inside = ((before >= 0.0) & (before < alignment.cameras[j].image_size)).all(axis=1)
         moved.append(np.linalg.norm(after - before, axis=1)[inside] / (2.0 * alignment.cameras[j].scale))
-    return not np.quantile(np.nan_to_num(np.concatenate(moved), nan=np.inf), _MOST) <= _ELSEWHERE
+    return not np.quantile(np.nan_to_num(np.concatenate(moved), nan=np.inf), _SHIFT_QUANTILE) <= _MIN_SHIFT

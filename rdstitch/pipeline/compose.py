@@ -28,7 +28,7 @@ from rdstitch.io.formats import check_memory, check_size
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.options.upright_options import Corners
-from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
+from rdstitch.pipeline.map_canvas import place_messages, place_on_canvas, plan_on_map
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
@@ -46,7 +46,7 @@ from rdstitch.verification.output_messages import (
 
 
 @dataclass(frozen=True)
-class Layout:
+class CanvasPlan:
     """Images on a canvas, and what was decided on small versions of them."""
 
     placed: PlacedImages
@@ -66,7 +66,7 @@ class Layout:
         return cls(placed, canvas, placed.images(canvas.near), place, reason)
 
     def decided(self, options: CompositeOptions) -> Self:
-        """With exposure and seams."""
+        """The plan with exposure, seams and crop of its images, decided on small versions of them."""
         return replace(self, decisions=decide(self.images, self.canvas, options))
 
     @property
@@ -76,20 +76,20 @@ class Layout:
 
 
 def compose_images(
-    layout: Layout, run: Run, outputs: Outputs, elsewhere: BlockRunner | None = None
+    plan: CanvasPlan, run: Run, outputs: Outputs, run_blocks: BlockRunner | None = None
 ) -> tuple[OutputImage, list[Message]]:
     """See whether a file can hold the canvas, and put the images on it; of a dry run the plan alone.
 
     Without an output the image is made in memory; a file has colour profile and EXIF of the first image, and its place
-    on the Earth. ``elsewhere``: see :func:`rdstitch.compositing.compose_decided`. With it comes what the user should
+    on the Earth. ``run_blocks``: see :func:`rdstitch.compositing.compose_decided`. With it comes what the user should
     know, such as why nothing was cropped.
     """
     return_freed_memory()
     options = run.options.compositing
-    placed, canvas, place, output = layout.placed, layout.canvas, layout.georeference, run.output
+    placed, canvas, place, output = plan.placed, plan.canvas, plan.georeference, run.output
     messages = [
         *masked_messages(placed),
-        *place_messages(place, layout.not_georeferenced, placed),
+        *place_messages(place, plan.not_georeferenced, placed),
         *cut_away_messages(placed, canvas, options),
     ]
     # A crop may yet make it fit.
@@ -102,33 +102,33 @@ def compose_images(
         options=run.options,
         output=None if output is None else Path(output),
         georeference=place,
-        not_georeferenced=layout.not_georeferenced,
+        not_georeferenced=plan.not_georeferenced,
     )
     if run.options.dry_run:
-        return replace(composed, plan=planned(layout.images, canvas, options)), messages
-    layout = layout if layout.decisions is not None else layout.decided(options)
-    assert layout.decisions is not None
-    if layout.photographs:
-        messages += seam_messages(layout.seams, [str(source.path) for source in placed.sources])
+        return replace(composed, plan=planned(plan.images, canvas, options)), messages
+    plan = plan if plan.decisions is not None else plan.decided(options)
+    assert plan.decisions is not None
+    if plan.photographs:
+        messages += seam_messages(plan.seams, [str(source.path) for source in placed.sources])
 
     def report(share: float) -> None:
         run.progress("compositing", round(100 * share), 100)
 
     def tags(final: Canvas) -> list[ExtraTag]:
-        on_final = moved(place, canvas, final)
+        on_final = place_on_canvas(place, canvas, final)
         return [] if on_final is None else on_final.tiff_tags()
 
     made: Composite | FileComposite
     if output is None:
-        made = composite = compose_decided(layout.decisions, report, elsewhere)
+        made = composite = compose_decided(plan.decisions, report, run_blocks)
         composed = replace(composed, composite=composite)
     else:
         metadata = _metadata(placed.sources[0], options)
         made = written = compose_to_file(
-            output, layout.decisions, report, elsewhere, metadata=metadata, extra_tags=tags, outputs=outputs
+            output, plan.decisions, report, run_blocks, metadata=metadata, extra_tags=tags, outputs=outputs
         )
         composed = replace(composed, written=written)
-    place = moved(place, canvas, made.canvas)
+    place = place_on_canvas(place, canvas, made.canvas)
     messages += made.messages
     if output is not None:
         messages += [
@@ -137,7 +137,7 @@ def compose_images(
         ]
         if place is not None and (files := world_file_paths(output) if placed.has_place else ()):
             messages += outputs.attempt(files[0], partial(_write_world_files, outputs, files, place))
-    return replace(composed, canvas=made.canvas, georeference=place, seams=layout.seams), messages
+    return replace(composed, canvas=made.canvas, georeference=place, seams=plan.seams), messages
 
 
 def _metadata(source: Source, options: CompositeOptions) -> Metadata:

@@ -86,6 +86,7 @@ def detect_batch(
     sources: Sequence[Source], *, options: FeatureOptions, store: Cache
 ) -> list[StoredFeatures | InputError]:
     """The features of each image, or why it cannot be read."""
+    reuse_freed_memory()  # also in a worker, whose later tasks return it
     detected: list[StoredFeatures | InputError] = []
     for source in sources:
         try:
@@ -128,7 +129,6 @@ def detect_by_contrast(
     progress: Progress,
 ) -> DetectedFeatures:
     """Detect the features of all images, if necessary once more; see :func:`detect_features`."""
-    reuse_freed_memory()
     detect = partial(detect_features, executor=executor, store=store, guard=guard, skip_bad=skip_bad, progress=progress)
     stretch_of = partial(_stretch_of, options=options, executor=executor, store=store, guard=guard)
     depths = {source.metadata.bit_depth > 8 for source in sources}
@@ -136,7 +136,7 @@ def detect_by_contrast(
     options = replace(options, stretch=stretch)
     detected = detect(sources, options)
     # Samples of two kinds have no grey levels in common: each image is stretched on its own.
-    poor = [] if options.equalize is not None or len(depths) > 1 else _show_little(sources, detected, options)
+    poor = [] if options.equalize is not None or len(depths) > 1 else _of_low_contrast(sources, detected, options)
     all_of_them = tuple(range(len(sources)))
     if not poor:
         return replace(detected, equalized=all_of_them if options.equalize else ())
@@ -145,21 +145,21 @@ def detect_by_contrast(
     wanted = [sources[k] for k in chosen]
     common = options.stretch or stretch_of(wanted)
     again = detect(wanted, replace(options, stretch=common, equalize=True))
-    if np.median(_shown(again.features.items)) <= np.median(_shown(detected.features.items)[list(chosen)]):
+    if np.median(_counts_of(again.features.items)) <= np.median(_counts_of(detected.features.items)[list(chosen)]):
         return detected
     items = dict(enumerate(detected.features.items)) | dict(zip(chosen, again.features.items, strict=True))
     features = FeatureStore(tuple(items.values()))
     return replace(detected, features=features, stretch=common if most else stretch, equalized=chosen)
 
 
-def _show_little(sources: Sequence[Source], detected: DetectedFeatures, options: FeatureOptions) -> list[int]:
+def _of_low_contrast(sources: Sequence[Source], detected: DetectedFeatures, options: FeatureOptions) -> list[int]:
     """The images that show few features for their size, or for what the set shows, for want of contrast.
 
     Counted are those of the working size: that there are more pixels, in which more is found, is no contrast. A board
     of black and white squares shows few, but strong ones; equalization would only add the noise of what is plain.
     """
     most, megapixels = options.limits
-    counts, poor = np.minimum(_shown(detected.features.items), most), []
+    counts, poor = np.minimum(_counts_of(detected.features.items), most), []
     usual = float(np.median(np.delete(counts, list(detected.damaged)))) if len(detected.damaged) < len(counts) else 0.0
     for index, (source, count) in enumerate(zip(sources, counts.tolist(), strict=True)):
         size = np.prod(source.metadata.size) / source.reduction(megapixels) ** 2 / 1e6
@@ -169,7 +169,7 @@ def _show_little(sources: Sequence[Source], detected: DetectedFeatures, options:
     return poor
 
 
-def _shown(features: Sequence[StoredFeatures]) -> IntArray:
+def _counts_of(features: Sequence[StoredFeatures]) -> IntArray:
     """Keypoints that each image shows at its working size, (N,)."""
     return np.array([item.detected_count for item in features], dtype=np.intp)
 

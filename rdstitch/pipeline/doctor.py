@@ -2,12 +2,13 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 
+from rdstitch.arrays import FloatArray
 from rdstitch.choices import ChannelOrder
 from rdstitch.compositing import CompositePlan
 from rdstitch.errors import InputError, LimitError, RegistrationError
@@ -138,60 +139,76 @@ def examine(
         When an input names nothing, or nothing can be read.
     """
     with found_images(as_inputs(inputs, channel_order), every=every, topic=topic) as listed:
-        sources, unread = read_sources(listed.frames, skip_bad=True)
-        unreadable = [f"{message.images[0]}: {message.text}" for message in unread]
-        looks: dict[int, tuple[float, float, float]] = {}
-        for index, source in enumerate(sources):
-            reduction = max(1, round(np.sqrt(np.prod(source.camera.image_size) / (_MEGAPIXELS * 1e6))))
-            try:
-                looks[index] = _look(source.read(reduction))
-            except InputError as error:
-                unreadable.append(str(error))
-            progress("examining", index + 1, len(sources))
-        if not looks:
-            raise InputError(unreadable[0] if unreadable else "there is nothing to examine")
-        plan, registration, problems = _dry_run(listed.frames, progress) if len(looks) > 1 else (None, None, ())
-    chosen, (sharpness, brightness, burnt_out) = [sources[k] for k in looks], np.array([*looks.values()]).T
+        sources, unreadable, (sharpness, brightness, burnt_out) = _measured(listed.frames, progress)
+        plan, registration, problems = _dry_run(listed.frames, progress) if len(sources) > 1 else (None, None, ())
 
     def named(which: Iterable[Any]) -> tuple[str, ...]:
-        return tuple(source.name for source, is_one in zip(chosen, which, strict=True) if is_one)
+        return tuple(source.name for source, is_one in zip(sources, which, strict=True) if is_one)
 
-    alone, overlap = named([True] * len(chosen)), None
+    alone, overlap = named([True] * len(sources)), None
     if registration is not None:
         placed = zip(registration.sources, registration.alignment.used, strict=True)
         alone, overlap = tuple(source.name for source, is_used in placed if not is_used), _overlap(registration)
-    focal, zoomed = _focal(chosen)
-    cameras = Counter(map(_camera, chosen)).most_common()
-    known = [camera for camera, _ in cameras if camera != _UNKNOWN_CAMERA]
-    blurred = named(sharpness < _BLURRED * np.median(sharpness))
-    dark, burnt = named(brightness < _DARK), named(burnt_out > _BURNT)
+    focal, zoomed = _focal(sources)
+    examination = Examination(
+        images=len(sources),
+        unreadable=tuple(unreadable),
+        sizes=tuple(Counter("{} x {}".format(*source.metadata.size) for source in sources).most_common()),
+        cameras=tuple(Counter(map(_camera, sources)).most_common()),
+        focal=focal,
+        blurred=named(sharpness < _BLURRED * np.median(sharpness)),
+        dark=named(brightness < _DARK),
+        burnt=named(burnt_out > _BURNT),
+        alone=alone,
+        overlap=overlap,
+        plan=plan,
+        advice=(),
+    )
+    return replace(examination, advice=_advice(examination, problems, zoomed=zoomed))
+
+
+def _measured(frames: Sequence[Frame], progress: Progress) -> tuple[list[Source], list[str], FloatArray]:
+    """The images that can be read, why others cannot, and sharpness, brightness and burnt-out share (3, N) of each."""
+    sources, unread = read_sources(frames, skip_bad=True)
+    unreadable = [f"{message.images[0]}: {message.text}" for message in unread]
+    read, measured = [], []
+    for done, source in enumerate(sources, start=1):
+        reduction = max(1, round(np.sqrt(np.prod(source.camera.image_size) / (_MEGAPIXELS * 1e6))))
+        try:
+            measured.append(_sharpness_and_exposure(source.read(reduction)))
+            read.append(source)
+        except InputError as error:
+            unreadable.append(str(error))
+        progress("examining", done, len(sources))
+    if not read:
+        raise InputError(unreadable[0] if unreadable else "there is nothing to examine")
+    return read, unreadable, np.array(measured).T
+
+
+def _advice(found: Examination, problems: Sequence[Message], *, zoomed: bool) -> tuple[str, ...]:
+    """What to change, most important first."""
+    known = [camera for camera, _ in found.cameras if camera != _UNKNOWN_CAMERA]
+    bad, overlap = found.unreadable, found.overlap
     advice = (
-        (len(chosen) < 2, "stitching needs two images or more; name another one"),
+        (found.images < 2, "stitching needs two images or more; name another one"),
         (len(known) > 1, f"the images come from {len(known)} cameras: stitch those of each on their own"),
         (zoomed, "the lens was zoomed between the images: stitch those of one zoom on their own"),
-        (unreadable, f"{len(unreadable)} file{'s' * (len(unreadable) != 1)} cannot be read: {''.join(unreadable[:1])}"),
+        (bad, f"{len(bad)} file{'s' * (len(bad) != 1)} cannot be read: {''.join(bad[:1])}"),
         *((True, str(problem)) for problem in problems),
         (
             overlap is not None and overlap < _MIN_OVERLAP,
             f"images overlap by about {overlap or 0.0:.0%} only: take more images, a third is the least",
         ),
-        (blurred, f"leave blurred images out if their neighbours overlap without them: {shortened(blurred)}"),
-        (dark or burnt, "dark or burnt-out images have few features: fix the exposure if you can take them again"),
+        (
+            found.blurred,
+            f"leave blurred images out if their neighbours overlap without them: {shortened(found.blurred)}",
+        ),
+        (
+            found.dark or found.burnt,
+            "dark or burnt-out images have few features: fix the exposure if you can take them again",
+        ),
     )
-    return Examination(
-        images=len(chosen),
-        unreadable=tuple(unreadable),
-        sizes=tuple(Counter("{} x {}".format(*source.metadata.size) for source in chosen).most_common()),
-        cameras=tuple(cameras),
-        focal=focal,
-        blurred=blurred,
-        dark=dark,
-        burnt=burnt,
-        alone=alone,
-        overlap=overlap,
-        plan=plan,
-        advice=tuple(text for applies, text in advice if applies),
-    )
+    return tuple(text for applies, text in advice if applies)
 
 
 def _dry_run(
@@ -210,7 +227,7 @@ def _dry_run(
     return plan, registration, tuple(problems)
 
 
-def _look(image: DecodedImage) -> tuple[float, float, float]:
+def _sharpness_and_exposure(image: DecodedImage) -> tuple[float, float, float]:
     """Sharpness, mean brightness from 0 to 1, and share of burnt-out pixels of an image.
 
     Sharpness is the contrast of the finest detail over that of twice as coarse detail; an image without detail has 0.

@@ -3,9 +3,10 @@
 import numpy as np
 
 from rdstitch.compositing.projection import PLANE
+from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.local_alignment import LocalAlignment
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.pipeline.compose import Layout
+from rdstitch.pipeline.compose import CanvasPlan
 from rdstitch.pipeline.straighten import oriented
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
@@ -20,50 +21,55 @@ IMAGE_GRID = np.stack(np.meshgrid(*[[0.02, 0.25, 0.5, 0.75, 0.98]] * 2), axis=-1
 
 
 @dataclass(frozen=True)
-class LaidOut:
-    """A registration in the frame of the output, with its layout."""
+class CandidateLayout:
+    """A registration in the frame of the output, with its images on a canvas."""
 
     registration: Registration
     local: LocalAlignment
-    layout: Layout
+    plan: CanvasPlan
     messages: tuple[Message, ...] = ()
+
+    @property
+    def seams(self) -> SeamQuality:
+        """What its seams are like."""
+        return self.plan.seams
 
     @property
     def faults(self) -> int:
         """What speaks against it: broken seams, stretched places, overlaps that do not look alike, and local alignment
         whose seams lie nowhere where they could be judged, 0 to 4.
         """
-        seams = self.layout.seams
+        seams = self.seams
         unjudged = bool(self.local.fields) and not len(seams.places)
-        return int(seams.seen) + int(is_stretched(self.layout)) + int(seams.contradicted) + int(unjudged)
+        return int(seams.seen) + int(is_stretched(self.plan)) + int(seams.contradicted) + int(unjudged)
 
     @property
     def clipped(self) -> int:
         """Number of images of which only the near part is drawn."""
-        return sum(part is not None for part in self.layout.canvas.near)
+        return sum(part is not None for part in self.plan.canvas.near)
 
     @property
     def broken(self) -> int:
         """Number of places at which its seams are broken; they are as far apart in every layout."""
-        return int(self.layout.seams.broken.sum())
+        return int(self.seams.broken.sum())
 
 
-def lay_out(registration: Registration, local: LocalAlignment, options: CompositeOptions) -> LaidOut:
+def lay_out(registration: Registration, local: LocalAlignment, options: CompositeOptions) -> CandidateLayout:
     """Images of a registration on the canvas of the output."""
     placed, messages = oriented(PlacedImages.of(registration, local.fields or None), options)
     if placed.orientation is not None:
         homographies = placed.orientation @ registration.alignment.homographies
         registration = replace(registration, alignment=replace(registration.alignment, homographies=homographies))
-    return LaidOut(registration, local, Layout.of(placed, options), tuple(messages))
+    return CandidateLayout(registration, local, CanvasPlan.of(placed, options), tuple(messages))
 
 
-def is_stretched(layout: Layout) -> bool:
+def is_stretched(plan: CanvasPlan) -> bool:
     """Whether a plane shows some places much larger than most, or much longer than wide, lens apart."""
-    canvas = layout.canvas
+    canvas = plan.canvas
     if canvas.projection != PLANE:
         return False
     magnification = []
-    for image in layout.images:
+    for image in plan.images:
         size = np.array(image.camera.image_size)
         at, step = IMAGE_GRID * size, 1e-3 * size[1]
         # A fisheye's border is stretched on any plane.

@@ -79,7 +79,7 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
         if (rotate, scale) == (options.rotate, options.scale)
         else plan(placed, replace(options, rotate=rotate, scale=scale, gsd=None))
     )
-    return laid, moved(place, canvas, laid), reason
+    return laid, place_on_canvas(place, canvas, laid), reason
 
 
 def _grid(options: CompositeOptions, place: Georeference) -> MapGrid | None:
@@ -97,7 +97,7 @@ def _overlaps(outline: FloatArray, size: tuple[int, int]) -> bool:
     return bool((outline.max(axis=0) > 0).all() and (outline.min(axis=0) < size).all())
 
 
-def moved(place: Georeference | None, one: Canvas, other: Canvas) -> Georeference | None:
+def place_on_canvas(place: Georeference | None, one: Canvas, other: Canvas) -> Georeference | None:
     """The place of another canvas of the same plane."""
     if place is None or np.array_equal(one.matrix, other.matrix):  # without rounding: grids are compared
         return place

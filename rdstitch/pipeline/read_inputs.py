@@ -26,7 +26,7 @@ NO_FLAT_FIELD = Message(
 )
 
 
-def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
+def in_order(frames: Sequence[Frame]) -> Sequence[Frame]:
     """Files by their names where every pair is compared, so that the order in which they were named does not show.
 
     Of more images, and of arrays, the order says which follow which.
@@ -73,7 +73,7 @@ def read_inputs(
     return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), unread
 
 
-def check_size(sources: Sequence[Source]) -> None:
+def check_one_size(sources: Sequence[Source]) -> None:
     """Refuse images of several sizes."""
     w1, h1 = sources[0].camera.image_size
     other = next((source for source in sources if source.camera.image_size != (w1, h1)), None)

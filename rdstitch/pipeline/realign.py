@@ -14,9 +14,9 @@ from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.results.messages import Message, names_of
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
-from rdstitch.verification.rival_planes import planes_of_pairs, second_motions
+from rdstitch.verification.second_motions import planes_of_pairs, second_motions
 
-Offenders = Mapping[tuple[int, ...], Message]
+Rejected = Mapping[tuple[int, ...], Message]
 """What is left out, with what is wrong: images (k,), and pairs (i, j) without which other images may fall off."""
 
 
@@ -88,20 +88,20 @@ def _with_pairs(registration: Registration, pairs: Sequence[PairRegistration], a
     return _aligned_anew(replace(registration, pairs=tuple(aligner.used(aligned))), aligned, aligner, {})
 
 
-def without(registration: Registration, offenders: Offenders, aligner: Aligner) -> Registration | None:
+def without(registration: Registration, rejected: Rejected, aligner: Aligner) -> Registration | None:
     """The rest, aligned anew; None where nothing that fits together would be left.
 
-    Pairs that contradicted the offenders are judged again: it may have been the offenders that were wrong.
+    Pairs that contradicted the rejected are judged again: it may have been the rejected that were wrong.
     """
-    reasons = left_out_images(offenders)
-    pairs = [p for p in registration.pairs if not {*p.images} & reasons.keys() and p.images not in offenders]
+    reasons = left_out_images(rejected)
+    pairs = [p for p in registration.pairs if not {*p.images} & reasons.keys() and p.images not in rejected]
     try:
         aligned = aligner.align(pairs)
     except RegistrationError:
         return None
     used = aligned.alignment.used
     neighbours = _neighbours_of(reasons, registration)
-    for images, message in offenders.items():
+    for images, message in rejected.items():
         reasons |= {k: message for k in images if not used[k]}
     for image, others in neighbours.items():
         named_others = ", ".join(names_of(aligner.paths[k] for k in sorted(others)))
@@ -111,17 +111,17 @@ def without(registration: Registration, offenders: Offenders, aligner: Aligner) 
     return _aligned_anew(registration, aligned, aligner, reasons)
 
 
-def left_out_images(offenders: Offenders) -> dict[int, Message]:
-    """The images among the offenders."""
-    return {images[0]: message for images, message in offenders.items() if len(images) == 1}
+def left_out_images(rejected: Rejected) -> dict[int, Message]:
+    """The images among the rejected."""
+    return {images[0]: message for images, message in rejected.items() if len(images) == 1}
 
 
-def _neighbours_of(offenders: Mapping[int, Message], registration: Registration) -> dict[int, set[int]]:
-    """The offenders that each other image was linked with."""
+def _neighbours_of(rejected: Mapping[int, Message], registration: Registration) -> dict[int, set[int]]:
+    """The rejected that each other image was linked with."""
     linked: dict[int, set[int]] = {}
     for fit in registration.alignment.links:
         for image, other in (fit.images, fit.images[::-1]):
-            if fit.used and other in offenders and image not in offenders:
+            if fit.used and other in rejected and image not in rejected:
                 linked.setdefault(image, set()).add(other)
     return linked
 

@@ -26,9 +26,9 @@ from rdstitch.pipeline.camera_path import camera_path
 from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import compose_images
 from rdstitch.pipeline.deep_zoom_page import viewed_images, write_page
-from rdstitch.pipeline.lay_out import LaidOut
+from rdstitch.pipeline.lay_out import CandidateLayout
 from rdstitch.pipeline.map_canvas import check_map
-from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs
+from rdstitch.pipeline.read_inputs import in_order, read_inputs
 from rdstitch.pipeline.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.remote_blocks import blocks_on
@@ -169,7 +169,7 @@ def stitch_found(
 ) -> StitchResult:
     """Stitch images that were found into an output of a run; more images, and files, may be written after it."""
     options = run.options
-    frames = in_lasting_order(with_times(listed.frames, options.timestamps))
+    frames = in_order(with_times(listed.frames, options.timestamps))
     names = [frame.name for frame in selected(frames, options.exclude, options.include_only)]
     files = RunFiles.of_images(run, listed.files, names, more_images, more_files)
     files.check(outputs)
@@ -335,11 +335,11 @@ def _accepted(
     return accepted, run
 
 
-def compose_registration(chosen: LaidOut, run: Run, outputs: Outputs, executor: Executor) -> StitchResult:
+def compose_registration(chosen: CandidateLayout, run: Run, outputs: Outputs, executor: Executor) -> StitchResult:
     """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
     registration, options = chosen.registration, run.options
-    elsewhere = blocks_on(executor, chosen.layout.placed.sources, run.guard, options.cache)
-    composed, messages = compose_images(chosen.layout, run, outputs, elsewhere)
+    run_blocks = blocks_on(executor, chosen.plan.placed.sources, run.guard, options.cache)
+    composed, messages = compose_images(chosen.plan, run, outputs, run_blocks)
     result = StitchResult(
         registration=_finished(registration, run).with_messages((*chosen.messages, *messages)),
         local_alignment=chosen.local,

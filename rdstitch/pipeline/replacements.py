@@ -9,12 +9,12 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.options.apply_options import ApplyOptions
-from rdstitch.pipeline.read_inputs import check_size, with_flat_field
+from rdstitch.pipeline.read_inputs import check_one_size, with_flat_field
 from rdstitch.results.messages import Message, left_out, merge_by_reason
 from rdstitch.sidecar.counterparts import counterparts
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import MatchedBy
-from rdstitch.stage.tile_frames import tile_frames
+from rdstitch.stage.tile_inputs import tile_frames
 from rdstitch.system.dataclasses import dataclass, replace
 
 
@@ -51,7 +51,7 @@ def read_replacements(
         used = [replace(s, metadata=replace(s.metadata, pixel_size=stage.pixel_um)) for s in used]
     illumination: list[Message] = []
     if options.flat_field != "off":
-        check_size(used)
+        check_one_size(used)
         used, illumination = with_flat_field(used, options.flat_field)
     return Replacements(
         {index: frame for index, frame in enumerate(chosen) if index in sources and frame is not None},

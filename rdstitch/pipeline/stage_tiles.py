@@ -39,13 +39,12 @@ from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.pair_candidates import SearchPlan
 from rdstitch.stage.positions import Scan, grid_from_arrays, grid_from_names, grid_from_table, grid_from_tiles
 from rdstitch.stage.register_tiles import TileRegistration, register_tiles
-from rdstitch.stage.tile_frames import tile_frames
-from rdstitch.stage.tile_inputs import as_tiles
+from rdstitch.stage.tile_inputs import as_tiles, tile_frames
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.system.progress import Progress, silent
 
-_COMPARED = 32  # overlaps by which a flat field is judged
+_SAMPLED_OVERLAPS = 32  # overlaps by which a flat field is judged
 
 
 @one_native_thread()
@@ -91,7 +90,7 @@ def tiles(
         with run.executor(len(registration.sources)) as executor:
             _write_beside(outputs, positions_file, options, registration, tiled)
             chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
-            chosen = replace(chosen, layout=replace(chosen.layout, photographs=False))
+            chosen = replace(chosen, plan=replace(chosen.plan, photographs=False))
             return compose_registration(chosen, run, outputs, executor)
 
 
@@ -229,7 +228,7 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
     assert field is not None
     raw = [replace(source, flat_field=None) for source in sources]
     pairs = tiled.links.tiles[tiled.adjustment.weights > 0.5]
-    chosen = pairs[evenly_spaced(len(pairs), _COMPARED)]
+    chosen = pairs[evenly_spaced(len(pairs), _SAMPLED_OVERLAPS)]
     places = tiled.adjustment.places
     compared = ((raw[a].read().pixels, raw[b].read().pixels, places[b] - places[a]) for a, b in chosen.tolist())
     return agrees_with_overlaps(field, compared)

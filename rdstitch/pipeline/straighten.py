@@ -67,7 +67,7 @@ def _product(first: FloatArray | None, second: FloatArray | None) -> FloatArray 
 def reoriented(
     placed: PlacedImages, options: CompositeOptions, former: UprightOptions
 ) -> tuple[PlacedImages, list[Message]]:
-    """The same of images that other options have turned before."""
+    """Images that former options have turned, as other options turn them, and what the user should know of it."""
     if options.same_turn(former):
         return placed, []
     if placed.orientation is not None:

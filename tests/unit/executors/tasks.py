@@ -1,6 +1,7 @@
 """Tasks that workers can import."""
 
 import os
+import resource
 import signal
 import time
 from pathlib import Path
@@ -59,3 +60,8 @@ def leave_trace(path: Path | None) -> None:
         raise ZeroDivisionError
     path.touch()
     time.sleep(0.02)
+
+
+def pages() -> int:
+    """That the process was given so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt

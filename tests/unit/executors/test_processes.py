@@ -9,10 +9,17 @@ import time
 from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from rdstitch.errors import ArgumentError, InputError, LimitError
-from rdstitch.executors import ProcessExecutor, in_order, open_executor
+from rdstitch.executors import ProcessExecutor, in_order, open_executor, processes
+from rdstitch.features import FeatureOptions
+from rdstitch.inputs.source import read_sources
+from rdstitch.io import write_image
+from rdstitch.pipeline.detect_features import detect_batch
+from rdstitch.system.cache import Cache
 from tests.unit.executors import tasks
 
 
@@ -64,6 +71,18 @@ def test_a_worker_that_dies_costs_its_task_only(tmp_path: Path) -> None:
     with ProcessExecutor(1) as executor:
         with pytest.raises(LimitError, match="worker process was ended"):
             executor.submit(tasks.die, signal.SIGKILL).result()
+        assert executor.submit(tasks.square, 3).result() == 9
+
+
+def test_a_worker_whose_pipes_another_thread_has_closed_is_no_failure_of_the_task(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with ProcessExecutor(1) as executor:
+        assert executor.submit(tasks.square, 2).result() == 4
+        ended, start = executor._workers[0], ProcessExecutor._worker
+        processes._end(ended)
+        given = iter([ended])
+        monkeypatch.setattr(ProcessExecutor, "_worker", lambda self: next(given, None) or start(self))
         assert executor.submit(tasks.square, 3).result() == 9
 
 
@@ -134,8 +153,21 @@ def test_after_a_failure_the_rest_is_cancelled(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("workers", "images", "kind"),
-    [(1, 1000, ThreadPoolExecutor), (4, 12, ThreadPoolExecutor), (2, 1000, ProcessExecutor)],
+    [(1, 1000, ThreadPoolExecutor), (4, 12, ThreadPoolExecutor), (2, 40, ProcessExecutor), (2, 1000, ProcessExecutor)],
 )
 def test_few_images_are_not_worth_starting_processes(workers: int, images: int, kind: type[Executor]) -> None:
     with open_executor(workers, images) as executor:
         assert isinstance(executor, kind)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="pages of another system and C library")
+def test_workers_keep_the_memory_of_one_image_for_the_next(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(1).integers(0, 256, (600, 800), dtype=np.uint8)
+    write_image(tmp_path / "noise.png", cv2.GaussianBlur(pixels, (0, 0), 2.0))
+    sources = read_sources([tmp_path / "noise.png"], camera=None, focal=None, distortion=None, skip_bad=False)[0]
+    with ProcessExecutor(1) as executor:
+        pages = []
+        for _ in range(5):
+            executor.submit(detect_batch, sources, options=FeatureOptions(), store=Cache.for_this_run()).result()
+            pages.append(executor.submit(tasks.pages).result())
+    assert pages[-1] - pages[-2] < 3_000, np.diff(pages)

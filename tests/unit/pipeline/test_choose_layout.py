@@ -15,7 +15,7 @@ from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.choose_layout import _error, choose_layout
-from rdstitch.pipeline.compose import Layout
+from rdstitch.pipeline.compose import CanvasPlan
 from rdstitch.pipeline.lay_out import is_stretched
 from rdstitch.pipeline.realign import aligner_of, by_second_motions
 from rdstitch.pipeline.recipes import mosaic, pano
@@ -98,7 +98,7 @@ def test_a_plane_seen_from_the_sideis_stretched(tilt: float, stretched: bool) ->
     oblique = np.eye(3)
     oblique[2, 0] = tilt
     placed = PlacedImages([source(), source()], [CAMERA] * 2, np.stack([np.eye(3), oblique]), 0)
-    assert is_stretched(Layout.of(placed, CompositeOptions())) is stretched
+    assert is_stretched(CanvasPlan.of(placed, CompositeOptions())) is stretched
 
 
 def _quality(*breaks: SeamBreak, alike: float = 0.9) -> SeamQuality:
