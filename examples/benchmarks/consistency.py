@@ -75,8 +75,9 @@ def rendered(kind: str, seed: int) -> Sequence:
 
 def nearest_distortion(lens: Lens) -> float:
     """λ of the one-parameter lens nearest to another, as :attr:`Camera.nearest_distortion` is defined."""
-    measured = (points_over(SIZE, 33) - lens.center) / HALF
-    straight = (lens.undistort(measured * HALF + lens.center) - lens.center) / HALF
+    half = float(np.hypot(*lens.image_size)) / 2.0
+    measured = (points_over(lens.image_size, 33) - lens.center) / half
+    straight = (lens.undistort(measured * half + lens.center) - lens.center) / half
     seen = np.isfinite(straight).all(axis=1)
 
     def missed(parameters: FloatArray) -> FloatArray:

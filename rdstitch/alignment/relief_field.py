@@ -64,6 +64,13 @@ class Parallax:
         """Of half a diagonal of most images on the plane, or between directions."""
         return float(np.median(self._sizes))
 
+    def from_middle(self, place: FloatArray) -> FloatArray:
+        """Places (m, 2) from the middle of the images, in sizes of one; far beyond them (at a horizon), less far."""
+        middle = np.median(self._centres, axis=0)
+        reach = self.size + 2.0 * np.median(np.linalg.norm(self._centres - middle, axis=1))
+        near: FloatArray = np.clip(place - middle, -reach, reach) / self.size
+        return near
+
     @cached_property
     def _back(self) -> FloatArray:
         """Image-to-plane homographies, or those to directions, (N, 3, 3)."""
@@ -138,6 +145,12 @@ _FEWEST = 20
 _NOISE_FIELDS = 16
 """Fields of independent errors that show what their absorption leaves of agreement between neighbours."""
 
+_CURVATURES = 3
+"""Of a plane: along x, aslant, and along y."""
+
+_UNSEEN, _NEWTON_STEPS = 1e-9, 50
+"""Share of the largest information that none is; steps to the variance of curvatures at most."""
+
 
 @dataclass(frozen=True)
 class ReliefField:
@@ -146,15 +159,19 @@ class ReliefField:
     response: LinearResponse
 
     def steps(self) -> tuple[FloatArray, FloatArray]:
-        """Steps of the poses (N, D, K) and the shared parameters (S, K) by relief; ``x x'`` is its covariance.
+        """Steps of the poses (N, D, K) and the shared parameters (S, K) by relief; ``x x'`` is its covariance."""
+        normal = self.response.normal
+        steps = [(np.zeros((*normal.gradient_poses.shape, 0)), np.zeros((len(normal.gradient_shared), 0)))]
+        agreement, std = self._agreement()
+        if len(agreement) and agreement[0] > 0.0:
+            steps.append(self._steps_by_waves(agreement, std))
+        if not self._parallax.is_turn and len(self.response.adjuster.observations) > 1:
+            steps.append(self._steps_by_curvature())
+        poses, shared = zip(*steps, strict=True)
+        return np.concatenate(poses, axis=-1), np.concatenate(shared, axis=-1)
 
-        By relief of the heights at which it leaves the agreement of errors that was found, at every distance, beyond
-        that of independent errors. These agree less than not at all, since the parameters absorb what they have in
-        common.
-        """
-        normal, (agreement, std) = self.response.normal, self._agreement()
-        if not len(agreement) or agreement[0] <= 0.0:
-            return np.zeros((*normal.gradient_poses.shape, 0)), np.zeros((len(normal.gradient_shared), 0))
+    def _steps_by_waves(self, agreement: FloatArray, std: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """By relief of the heights at which it leaves the agreement of errors that was found, at every distance."""
         step = _WAVES // _BANDS
         answers = [self._answers(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
         power = _spectrum(np.stack([left for left, *_ in answers], axis=1), agreement, std)
@@ -162,9 +179,32 @@ class ReliefField:
         poses, shared = (np.concatenate([answer[k] for answer in answers], axis=-1) for k in (1, 2))
         return poses * scale, shared * scale
 
+    def _steps_by_curvature(self) -> tuple[FloatArray, FloatArray]:
+        """By a plane that is curved alike everywhere, as a wall may be: what pairs absorb of it does not cancel out.
+
+        How much curvature there is shows what they do not absorb of it, beyond noise; of one pair next to nothing.
+        """
+        poses, shared = self.response.steps_of(self._curved, _CURVATURES)
+        information, score = np.zeros((_CURVATURES, _CURVATURES)), np.zeros(_CURVATURES)
+        for part in self.response.parts():
+            left = self._curved(part) + self.response.changes(part, poses, shared)
+            weight = self.response.weight[part.rows]
+            information += self.response.curvature * np.einsum("m,mic,mid->cd", weight, left, left)
+            score += np.einsum("m,mic,mi->c", weight, left, part.errors)
+        std = math.sqrt(_variance_between(information, score))
+        return poses * std, shared * std
+
+    def _curved(self, part: LinearizedErrors) -> FloatArray:
+        """Errors (m, 2, C) by curvature along x, aslant, and along y."""
+        place, parallax = self._parallax.of(part)
+        x, y = self._parallax.from_middle(place).T
+        heights = np.column_stack([x * x, math.sqrt(2.0) * x * y, y * y])
+        field: FloatArray = parallax[:, :, None] * heights[:, None, :]
+        return field
+
     def _agreement(self) -> tuple[FloatArray, FloatArray]:
         """Mean products (D,) of the errors at each distance, px², beyond what the absorption of independent errors
-        leaves, and their standard deviations.
+        leaves (less than none, since the parameters absorb what they have in common), and their standard deviations.
         """
         pairs = self._pairs
         if not pairs:
@@ -261,6 +301,26 @@ def _spectrum(left: FloatArray, agreement: FloatArray, std: FloatArray) -> Float
     power = _nonnegative_solution(equations, np.concatenate([agreement * weight, np.ones(bands)]))
     scaled: FloatArray = power * (steep / bands)
     return scaled
+
+
+def _variance_between(information: FloatArray, score: FloatArray) -> float:
+    """Variance of parameters about 0, by the information (P, P) of noisy estimates of them and their score (P,).
+
+    That with which the squares of the estimates over their variances add up to their number (Paule and Mandel 1982),
+    less what chance makes of it: the positive part of James and Stein's estimate.
+    """
+    values, vectors = np.linalg.eigh(information)
+    seen = values > _UNSEEN * values[-1]
+    precision, squared = values[seen], (vectors.T @ score)[seen] ** 2 / values[seen]
+    excess = float(squared.sum()) - len(squared)
+    expected, variance = len(squared) * (1.0 + 2.0 / max(excess, 1e-300)), 0.0
+    for _ in range(_NEWTON_STEPS):  # from below to the root of a convex function
+        grown = 1.0 + variance * precision
+        excess = float((squared / grown).sum()) - expected
+        if excess <= 0.0:
+            break
+        variance += excess / float((squared * precision / grown**2).sum())
+    return variance
 
 
 def _nonnegative_solution(equations: FloatArray, right: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.inputs.frame import Frame
 from rdstitch.io import read_image, read_metadata
 from rdstitch.io.stored_tiles import stored_tiles
-from rdstitch.stage.tile_frames import tile_frames, with_position_folders
+from rdstitch.stage.tile_inputs import tile_frames, with_position_folders
 
 SHAPE = (12, 16)
 
