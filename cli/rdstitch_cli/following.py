@@ -16,8 +16,8 @@ from rdstitch_cli.stitching import warn_of
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
-    from rdstitch.inputs.arrivals import Arrivals
     from rdstitch.inputs.frame import Named
+    from rdstitch.inputs.frame_stream import FrameStream
     from rdstitch.pipeline.run import Run
     from rdstitch.pipeline.run_files import RunFiles
     from rdstitch.results.pose import FollowedPoses
@@ -67,7 +67,7 @@ def followed(
 
     ``files`` are those of the recipe, and ``poses`` says how poses are printed: as the recipe writes them.
     """
-    from rdstitch.inputs.arrivals import open_arrivals
+    from rdstitch.inputs.frame_stream import open_frame_stream
     from rdstitch.system.file_access import file_state
     from rdstitch.system.outputs import Outputs
     from rdstitch.system.temporary_folder import TemporaryFolder
@@ -83,7 +83,7 @@ def followed(
         reporter.tell(note)
     before = None if preview is None else file_state(preview)
     with TemporaryFolder() as folder:
-        arrivals = open_arrivals(
+        arrivals = open_frame_stream(
             str(source),
             frames_folder=lambda: folder,
             names=sys.stdin,
@@ -102,7 +102,7 @@ def followed(
 
 
 def _print_poses(
-    arrivals: "Arrivals",
+    arrivals: "FrameStream",
     options: StitchOptions,
     poses: "FollowedPoses | None",
     preview: Path | None,

@@ -11,8 +11,8 @@ from rdstitch.alignment.frames.level_frame import levelled
 from rdstitch.alignment.least_squares.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.lens.lens_description import radius_std
 from rdstitch.alignment.lens.lens_selection import CENTER, ENOUGH_IMAGES
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
-from rdstitch.alignment.noise import coherence, judge_relief
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, MotionModel, X, Y
+from rdstitch.alignment.noise import COHERENT_CORRELATION, Coherence, coherence, shows_relief
 from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, ReliefTest, Unused
 from rdstitch.alignment.uncertainty import considered_covariance, lever_std, pose_covariances
 from rdstitch.arrays import BoolArray, FloatArray
@@ -97,7 +97,7 @@ class _Agreement:
         # No lens or plane is exact enough for matches that are off by less to disagree.
         agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(observations.sigma(squared), MODEL_ERROR)) ** 2
         left = coherence(observations, errors, observations.inliers(squared))
-        return cls(squared, agreeing, judge_relief(left, fit.model.name, len(observations)))
+        return cls(squared, agreeing, _relief_test(left, fit.model, len(observations)))
 
     @property
     def rms(self) -> float:
@@ -130,6 +130,24 @@ class _Uncertainty:
     def std(self) -> FloatArray:
         """Standard deviations (P,)."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+
+def _relief_test(left: Coherence, model: MotionModel, links: int) -> ReliefTest:
+    """What the agreement of neighbours that a model leaves means for the scene."""
+    found = shows_relief(left)
+    agreement = f"errors of neighbours agree (correlation {left.correlation:.2f}, {left.size:.1f} pixels in common)"
+    if model.on_sphere:
+        moved = "the camera moved between the images (parallax): what is near does not fit; turn about the lens"
+        text = f"{agreement}: {moved}" if found else f"the camera hardly moved (correlation {left.correlation:.2f})"
+    elif found:
+        wrong = f"the scene is not one plane, or the {model.name} model does not describe the camera; λ may be off"
+        text = f"{agreement}: {wrong}"
+    elif left.correlation > COHERENT_CORRELATION:
+        text = f"{agreement}, as over a scene that is nearly flat"
+    else:
+        seen = "the scene is flat" if links > 1 else "no relief shows, but hills as wide as one overlap would not"
+        text = f"errors of neighbours hardly agree (correlation {left.correlation:.2f}): {seen}"
+    return ReliefTest(found, left.correlation, left.size, text)
 
 
 def _adjusted_cameras(adjustment: AdjustedImages, uncertainty: _Uncertainty) -> tuple[Camera, ...]:
@@ -270,7 +288,7 @@ def _overruled_focal(adjustment: AdjustedImages, camera: Camera) -> str | None:
     if abs(math.log(ratio)) < math.log(_OVERRULED):
         return None
     times = f"{ratio:.1f} times the one" if ratio > 1.0 else f"1/{1.0 / ratio:.1f} of the one"
-    return f"the images show a focal length that is {times} in EXIF, which was not used; --focal gives the right one"
+    return f"the images show a focal length that is {times} in EXIF, which was not used; give the right one"
 
 
 def _warnings(adjustment: AdjustedImages, camera: Camera, considered: FloatArray) -> tuple[Message, ...]:
@@ -291,7 +309,7 @@ def _warnings(adjustment: AdjustedImages, camera: Camera, considered: FloatArray
         if off > _WORTH_SAYING:
             text = (
                 f"from {len(adjustment.images)} images the lens distortion is known to about {off:.2g} pixels at the "
-                f"corners; {ENOUGH_IMAGES} or more images, or --camera, make it surer"
+                f"corners; {ENOUGH_IMAGES} or more images, or a camera file, make it surer"
             )
             result.append(Message(text, severity="detail" if image_only else "warning", code="few-images"))
     if (overruled := _overruled_focal(adjustment, camera)) is not None:

@@ -12,7 +12,6 @@ import numpy as np
 from rdstitch.alignment.cycle_consistency import misfitting_links
 from rdstitch.alignment.least_squares.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.least_squares.observations import Observations
-from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.robust.posterior import Evidence, overlap_cells
@@ -104,26 +103,12 @@ def _overdispersion(link: IntArray, points: FloatArray, residual: FloatArray, co
     return max(1.0, float((sums[several] ** 2).sum() / power[several].sum()))
 
 
-def judge_relief(left: Coherence, model: str, links: int) -> ReliefTest:
-    """What the agreement of neighbours that a model leaves means for the scene.
+def shows_relief(left: Coherence) -> bool:
+    """Whether neighbours agree as they do over a scene with depth, in the errors that a model leaves.
 
     What is as wide as the overlap of one pair alone, its homography and λ absorb.
     """
-    agreement = f"errors of neighbours agree (correlation {left.correlation:.2f}, {left.size:.1f} pixels in common)"
-    relief = left.correlation > COHERENT_CORRELATION and left.relative_size > LARGE_RELIEF
-    if model == "rotation":
-        moved = "the camera moved between the images (parallax): what is near does not fit; turn about the lens"
-        text = f"{agreement}: {moved}" if relief else f"the camera hardly moved (correlation {left.correlation:.2f})"
-    elif relief:
-        text = (
-            f"{agreement}: the scene is not one plane, or the {model} model does not describe the camera; λ may be off"
-        )
-    elif left.correlation > COHERENT_CORRELATION:
-        text = f"{agreement}, as over a scene that is nearly flat"
-    else:
-        seen = "the scene is flat" if links > 1 else "no relief shows, but hills as wide as one overlap would not"
-        text = f"errors of neighbours hardly agree (correlation {left.correlation:.2f}): {seen}"
-    return ReliefTest(relief, left.correlation, left.size, text)
+    return left.correlation > COHERENT_CORRELATION and left.relative_size > LARGE_RELIEF
 
 
 def evidence_of(observations: Observations, errors: FloatArray) -> Evidence:

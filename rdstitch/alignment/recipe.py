@@ -49,22 +49,9 @@ _REFERENCE_LEFT_OUT = Message("the reference image that was named is not among t
 
 
 def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions | None = None) -> Alignment:
-    """Align all images over one plane.
+    """Align all images of one lens over one plane, or around one centre, by pairs that overlap, each once.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        One per image, of one lens; sizes may differ.
-    links : sequence of Link
-        The pairs that overlap, each once.
-    options : AlignmentOptions, optional
-
-    Raises
-    ------
-    ArgumentError
-        When an argument is out of range, or two links are between the same images.
-    RegistrationError
-        When no two images are linked.
+    :exc:`ArgumentError` where two links are between the same images; :exc:`RegistrationError` where no two are linked.
     """
     return AlignmentTask(GivenImages(cameras, links, options or AlignmentOptions())).result
 

@@ -16,7 +16,7 @@ from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.link_equations import linearized_errors
 from rdstitch.alignment.lens.lens_selection import residual_coherence
 from rdstitch.alignment.motion_models import SIMILARITY, TILTING
-from rdstitch.alignment.noise import independent_errors, judge_relief
+from rdstitch.alignment.noise import independent_errors, shows_relief
 from rdstitch.alignment.relief_field import Parallax
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.alignment.starts import fit_model, start_from
@@ -43,7 +43,8 @@ def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[st
 
     Freeing the distortion centre is not tried: over relief it bends the whole as the ground bends the images.
     """
-    if not _shows_relief(problem, choice.fit) or weighted_by_relief(problem, choice.fit) is None:
+    # Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
+    if not shows_relief(residual_coherence(choice.fit.adjusted)) or weighted_by_relief(problem, choice.fit) is None:
         return choice
     problem = replace(problem, overdispersion=choice.fit.overdispersion)
     fits: list[Fit] = []
@@ -87,14 +88,6 @@ def weighted_by_relief(problem: Problem, fit: Fit) -> Problem | None:
     if scatter == 0.0:
         return None
     return replace(problem, observations=replace(o, relief=scatter * moved * o.scale2[o.link, None]))
-
-
-def _shows_relief(problem: Problem, fit: Fit) -> bool:
-    """Whether the ground moves points, and not by next to nothing.
-
-    Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
-    """
-    return judge_relief(residual_coherence(fit.adjusted), fit.model.name, len(problem.observations)).found
 
 
 def _settled(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:

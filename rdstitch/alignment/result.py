@@ -10,8 +10,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.alignment.motion_models import MODELS
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.planar_motion import rigid_in_plane
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.results.messages import Message
 
@@ -57,9 +59,8 @@ class PlanarPoses:
 
     def relative_to(self, reference: int) -> "PlanarPoses":
         """The poses in the frame of one image: at the origin, with yaw zero, its height the unit; no covariances."""
-        c, s = np.cos(self.yaw[reference]), np.sin(self.yaw[reference])
-        unit = self.height[reference]
-        position = (self.position - self.position[reference]) @ np.array([[c, -s], [s, c]]).T / unit
+        unit, turn = self.height[reference], rigid_in_plane(self.yaw[reference], np.zeros(2))[:2, :2]
+        position = (self.position - self.position[reference]) @ turn.T / unit
         yaw = np.remainder(self.yaw - self.yaw[reference] + np.pi, 2.0 * np.pi) - np.pi
         return PlanarPoses(yaw, position, self.height / unit, self.tilt)
 
@@ -233,7 +234,7 @@ class Alignment:
     @property
     def on_sphere(self) -> bool:
         """Whether :attr:`homographies` lead to directions around one centre, not to a plane."""
-        return self.model == "rotation"
+        return MODELS[self.model].on_sphere
 
     @property
     def length_std(self) -> float:

@@ -156,10 +156,7 @@ class Posterior:
 
 
 def select_model(
-    problem: Problem,
-    names: Sequence[str],
-    lenses: Sequence[BoolArray] = (),
-    purpose: Purpose = Purpose.MOSAIC,
+    problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = (), purpose: Purpose = Purpose.MOSAIC
 ) -> ModelChoice:
     """Adjust hypotheses from the least to the most free, and take the one with the best score.
 

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.geometry.planar_motion import rigid_in_plane
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -77,7 +78,7 @@ class Trajectory:
             When the alignment has no poses (general model), or the height is not positive.
         """
         if alignment.on_sphere:
-            raise ArgumentError("the camera turned on the spot: there is no path; --model tilting looks for one anyhow")
+            raise ArgumentError("the camera turned on the spot: there is no path; the model tilting looks for one")
         if alignment.poses is None:
             raise ArgumentError(
                 "one homography per image has no metric poses; choose a planar model (rigid, similarity or tilting)"
@@ -93,16 +94,13 @@ class Trajectory:
         if not len(frame):
             raise ArgumentError("a trajectory needs at least one frame")
         first = frame[0]
-        c, s = np.cos(poses.yaw[first]), np.sin(poses.yaw[first])
-        turned = (poses.position[frame] - poses.position[first]) @ np.array([[c, -s], [s, c]]).T
-        unit = height / poses.height[first]
-        yaw = np.unwrap(poses.yaw[frame] - poses.yaw[first])
-        path = cls(frame, turned * unit, yaw, poses.height[frame] * unit)
+        relative, unit = poses.relative_to(int(first)), height / poses.height[first]
+        path = cls(frame, height * relative.position[frame], np.unwrap(relative.yaw[frame]), unit * poses.height[frame])
         if poses.covariance is None or poses.with_first is None:
             return path
         one, both = poses.covariance[frame], poses.with_first[frame]
         change = np.diag([unit, unit, unit, 1.0])
-        change[:2, :2] = unit * np.array([[c, -s], [s, c]])
+        change[:2, :2] = unit * rigid_in_plane(poses.yaw[first], np.zeros(2))[:2, :2]
         # The first frame moves all others: by its place, by its height, which is the unit, and by its yaw.
         first_moves = np.tile(-change, (len(frame), 1, 1))
         first_moves[:, :2, 2] = -path.position / poses.height[first]
@@ -134,8 +132,7 @@ class Trajectory:
 
     def __repr__(self) -> str:
         """One line: the number of frames and the length of the path."""
-        length = float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
-        return f"<Trajectory {len(self)} frames, {length:.3g} long, from height {self.height[0]:.3g}>"
+        return f"<Trajectory {len(self)} frames, {self.length:.3g} long, from height {self.height[0]:.3g}>"
 
     def __len__(self) -> int:
         """Number of frames."""

@@ -208,11 +208,7 @@ def _merge(block: NDArray[np.float32], layers: list[NDArray[np.intp]], two: Loca
 
 
 def _nearest_keypoints(
-    similarity: Similarity,
-    one: Locations,
-    two: Locations,
-    location1: NDArray[np.intp],
-    location2: NDArray[np.intp],
+    similarity: Similarity, one: Locations, two: Locations, location1: NDArray[np.intp], location2: NDArray[np.intp]
 ) -> NDArray[np.intp]:
     """Select the most alike pair of keypoints of each pair of locations, as indices into the features, shape (M, 2)."""
     count2 = two.count[location2]

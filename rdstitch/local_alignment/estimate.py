@@ -19,15 +19,13 @@ from rdstitch.system.dataclasses import dataclass
 _COARSE, _FINE = (12, 120_000), (24, 40_000)
 _SLOPES = (0.2, 0.06, 0.02)
 _HELD_OUT = 5  # every fifth match
-# Share by which what a person sees must get less for local alignment to be worth while.
-_WORTHWHILE = 0.15
+_WORTHWHILE = 0.15  # share by which what a person sees must get less for local alignment to be worth while
 # A person sees edges that do not go on across seams, as far as this percentile of the held-out residuals, and straight
 # edges, of a tenth of the diagonal or more, that fields bend up to this percentile: a single one is seen.
 _SEAMS, _BENDS, _EDGE = 75.0, 98.0, 0.1
 _MAX_IMAGES = 24  # whose edges are looked at
 _MIN_MATCHES = 60  # of 60 planes with so many matches and noise, none was bent; with 40, five were
-# Of thousands of images, fields are fitted to a part: each match takes about 600 bytes meanwhile.
-_MAX_MATCHES = 250_000
+_MAX_MATCHES = 250_000  # that fields are fitted to, 600 bytes each: of thousands of images a part
 # Correlation of the residuals of neighbouring matches below which no smooth field is worth while: one that brings the
 # median down by 15 % takes away a quarter of the variance, and that quarter neighbours would have in common.
 _MIN_AGREEMENT = 0.1
@@ -55,9 +53,8 @@ class LocalAlignment:
     fields: tuple[DisplacementField, ...]  # one an image; empty where images are not aligned locally
     reason: str  # why they are, or are not
     cells: int = 0  # of the grid along the longer side of an image; 0 without fields
-    # before, after: residuals of held-out matches without and with fields; None where nothing was tried
-    before: HeldOut | None = None
-    after: HeldOut | None = None
+    before: HeldOut | None = None  # residuals of held-out matches without fields; None where nothing was tried
+    after: HeldOut | None = None  # the same with fields
 
 
 def no_local_alignment(reason: str) -> LocalAlignment:
@@ -132,10 +129,7 @@ def _candidates(
 
 
 def _agreement_of_neighbours(matches: PlacedMatches) -> float:
-    """Correlation of the residuals of each match and the nearest one of the same pair of images, in [-1, 1].
-
-    Outlying residuals count as if they were shorter.
-    """
+    """Correlation, in [-1, 1], of residuals of each match and the nearest one of its pair, outlying ones shortened."""
     length = np.linalg.norm(matches.residual, axis=1)
     most = _OUTLYING * float(np.median(length))
     residual = matches.residual * np.minimum(1.0, most / np.maximum(length, 1e-12))[:, None]

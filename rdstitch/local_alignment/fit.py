@@ -137,10 +137,8 @@ def _solve(
 
 
 def _factorized(matrix: Any) -> Any:
-    options = {"SymmetricMode": True}
-    return sparse_linalg.splu(
-        sparse.csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
-    )
+    symmetric: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    return sparse_linalg.splu(sparse.csc_array(matrix), **symmetric)
 
 
 def _coarser(shapes: Shapes, cameras: Sequence[Camera], cells: int) -> "sparse.csr_array | None":

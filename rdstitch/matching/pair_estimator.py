@@ -58,10 +58,7 @@ class PairEstimator:
     tilts: Sequence[Tilt] | None = None  # (ψ, θ), radians, of each image, where they are known exactly
 
     def estimate(
-        self,
-        pairs: Iterable[Pair],
-        distortion: float | None = None,
-        shared: Mapping[Pair, StoredMatches] | None = None,
+        self, pairs: Iterable[Pair], distortion: float | None = None, shared: Mapping[Pair, StoredMatches] | None = None
     ) -> list[PairRegistration]:
         """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say.
 

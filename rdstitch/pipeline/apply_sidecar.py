@@ -29,7 +29,7 @@ from rdstitch.sidecar.counterparts import registered_files
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
 from rdstitch.sidecar.recomposition import Recomposition
 from rdstitch.sidecar.write_applied import applied_sidecar
-from rdstitch.stage.tile_frames import with_position_folders
+from rdstitch.stage.tile_inputs import with_position_folders
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, json_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent

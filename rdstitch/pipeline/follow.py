@@ -52,7 +52,7 @@ def follow(
     Poses are for watching: loops are closed, and every pair is used, only when all frames are registered together
     afterwards, by :func:`rdstitch.mosaic` or :func:`rdstitch.trajectory`. Features are fewer and from smaller images
     than there. Memory does not grow with the number of frames. ``comes_again`` says of a frame that could not be read
-    whole whether it will come again (:class:`rdstitch.inputs.arrivals.Arrivals`); ``preview`` is written every
+    whole whether it will come again (:class:`rdstitch.inputs.frame_stream.FrameStream`); ``preview`` is written every
     ``refresh`` seconds at most. One pose a frame, and more for those that find their
     place, or another one, only later.
     """

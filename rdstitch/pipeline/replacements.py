@@ -14,7 +14,7 @@ from rdstitch.results.messages import Message, left_out, merge_by_reason
 from rdstitch.sidecar.counterparts import counterparts
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import MatchedBy
-from rdstitch.stage.tile_frames import tile_frames
+from rdstitch.stage.tile_inputs import tile_frames
 from rdstitch.system.dataclasses import dataclass, replace
 
 

@@ -39,8 +39,7 @@ from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.pair_candidates import SearchPlan
 from rdstitch.stage.positions import Scan, grid_from_arrays, grid_from_names, grid_from_table, grid_from_tiles
 from rdstitch.stage.register_tiles import TileRegistration, register_tiles
-from rdstitch.stage.tile_frames import tile_frames
-from rdstitch.stage.tile_inputs import as_tiles
+from rdstitch.stage.tile_inputs import as_tiles, tile_frames
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.system.progress import Progress, silent

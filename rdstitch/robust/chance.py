@@ -14,8 +14,8 @@ MIN_OCCUPIED_CELLS = 8
 """Cells in which the inliers must lie.
 
 With half as many, 14 % of 72 pairs come out wrong instead of 3 %, mostly clusters of wrong matches; with twice as many,
-89 % of the solvable ones are found instead of 94 %. The size of
-the cells and the limit of chance, halved or doubled, change nothing there.
+89 % of the solvable ones are found instead of 94 %. The size of the cells and the limit of chance, halved or doubled,
+change nothing there.
 """
 
 _NEGLIGIBLE = 1e-17

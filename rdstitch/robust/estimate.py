@@ -16,7 +16,7 @@ from rdstitch.robust.measurements import Measurements, checked_matches, padded_l
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
 from rdstitch.robust.pair_models import PlanarPairModel
-from rdstitch.robust.ransac import ransac
+from rdstitch.robust.ransac import Hypotheses, ransac
 from rdstitch.system.dataclasses import dataclass, replace
 
 _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
@@ -172,43 +172,50 @@ def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> lis
     )
     known = [pair.tilts for pair in pairs if pair.tilts is not None]
     tilts = np.stack(known) if known else None
-    ordered = np.array([pair.quality is not None for pair in pairs])
-    focal, std = pairs[0].focal, pairs[0].camera1.focal_log_std
-    solvers = _solvers(options, focal, std, tilts is not None)
-    search = ransac(solvers, data, ordered, tilts, options)
-    threshold = options.threshold
-
-    solved = np.flatnonzero(np.isfinite(search.best.cost))
-    limit = np.inf if options.select_below is None else options.select_below
-    few = search.best.inliers[solved].sum(axis=1) < limit
-    fits: dict[int, PairFit] = {}
-    selection = PairSelection(
-        search.best.homography[solved],
-        search.best.distortion[solved],
-        data.take(solved),
-        None if tilts is None else tilts[solved],
-        noise=None,
-        threshold=threshold,
-        fixed_distortion=options.distortion is not None,
-    )
-    planar = [PlanarPairModel(focal, std, tilts is not None, height_free=free) for free in (False, True)]
-    for models, rows in ((planar, few), ([], ~few)):
-        if rows.any():
-            selected = select_models(models, selection.take(np.flatnonzero(rows)))
-            fits.update(zip(solved[rows].tolist(), selected, strict=True))
-
+    solvers = _solvers(options, pairs[0].focal, pairs[0].camera1.focal_log_std, tilts is not None)
+    search = ransac(solvers, data, np.array([pair.quality is not None for pair in pairs]), tilts, options)
+    fits = _selected(pairs[0], search.best, data, tilts, options)
     result = []
-    for row, pair in enumerate(pairs):
+    for row, (pair, ranked) in enumerate(zip(pairs, order, strict=True)):
         iterations, count = int(search.iterations[row]), len(pair)
         if row not in fits:
             reason = f"no plausible model in {iterations} samples of {count} matches"
             result.append(RadialHomography.failed(reason, pair.camera1, pair.camera2, count, iterations))
             continue
         errors = np.empty(count)
-        errors[order[row]] = fits[row].errors[:count]
-        solver = solvers[int(search.best.solver[row])].name
-        result.append(_result(pair, fits[row], errors, threshold, solver, iterations, bool(search.confident[row])))
+        errors[ranked] = fits[row].errors[:count]
+        solver, confident = solvers[int(search.best.solver[row])].name, bool(search.confident[row])
+        result.append(_result(pair, fits[row], errors, options.threshold, solver, iterations, confident))
     return result
+
+
+def _selected(
+    pair: PairMatches, best: Hypotheses, data: Measurements, tilts: FloatArray | None, options: EstimationOptions
+) -> dict[int, PairFit]:
+    """The model of each pair, by its row, that has a hypothesis; ``pair`` is any of the batch.
+
+    Pairs with many inliers keep a free homography, where the options say so.
+    """
+    solved = np.flatnonzero(np.isfinite(best.cost))
+    limit = np.inf if options.select_below is None else options.select_below
+    few = best.inliers[solved].sum(axis=1) < limit
+    selection = PairSelection(
+        best.homography[solved],
+        best.distortion[solved],
+        data.take(solved),
+        None if tilts is None else tilts[solved],
+        noise=None,
+        threshold=options.threshold,
+        fixed_distortion=options.distortion is not None,
+    )
+    std = pair.camera1.focal_log_std
+    planar = [PlanarPairModel(pair.focal, std, tilts is not None, height_free=free) for free in (False, True)]
+    fits: dict[int, PairFit] = {}
+    for models, rows in ((planar, few), ([], ~few)):
+        if rows.any():
+            selected = select_models(models, selection.take(np.flatnonzero(rows)))
+            fits.update(zip(solved[rows].tolist(), selected, strict=True))
+    return fits
 
 
 def _tilts(tilt: ArrayLike | None) -> FloatArray | None:

@@ -70,14 +70,11 @@ class Problems(Protocol[Equations]):
 
 
 def descend(
-    problems: Problems[Equations],
-    start: FloatArray,
-    iterations: int,
-    *,
-    loose: bool = False,
+    problems: Problems[Equations], start: FloatArray, iterations: int, *, loose: bool = False
 ) -> tuple[FloatArray, Equations]:
     """Where at most so many steps lead to, parameters of shape (B, K), and the equations there.
 
+    Damping falls tenfold or rises twentyfold, which suffices for a pair; :func:`damping_by_gain` is for many images.
     A problem that has converged takes no further part, so that each is solved as if it were alone. ``loose``: another
     descent goes on from there.
     """

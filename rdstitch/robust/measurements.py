@@ -22,10 +22,10 @@ class Measurements(Rows):
 
     x1: FloatArray  # x1, x2: (B, 2, N): measured points; zeros where ``present`` is False
     x2: FloatArray
-    present: BoolArray  # (B, N) bool: Which are matches; the rest is padding, or matches that are left out
-    count: IntArray  # (B,): Matches of each pair: they come before the padding
+    present: BoolArray  # (B, N) bool: which are matches; the rest is padding, or matches that are left out
+    count: IntArray  # (B,): matches of each pair: they come before the padding
     px: FloatArray  # (B,): pixels of image 2 in one normalized unit
-    # (B,): Pixels of image 2 that one pixel of image 1 becomes when normalized coordinates are kept
+    # (B,): pixels of image 2 that one pixel of image 1 becomes when normalized coordinates are kept
     px_ratio: FloatArray
 
     @classmethod
@@ -62,9 +62,9 @@ class Measurements(Rows):
 
     def at(self, index: IntArray) -> Self:
         """The matches at some places of each pair, (B, K); the padding at those beyond the matches."""
-        places = np.minimum(index, self.present.shape[1] - 1)
-        x1, x2 = (np.take_along_axis(x, places[:, None], axis=2) for x in (self.x1, self.x2))
-        present = np.take_along_axis(self.present, places, axis=1) & (index < self.count[:, None])
+        within = np.minimum(index, self.present.shape[1] - 1)
+        x1, x2 = (np.take_along_axis(x, within[:, None], axis=2) for x in (self.x1, self.x2))
+        present = np.take_along_axis(self.present, within, axis=1) & (index < self.count[:, None])
         return type(self)(x1, x2, present, present.sum(axis=1), self.px, self.px_ratio)
 
 

@@ -101,13 +101,14 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
 
     def finished(index: int, rows: IntArray) -> dict[int, PairFit]:
         model, fits, equations = fitted[index]
-        fits, standing = fits.take(rows), pairs.at(fits).take(rows)
+        fits = fits.take(rows)
+        selected = pairs.at(fitted[index].fits).take(rows)
         if index < len(planar):  # on all matches, with the noise that it leaves itself
-            equations = standing.problems(model).normal_equations(fits.parameters)
+            equations = selected.problems(model).normal_equations(fits.parameters)
         else:
             equations = equations.take(rows)
-        reasons = [_explained(fitted, index, rms[row]) for row in rows]
-        return dict(zip(rows.tolist(), _finished(_Fitted(model, fits, equations), standing, reasons), strict=True))
+        reasons = [_explained(fitted, index, rms[k]) for k in rows]
+        return dict(zip(rows.tolist(), _finished(_Fitted(model, fits, equations), selected, reasons), strict=True))
 
     for index in range(len(fitted)):
         rows = np.flatnonzero(chosen == index)

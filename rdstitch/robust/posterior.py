@@ -151,10 +151,7 @@ def focal_prior(log_focal: float, std: float, source: str) -> Prior:
     return Prior(((0.9, log_focal, std), (0.1, math.log(1.5), 0.7)))
 
 
-LENS = (
-    Prior(((0.9, 0.0, 0.04), (0.1, -0.35, 0.12))),
-    *(Prior(((1.0, 0.0, std),)) for std in LENS_STD[1:].tolist()),
-)
+LENS = (Prior(((0.9, 0.0, 0.04), (0.1, -0.35, 0.12))), *(Prior(((1.0, 0.0, std),)) for std in LENS_STD[1:].tolist()))
 """Priors on :data:`rdstitch.geometry.camera.LENS_PARAMETERS`."""
 
 WRONG_GIVEN_FOCAL = 0.02, 0.2
@@ -238,6 +235,7 @@ class Evidence:
         best = ErrorCost(np.full(groups, np.inf), np.zeros(groups), np.full(groups, 2.0))
         every = np.arange(groups)
         for fine in sizes:
+            # A cell's mean error has the variance of its noise and of its own field; blocks of cells share another one.
             variance = (fine**2)[group] + (self.noise**2)[group] / self.counts
             information = np.bincount(self.block, 1.0 / variance)
             weighted = np.stack([np.bincount(self.block, axis / variance) for axis in mean.T], axis=1)
@@ -247,8 +245,10 @@ class Evidence:
             costs = np.stack([np.bincount(self.group, each, groups) for each in of_blocks])
             index = np.argmin(costs, axis=0)
             of_cells = np.bincount(group, 2.0 * np.log(variance) + squared / variance, groups)
+            # Of normal variables: log det Σ + r' Σ⁻¹ r, by cells with the blocks' fields taken out (Woodbury).
             cost = self.weight * (of_cells + costs[index, every])
             field = np.hypot(fine, np.concatenate([np.zeros((1, groups)), sizes])[index, every])
+            # Independent coordinates: the information that is left, in units of what one coordinate would have.
             left = information / np.take_along_axis(grown, index[self.group][None], axis=0)[0]
             count = 2.0 * self.weight * (field**2 + self.noise**2) * np.bincount(self.group, left, groups)
             better = cost < best.cost

@@ -120,7 +120,7 @@ def ransac(
 
 @dataclass(eq=False)
 class _SolverState:
-    """One minimal solver's share of the search."""
+    """What one minimal solver has searched."""
 
     solver: MinimalSolver
     data: Measurements
@@ -132,7 +132,7 @@ class _SolverState:
 
     def __post_init__(self) -> None:
         self.drawn = np.zeros(len(self.data), dtype=np.intp)
-        self._least_raw_cost = np.ones(len(self.data))
+        self._min_raw_cost = np.ones(len(self.data))
 
     @cached_property
     def _sampler(self) -> Sampler:
@@ -158,9 +158,9 @@ class _SolverState:
         step = max(1, _SAMPLES_AT_ONCE // batch)
         hypotheses = [self._best_of(rows[i : i + step], picks[i : i + step]) for i in range(0, len(rows), step)]
         homography, distortion, cost = (np.concatenate(column) for column in zip(*hypotheses, strict=True))
-        better = cost < self._least_raw_cost[rows]
+        better = cost < self._min_raw_cost[rows]
         rows, homography, distortion = rows[better], homography[better], distortion[better]
-        self._least_raw_cost[rows] = cost[better]
+        self._min_raw_cost[rows] = cost[better]
         if not len(rows):
             return
         data, threshold = self.data.take(rows), self.options.threshold
@@ -175,9 +175,9 @@ class _SolverState:
     def _best_of(self, rows: IntArray, picks: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of each pair the hypothesis that explains a part of its matches best: H, λ and cost; inf where none is."""
         _, batch, size = picks.shape
-        places = picks.reshape(len(rows), 1, -1)
+        chosen = picks.reshape(len(rows), 1, -1)
         x1, x2 = (
-            np.take_along_axis(x[rows], places, axis=2).reshape(len(rows), 2, batch, size).transpose(0, 2, 3, 1)
+            np.take_along_axis(x[rows], chosen, axis=2).reshape(len(rows), 2, batch, size).transpose(0, 2, 3, 1)
             for x in (self.data.x1, self.data.x2)
         )
         tilts = None if self.tilts is None else np.repeat(self.tilts[rows], batch, axis=0)
@@ -238,7 +238,7 @@ def _subset(data: Measurements) -> Measurements:
         return data
     number = np.arange(_QUICK_SCORE)
     jitter = number * _GOLDEN % 1.0
-    places = ((number + jitter) * (data.count[:, None] / _QUICK_SCORE)).astype(np.intp)
+    index = ((number + jitter) * (data.count[:, None] / _QUICK_SCORE)).astype(np.intp)
     few = data.count <= _QUICK_SCORE
-    places[few] = number
-    return data.at(places)
+    index[few] = number
+    return data.at(index)

@@ -137,11 +137,7 @@ class PairProblems:
 
 @np.errstate(all="ignore")  # a step may leave the domain of the lens model
 def refine_pairs(
-    problems: PairProblems,
-    start: Fits,
-    iterations: int,
-    *,
-    loose: bool = False,
+    problems: PairProblems, start: Fits, iterations: int, *, loose: bool = False
 ) -> tuple[Fits, PairEquations]:
     """Fit the model and λ by at most so many steps; the fits, and the equations there.
 

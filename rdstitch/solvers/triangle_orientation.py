@@ -38,11 +38,7 @@ def oriented_samples(
     kept &= edges[1:] > edges[:-1]
     sample = np.flatnonzero(kept.any(axis=0))
     kept, edges = kept[:, sample], edges[:, sample]
-    return (
-        sample,
-        np.where(kept, edges[:-1], np.inf).min(axis=0),
-        np.where(kept, edges[1:], -np.inf).max(axis=0),
-    )
+    return (sample, np.where(kept, edges[:-1], np.inf).min(axis=0), np.where(kept, edges[1:], -np.inf).max(axis=0))
 
 
 def mirrored(triangles: FloatArray, distortion: FloatArray) -> NDArray[np.bool_]:

@@ -11,9 +11,8 @@ import math
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.stage.equations import StageEquations, Variances
+from rdstitch.stage.equations import LinkedPoints, StageEquations, Variances
 from rdstitch.stage.grid import TileGrid
-from rdstitch.stage.linked_points import LinkedPoints
 from rdstitch.system.dataclasses import dataclass
 
 _ROUNDS = 12
@@ -122,10 +121,7 @@ def _reweighted(
 def _variances(
     equations: StageEquations, state: FloatArray, draws: FloatArray, weights: FloatArray, usual: Variances
 ) -> Variances:
-    """The variances of tiles, rows, columns and pairs, from those that links hold.
-
-    The fewer they are, the more counts what is usual.
-    """
+    """Of tiles, rows, columns and pairs, from those that links hold: the fewer they are, the more counts the usual."""
     agreeing = weights > HOLDING_WEIGHT
 
     def squared(values: FloatArray, spread: FloatArray, shown: IntArray) -> FloatArray:

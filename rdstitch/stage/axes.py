@@ -24,9 +24,8 @@ class _Axis:
     """What pairs of neighbours along one of the stage's axes show."""
 
     step: FloatArray  # (2,): nominal, pixels
-    # (P, 2): where the second tile of a pair is in the first, and (P,): nats that it is there and not anywhere else
-    shown: FloatArray
-    nats: FloatArray
+    shown: FloatArray  # (P, 2): where the second tile of a pair is in the first
+    nats: FloatArray  # (P,): that it is there and not anywhere else
 
     def evidence(self, step: FloatArray, tolerance: float) -> float:
         """Nats for a step, over all pairs."""

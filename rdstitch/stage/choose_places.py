@@ -8,8 +8,8 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.stage.adjustment import HOLDING_WEIGHT, Adjustment, adjust
+from rdstitch.stage.equations import LinkedPoints
 from rdstitch.stage.evidence import ANYWHERE, HUNDRED_TO_ONE
-from rdstitch.stage.linked_points import LinkedPoints
 from rdstitch.stage.pair_candidates import Candidates, SearchPlan
 from rdstitch.stage.refinement import BlockMatches
 
@@ -21,7 +21,7 @@ def choose_places(
 ) -> dict[int, FloatArray]:
     """Where the second tile of a pair is in the first, by pair, where one place stands out.
 
-    What is certain teaches what the stage does, and that decides among the places of the other pairs.
+    What is certain teaches what the stage does, which decides among the places of the other pairs.
     """
     chosen: dict[int, FloatArray] = {}
     fitted = adjust(plan.grid, LinkedPoints.of(pairs, {}), plan.stage_std, lens)
@@ -50,9 +50,8 @@ def _most_likely(
     """The candidate that is likely the most where the stage leads one to expect it, and the logarithm of its odds."""
     covariance = covariance + np.eye(2) * (plan.factor / 2.0) ** 2
     off = candidates.offsets - expected
-    log_prior = -0.5 * np.einsum("ki,ij,kj->k", off, np.linalg.inv(covariance), off) - 0.5 * math.log(
-        (2.0 * math.pi) ** 2 * float(np.linalg.det(covariance))
-    )
+    squared = np.einsum("ki,ij,kj->k", off, np.linalg.inv(covariance), off)
+    log_prior = -0.5 * squared - 0.5 * math.log((2.0 * math.pi) ** 2 * float(np.linalg.det(covariance)))
     anywhere = -math.log(float(np.prod(plan.grid.size)))
     score = candidates.nats + np.logaddexp(log_prior, ANYWHERE + anywhere)
     best = int(score.argmax())
@@ -72,10 +71,7 @@ class _Move(NamedTuple):
 def _moved_tiles(
     pairs: IntArray, candidates: Sequence[Candidates], fitted: Adjustment, chosen: dict[int, FloatArray], search: float
 ) -> dict[int, FloatArray]:
-    """Places of pairs of tiles that are somewhere else, where nothing was chosen for any of a tile's pairs.
-
-    No pair alone can say that a tile is far from where its stage was sent, but all of them together.
-    """
+    """Places of pairs of tiles that are somewhere else: no pair alone can say so, but all pairs of a tile together."""
     of_tile: dict[int, list[int]] = {}
     for number, pair in enumerate(pairs.tolist()):
         for tile in pair:

@@ -165,10 +165,7 @@ def _sure_dark_level(light: FloatArray, variance: FloatArray) -> tuple[float, fl
 
 
 def agrees_with_overlaps(field: FlatField, overlaps: Iterable[tuple[NDArray[Any], NDArray[Any], FloatArray]]) -> bool:
-    """Check whether the same content differs between two tiles as it should by a flat field that they did not make.
-
-    An overlap is two tiles as measured, (h, w) or (h, w, C), and the place of the second in the first.
-    """
+    """Whether content differs between two tiles (h, w[, C]), the second at a place in the first, as by the field."""
     measured, expected = [], []
     for first, second, offset in overlaps:
         x, y = np.rint(offset).astype(int).tolist()

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.robust.loss import normal_std
-from rdstitch.stage.coarse_tile import CORRELATED, CoarseTile, energies, noise_variance
+from rdstitch.stage.coarse_tile import CORRELATED, CoarseTile, energies
 from rdstitch.stage.overlap import Overlap
-from rdstitch.stage.phase_correlation import peak_threshold, peaks, taper, whiten
+from rdstitch.stage.phase_correlation import correlate_frames, lay_tapered, peak_threshold, peaks
 from rdstitch.system.late_imports import fft
 
 HUNDRED_TO_ONE = math.log(100.0)  # by which a place of a pair stands out against another, or against nothing
@@ -71,32 +71,19 @@ def log_evidence(
 
 
 def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
-    """Places of the second tile in the first (K, 2), wherever along a side, and the evidence for them (K,), nats.
-
-    Of the highest peaks of two whole tiles; where they nearly coincide they share the camera and not the specimen.
-    """
-    first, second = (tile.pixels for tile in tiles)
-    sizes = np.array([first.shape, second.shape])
+    """Places of the second tile anywhere along a side of the first (K, 2), and the evidence for them (K,), nats."""
+    sizes, zero = np.array([tile.pixels.shape for tile in tiles]), np.zeros(2, dtype=np.intp)
     shape = tuple(int(fft.next_fast_len(int(side), real=True)) for side in sizes.sum(axis=0))
-    frames, noise = np.zeros((2, *shape), dtype=np.float32), []
-    for frame, tile in zip(frames, (first, second), strict=True):
-        weights = taper(tile.shape[0], _EDGE)[:, None] * taper(tile.shape[1], _EDGE)
-        frame[: tile.shape[0], : tile.shape[1]] = (tile - tile.mean()) * weights
-        noise.append(noise_variance(tile) * float((weights**2).sum()))
-    spectra = fft.rfft2(frames)
-    product = spectra[0] * np.conj(spectra[1])
-    plain = fft.irfft2(product, s=shape)
-    whiten(product, *np.array(noise))
-    surface = fft.irfft2(product, s=shape)
+    frames = np.zeros((2, 1, *shape), dtype=np.float32)
+    noise = [
+        [lay_tapered(frame, tile.pixels, np.array([0, 0, width, height]), zero, zero, _EDGE)]
+        for (frame,), tile, (height, width) in zip(frames, tiles, sizes, strict=True)
+    ]
+    (surface,), plain = correlate_frames(frames, np.array(noise))
     y, x = (
         np.where(np.arange(n) < side, np.arange(n), np.arange(n) - n) for n, side in zip(shape, sizes[0], strict=True)
     )
-    height, width = sizes.min(axis=0)
-    common = [np.minimum(s[0], v + s[1]) - np.maximum(0, v) for v, s in ((y, sizes[:, 0]), (x, sizes[:, 1]))]
-    least = [max(2.0, _MIN_COMMON * n) for n in (height, width)]
-    aside = (np.abs(y)[:, None] > _MIN_STEP * height) | (np.abs(x) > _MIN_STEP * width)
-    broad = (common[0][:, None] > 0.5 * height) | (common[1] > 0.5 * width)
-    possible = aside & broad & (common[0][:, None] > least[0]) & (common[1] > least[1])
+    possible = _may_be_neighbours(y, x, sizes)
     deviation = normal_std(surface[possible]) + 1e-12
     found: dict[tuple[int, int], None] = {}
     # A pattern that repeats itself is as high in many places of the plain correlation, and in chance ones of the other.
@@ -106,3 +93,16 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
     places = np.array(list(found), dtype=np.float64).reshape(-1, 2)
     boxes = [Overlap.expected(0, 1, place, sizes[:, ::-1], 1) for place in places]
     return places, np.array([log_evidence(tiles, box, at) for at, box in zip(places, boxes, strict=True)])
+
+
+def _may_be_neighbours(y: IntArray, x: IntArray, sizes: IntArray) -> BoolArray:
+    """Whether two tiles of sizes (2, 2), height and width, may lie so far apart (len(y), len(x)): side by side.
+
+    Where they nearly coincide they share the camera and not the specimen.
+    """
+    height, width = sizes.min(axis=0)
+    down, across = (np.minimum(a, v + b) - np.maximum(0, v) for v, (a, b) in ((y, sizes[:, 0]), (x, sizes[:, 1])))
+    aside = (np.abs(y)[:, None] > _MIN_STEP * height) | (np.abs(x) > _MIN_STEP * width)
+    broad = (down[:, None] > 0.5 * height) | (across > 0.5 * width)
+    enough = (down[:, None] > max(2.0, _MIN_COMMON * height)) & (across > max(2.0, _MIN_COMMON * width))
+    return np.asarray(aside & broad & enough)

@@ -46,10 +46,7 @@ class TileGrid:
         return _lines(self.places[:, 0], _SAME_LINE * self.size[0])
 
     def neighbours(self, reach: float) -> NDArray[np.intp]:
-        """Pairs of tiles that overlap along a good part of a side, or come so near that they may, (M, 2).
-
-        They follow one another along the grid, whatever the order of the tiles: few tiles are needed at a time.
-        """
+        """Pairs (M, 2) of tiles that may overlap along a good part of a side, ordered so that few are held at once."""
         sizes = self.sizes.astype(np.float64)
         order = np.argsort(self.places[:, 1], kind="stable")
         y = self.places[order, 1]

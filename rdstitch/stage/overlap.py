@@ -25,10 +25,7 @@ class Overlap:
 
     @classmethod
     def expected(cls, first: int, second: int, offset: FloatArray, sizes: IntArray, least: int) -> "Overlap":
-        """For two tiles of sizes (2, 2), width and height, the second of which should lie at an offset in the first.
-
-        An overlap narrower than ``least`` pixels is taken to be so wide.
-        """
+        """Of tiles of sizes (2, 2), width and height, the second at an offset in the first; ``least`` pixels wide."""
         side = sizes[0]
         whole = np.rint(offset).astype(np.intp)
         low, high = np.maximum(0, whole), np.minimum(side, sizes[1] + whole)

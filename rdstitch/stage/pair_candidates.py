@@ -76,14 +76,12 @@ class PairFinder:
     """Looks for the second tile of each pair in the first, on coarse tiles."""
 
     def __init__(self, plan: SearchPlan, pairs: IntArray) -> None:
-        self.grid, self.pairs, self.factor = plan.grid, pairs, plan.factor
-        grid, factor = plan.grid, plan.factor
-        side = max(grid.size)
-        self.radius = max(2, math.ceil(plan.search / factor))
-        self.spare = math.ceil(_LENS_REACH * side / factor)
+        self.grid, self.pairs, self.factor, side = plan.grid, pairs, plan.factor, max(plan.grid.size)
+        self.radius = max(2, math.ceil(plan.search / plan.factor))
+        self.spare = math.ceil(_LENS_REACH * side / plan.factor)
         self.least = math.ceil(_MIN_OVERLAP * side)
-        self.sizes = grid.sizes
-        self.coarse = Camera((-(-grid.size[0] // factor), -(-grid.size[1] // factor)))
+        self.sizes = plan.grid.sizes
+        self.coarse = Camera((-(-self.grid.size[0] // plan.factor), -(-self.grid.size[1] // plan.factor)))
 
     def overlap(self, number: int, offset: FloatArray | None = None, scale: int | None = None) -> Overlap:
         """What the tiles of a pair have in common with the second at an offset, by default where the grid has it."""

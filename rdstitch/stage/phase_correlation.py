@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.stage.coarse_tile import Image, noise_variance
 from rdstitch.stage.overlap import Overlap
 from rdstitch.system.dataclasses import dataclass
@@ -23,10 +23,8 @@ _FALSE_ALARMS = 1e-4  # chance that the highest of all peaks of noise is taken f
 class Surfaces:
     """Correlation of each block over all displacements within a radius."""
 
-    # (K, 2 P + 1, 2 P + 1), float16: rows are displacements in y, from -P on; columns in x. Noise has the standard
-    # deviation 1 in their sum
-    values: NDArray[np.float16]
-    plain: Image  # (2 P + 1, 2 P + 1): of all blocks, with the frequencies as strong as they are
+    values: NDArray[np.float16]  # (K, 2 P + 1, 2 P + 1): rows are displacements in y, from -P on; columns in x
+    plain: Image  # (2 P + 1, 2 P + 1): of all blocks; both as of :func:`correlate_frames`
 
     @property
     def reach(self) -> int:
@@ -56,26 +54,29 @@ def correlate(first: Image, second: Image, overlap: Overlap, reach: int) -> Surf
     noise = np.zeros((2, len(sizes)))
     for number, block in enumerate(overlap.blocks):
         margins = np.full(2, reach)
-        inner = margins.copy()
-        if along >= 0:
-            inner[along] = 0
+        inner = np.where(np.arange(2) == along, 0, reach)
         corner = block[:2] - reach
-        noise[0, number] = _fill(frames[0, number], first, block, inner, corner)
+        noise[0, number] = lay_tapered(frames[0, number], first, block, inner, corner)
         moved = block - np.tile(overlap.offset, 2)
-        noise[1, number] = _fill(frames[1, number], second, moved, margins, corner - overlap.offset)
-    spectra = fft.rfft2(frames)
-    product = spectra[0] * np.conj(spectra[1])
+        noise[1, number] = lay_tapered(frames[1, number], second, moved, margins, corner - overlap.offset)
+    surfaces, plain = correlate_frames(frames, noise)
     rows, columns = (np.arange(-reach, reach + 1) % side for side in shape)
-    plain = fft.irfft2(product.sum(axis=0), s=shape)[rows[:, None], columns]
-    whiten(product, noise[0][:, None, None], noise[1][:, None, None])
+    return Surfaces(surfaces[:, rows[:, None], columns].astype(np.float16), plain[rows[:, None], columns])
+
+
+def correlate_frames(frames: Image, noise: FloatArray) -> tuple[Image, Image]:
+    """Correlate K pairs of frames (2, K, h, w) whose spectra have noise of so much power (2, K).
+
+    First (K, h, w), with all frequencies as strong as they are sure: noise has the standard deviation 1 in the sum.
+    Then (h, w), of all pairs, with the frequencies as strong as they are.
+    """
+    shape, spectra = frames.shape[2:], fft.rfft2(frames)
+    product = spectra[0] * np.conj(spectra[1])
+    plain = fft.irfft2(product.sum(axis=0), s=shape)
+    of_noise = (_NOISE_SHARE * np.sqrt(noise.prod(axis=0))).astype(np.float32)[:, None, None]
+    product /= np.abs(product) + of_noise + np.float32(1e-12)
     power = float((np.abs(product) ** 2).sum()) * 2.0
-    surface = fft.irfft2(product, s=shape) * (shape[0] * shape[1] / np.sqrt(power + 1e-12))
-    return Surfaces(surface[:, rows[:, None], columns].astype(np.float16), plain)
-
-
-def whiten(product: NDArray[np.complexfloating], noise1: FloatArray, noise2: FloatArray) -> None:
-    """Make all frequencies of a product of spectra as strong as they are sure, by the noise power of both."""
-    product /= np.abs(product) + (_NOISE_SHARE * np.sqrt(noise1 * noise2)).astype(np.float32) + np.float32(1e-12)
+    return fft.irfft2(product, s=shape) * (shape[0] * shape[1] / np.sqrt(power + 1e-12)), plain
 
 
 def peaks(surface: NDArray[Any], threshold: float, count: int) -> list[tuple[int, int]]:
@@ -90,8 +91,8 @@ def peak_threshold(deviation: float, places: int) -> float:
     return deviation * math.sqrt(2.0 * math.log(places / _FALSE_ALARMS))
 
 
-def _fill(
-    frame: Image, tile: Image, block: NDArray[np.intp], margin: NDArray[np.intp], corner: NDArray[np.intp]
+def lay_tapered(
+    frame: Image, tile: Image, block: IntArray, margin: IntArray, corner: IntArray, share: float = _TAPER
 ) -> float:
     """Lay a block with a margin, as far as the tile has it, tapered into a frame; return its spectrum's noise power."""
     low = np.maximum(block[:2] - margin, 0)
@@ -99,14 +100,14 @@ def _fill(
     if (high - low < 4).any():
         return 0.0
     part = tile[low[1] : high[1], low[0] : high[0]]
-    weights = taper(part.shape[0])[:, None] * taper(part.shape[1])
+    weights = _taper(part.shape[0], share)[:, None] * _taper(part.shape[1], share)
     x, y = low - corner
     frame[y : y + part.shape[0], x : x + part.shape[1]] = (part - part.mean()) * weights
     return noise_variance(part) * float((weights**2).sum())
 
 
 @lru_cache(maxsize=64)
-def taper(length: int, share: float = _TAPER) -> Image:
+def _taper(length: int, share: float) -> Image:
     """A window that falls to 0 as a cosine at both ends, over a share of its length."""
     distance = (np.minimum(np.arange(length), np.arange(length)[::-1]) + 0.5) / max(1.0, share * length)
     return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.minimum(distance, 1.0)), dtype=np.float32)

@@ -106,10 +106,7 @@ def _number(letters: str) -> int:
 def grid_from_table(
     names: Sequence[str], file: str | Path, size: tuple[int, int], pixel_size: float | None
 ) -> TileGrid:
-    """Places by a CSV file with the columns ``name``, ``x`` and ``y``, pixels, or ``x_um`` and ``y_um``.
-
-    Or by Fiji's ``TileConfiguration.txt``, which is in pixels.
-    """
+    """Places by a CSV file with ``name``, ``x`` and ``y``, or ``x_um`` and ``y_um``, or by Fiji's list, in pixels."""
     text, unit = read_text(file), None
     table = _fiji_places(text, file)
     if not table:

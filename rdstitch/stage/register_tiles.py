@@ -10,8 +10,8 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.stage.adjustment import HOLDING_WEIGHT, Adjustment, adjust
 from rdstitch.stage.choose_places import choose_places
+from rdstitch.stage.equations import LinkedPoints
 from rdstitch.stage.grid import TileGrid
-from rdstitch.stage.linked_points import LinkedPoints
 from rdstitch.stage.overlap import Overlap
 from rdstitch.stage.pair_candidates import PairFinder, Reader, SearchPlan, in_pairs
 from rdstitch.stage.refinement import BlockMatches, PointMap, refine
@@ -68,8 +68,7 @@ def register_tiles(
 ) -> TileRegistration:
     """Find the places of all tiles.
 
-    ``distortion`` is λ where it is known, "auto" where it is to be estimated; otherwise it is 0 unless pairs along rows
-    and pairs along columns show the same.
+    ``distortion``: λ, or "auto" to estimate it; else it is 0 unless pairs along rows and along columns agree on it.
     """
     if distortion == "auto" and plan.grid.own_sizes is not None:
         raise ArgumentError("tiles of different sizes do not show λ; give a number with --distortion, or leave it out")

@@ -21,8 +21,8 @@ MATCH_ERROR = 1.5  # pixels by which a corner that was followed may be off the m
 _AGREEING = 0.5  # share of the corners that must agree on it
 _WRONG = 0.05  # share of the matches that agree by chance
 
+# A keyframe, its points (N, 2), those of the frame, and their quality (N,).
 Matched = tuple[TrackedFrame, FloatArray, FloatArray, FloatArray | None]
-"""A keyframe, its points (N, 2), those of the frame, and their quality (N,)."""
 
 
 def agree(inliers: BoolArray) -> bool:

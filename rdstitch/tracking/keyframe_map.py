@@ -6,10 +6,11 @@ from collections.abc import Container, Mapping, Sequence
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.features import Matcher
 from rdstitch.matching.links import Link
 from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
-from rdstitch.tracking.frame_links import MATCH_ERROR, fitted_homography
+from rdstitch.tracking.frame_links import MATCH_ERROR, fitted_homography, links_by_corners, links_by_features
 from rdstitch.tracking.metric_plane import chained
 from rdstitch.tracking.placement import Placement, PlaneSimilarity
 from rdstitch.tracking.state import TrackState
@@ -76,12 +77,24 @@ class KeyframeMap:
         """Whether alignments keep the focal length: that of one map must not depend on the window."""
         return self.knowledge.focal is not None and (self.knowledge.stated_std > 0.0 or not self.whole)
 
-    @property
-    def partners(self) -> list[TrackedFrame]:
-        """What a frame is matched with."""
-        return self.keyframes[: -_PARTNERS - 1 : -1]
+    def links_with(self, frame: Frame, placed: TrackedFrame | None, match: Matcher) -> list[Link]:
+        """Links of a frame with the last keyframes, as far as they can be registered; of a lost one, with more."""
+        last = self.keyframes[: -_PARTNERS - 1 : -1]
+        if placed is not None and (links := links_by_corners(placed, last, self.knowledge)):
+            return links
+        for others in (last, self._to_search()):
+            if links := links_by_features(frame, others, match, self.knowledge):
+                if (about := self.place_by_links(frame, links)) is None:
+                    return links
+                numbers = {link.image1 for link in links}
+                shown = [keyframe for keyframe in others if keyframe.number in numbers]
+                # What a frame shows again is among the last keyframes again.
+                self.keyframes = [k for k in self.keyframes if k not in shown] + shown[::-1]
+                self.older = [k for k in self.older if k not in shown]
+                return links_by_corners(TrackedFrame(frame, about), shown, self.knowledge) or links
+        return []
 
-    def to_search(self) -> list[TrackedFrame]:
+    def _to_search(self) -> list[TrackedFrame]:
         """Further keyframes for a frame without a place, others each time while the track is lost."""
         further = [*self.keyframes[:-_PARTNERS][::-1], *self.older[::-1]]
         start = self.searched % max(len(further), 1) if self.state.lost else 0
@@ -93,11 +106,6 @@ class KeyframeMap:
     def all_searched(self) -> bool:
         """Whether a lost frame was compared with all."""
         return self.searched >= len(self.older) + max(len(self.keyframes) - _PARTNERS, 0)
-
-    def found_again(self, shown: Sequence[TrackedFrame]) -> None:
-        """Make keyframes that a frame shows again the last ones."""
-        self.keyframes = [k for k in self.keyframes if k not in shown] + list(shown)[::-1]
-        self.older = [k for k in self.older if k not in shown]
 
     def place(
         self, frame: Frame, other: TrackedFrame, before: FloatArray, now: FloatArray, *, rough: bool = False
@@ -170,10 +178,9 @@ class KeyframeMap:
         below = move.applied(self.knowledge.plane.below(first.frame.camera, self.knowledge.attitude(first.frame)))
         covariance = np.zeros((4, 4)) if first.place.covariance is None else first.place.covariance
         first.place = replace(first.place, placement=below, aligned=True, covariance=covariance)
-        self.state = self.state.with_plane()
+        self.state, enlarge = self.state.with_plane(), PlaneSimilarity(length_factor, 0.0)
         for keyframe in (*self.older, *others):
-            enlarged = PlaneSimilarity(length_factor, 0.0).applied(keyframe.place.placement)
-            keyframe.place = replace(keyframe.place, placement=enlarged)
+            keyframe.place = replace(keyframe.place, placement=enlarge.applied(keyframe.place.placement))
         for keyframe in others:
             keyframe.place = self.place_by_links(keyframe.frame, self.links) or keyframe.place
 

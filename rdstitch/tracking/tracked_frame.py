@@ -27,9 +27,7 @@ class TrackingResult:
 
     number: int = -1  # of the frame, in the order of arrival; -1 where it could not be read
     placement: Placement | None = None  # where it lies on the plane of its map; None where that is not known
-    # distortion, distortion_std: λ by all frames up to this one, half-diagonal frame; NaN and inf where it cannot be
-    # seen
-    distortion: float = math.nan
+    distortion: float = math.nan  # λ by all frames up to this one, half-diagonal frame; NaN where it cannot be seen
     distortion_std: float = math.inf
     distortion_known: bool = False  # whether λ was given, or is so certain that it is kept from now on
     map_number: int | None = None  # maps have no common plane: a new one begins where the track was lost
@@ -41,19 +39,14 @@ class TrackingResult:
     # what all lengths share. None where there is no metric pose
     covariance: FloatArray | None = field(default=None, repr=False, compare=False)
     length_std: float = math.nan  # relative standard deviation that all lengths share
-    # unit, unit_std: the height of the first keyframe by odometry, and its relative standard deviation
-    unit: float = math.nan
-    unit_std: float = math.nan
+    unit: float = math.nan  # height of the first keyframe by odometry
+    unit_std: float = math.nan  # relative
     reason: str = ""  # why there is no place; empty where there is one
 
     @property
     def pose(self) -> CameraPose | None:
         """Pose of the camera, where its place is known and the model has poses."""
         return None if self.placement is None else self.placement.pose
-
-
-def _nothing_static(points: FloatArray) -> BoolArray:
-    return np.zeros(len(points), dtype=np.bool_)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +59,8 @@ class Frame:
     detect: Callable[[PreparedImage], Features]
     attitude: FloatArray | None = None  # (S, 2): (ψ, θ) as measured at DELAYS, radians
     body: BodyPose | None = None  # by odometry
-    static: Callable[[FloatArray], BoolArray] = _nothing_static  # which points (N, 2) do not move with the floor
+    # which points (N, 2) do not move with the floor
+    static: Callable[[FloatArray], BoolArray] = lambda points: np.zeros(len(points), dtype=np.bool_)
 
     @cached_property
     def corners(self) -> FloatArray:

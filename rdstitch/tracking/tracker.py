@@ -24,7 +24,6 @@ from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.map_refinement import MapRefinement
 from rdstitch.tracking.odometry_prediction import OdometryPrediction
 from rdstitch.tracking.placement import Placement
-from rdstitch.tracking.relocalisation import links_with_map
 from rdstitch.tracking.state import TrackState
 from rdstitch.tracking.tracked_frame import Frame, FramePlace, TrackedFrame, TrackingResult
 
@@ -37,11 +36,12 @@ class TrackingOptions:
     """Choices and knowledge of a tracker."""
 
     pair: EstimationOptions = field(default_factory=EstimationOptions)  # with λ, where it is known
-    # of the windows of keyframes; λ is that of the cameras where ``pair`` has one
-    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
-    # whether an alignment is waited for where it is due, so that the same frames give the same poses; else no frame
-    # waits for more than a part of its time
-    patient: bool = True
+    alignment: AlignmentOptions = field(
+        default_factory=AlignmentOptions
+    )  # with the λ of the cameras if ``pair`` has one
+    patient: bool = (
+        True  # whether alignments are waited for: the same frames give the same poses; else no frame waits long
+    )
 
 
 class FrameTracker:
@@ -52,11 +52,7 @@ class FrameTracker:
     """
 
     def __init__(
-        self,
-        options: TrackingOptions,
-        detect: Callable[[PreparedImage], Features],
-        match: Matcher,
-        executor: Executor,
+        self, options: TrackingOptions, detect: Callable[[PreparedImage], Features], match: Matcher, executor: Executor
     ) -> None:
         self._detect, self._match, self._count = detect, match, 0
         self.messages: list[Message] = []  # what the user should know of what has come so far
@@ -99,7 +95,7 @@ class FrameTracker:
         """By the corners that were followed, else by links with keyframes, else by odometry."""
         placed, links = self._follow(frame), list[Link]()
         if placed is None or self._is_new(placed):
-            links = links_with_map(frame, placed, self._map, self._match)
+            links = self._map.links_with(frame, placed, self._match)
             if (place := self._map.place_by_links(frame, links)) is not None:
                 placed = TrackedFrame(frame, place)
         if placed is not None:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.seam_quality import SeamTile, likeness
-from rdstitch.compositing.warp import Lattice
+from rdstitch.compositing.lattice import Lattice
+from rdstitch.compositing.likeness import likeness
+from rdstitch.compositing.seam_quality import SeamTile
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.io.read import DecodedImage

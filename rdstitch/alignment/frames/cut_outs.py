@@ -75,10 +75,7 @@ def cut_alignment(alignment: Alignment, sizes: Sequence[Size]) -> Alignment:
     units = np.array([powers.get(name, 1.0) for name in alignment.parameters])
     cameras = tuple(_cut_camera(camera, own) for camera, own in zip(framed, sizes, strict=True))
     return replace(
-        alignment,
-        cameras=cameras,
-        homographies=homographies,
-        covariance=units[:, None] * alignment.covariance * units,
+        alignment, cameras=cameras, homographies=homographies, covariance=units[:, None] * alignment.covariance * units
     )
 
 

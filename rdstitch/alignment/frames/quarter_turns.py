@@ -145,9 +145,9 @@ def _turned_poses(poses: PlanarPoses, turn: FloatArray, reference: int) -> tuple
     level = rotation_from_tilt(tilt).transpose(0, 2, 1) @ rotation
     yaw = np.arctan2(level[:, 1, 0], level[:, 0, 0])
     plane = rigid_in_plane(yaw[reference], np.zeros(2))
-    yaw = np.remainder(yaw - yaw[reference] + np.pi, 2.0 * np.pi) - np.pi
-    around = plane[:2, :2]
-    return PlanarPoses(yaw, poses.position @ around.T, poses.height, tilt, *poses.turned(around)), plane
+    covariance, with_first = poses.turned(plane[:2, :2])
+    relative = PlanarPoses(yaw, poses.position, poses.height, tilt).relative_to(reference)
+    return replace(relative, covariance=covariance, with_first=with_first), plane
 
 
 def _turned_covariance(alignment: Alignment, turn: FloatArray) -> FloatArray:

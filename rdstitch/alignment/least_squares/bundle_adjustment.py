@@ -54,10 +54,7 @@ class Parameters:
         size = len(self.shared)
         lens[free_lens] += step_shared[size:]
         return replace(
-            self,
-            poses=model.retract(self.poses, step_poses),
-            shared=self.shared + step_shared[:size],
-            lens=lens,
+            self, poses=model.retract(self.poses, step_poses), shared=self.shared + step_shared[:size], lens=lens
         )
 
 
@@ -312,10 +309,7 @@ class BundleAdjuster:
         )
         poses = self.model.prior_coordinates(state.parameters.poses) - p.poses
         return normal.with_priors(
-            p.poses_precision,
-            poses,
-            derivative.T @ (precision[:, None] * derivative),
-            derivative.T @ slope,
+            p.poses_precision, poses, derivative.T @ (precision[:, None] * derivative), derivative.T @ slope
         )
 
     def _of_marks(self, state: _State) -> ImageEquations | None:

@@ -26,7 +26,7 @@ class LinearResponse:
     """An adjustment, linearized at its solution."""
 
     adjuster: BundleAdjuster
-    adjusted: BundleAdjustmentResult  # of this adjuster
+    adjusted: BundleAdjustmentResult  # of this adjuster, or of one that held a part of the lens
     weight: FloatArray  # (M,): what the square of each error counts in the normal equations
     curvature: float  # mean derivative of ``w r`` by r, in units of the mean of w: between 0 and 1
     normal: SparseNormalEquations  # with the curvature in them

@@ -10,6 +10,7 @@ products of the coordinates of p, are all that is summed: no Jacobian is formed.
 from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +39,18 @@ class LinkEquations:
     errors: FloatArray  # (M, 2): whitened, pixels; NaN where there is no transfer
 
 
-def split_lens(lens: FloatArray) -> tuple[float, tuple[float, ...], FloatArray]:
-    """λ; μ and ν, nothing where both are 0; and the distortion centre (2,), of :data:`LENS_PARAMETERS` (5,)."""
-    distortion, *higher = lens[:3].tolist()
-    return distortion, tuple(higher) if any(higher) else (), lens[3:]
+class Lens(NamedTuple):
+    """The parameters of a lens, half-diagonal frame."""
+
+    distortion: float  # λ
+    higher: tuple[float, ...]  # μ and ν; nothing where both are 0
+    center: FloatArray  # (2,): the distortion centre, from that of the camera
+
+
+def split_lens(parameters: FloatArray) -> Lens:
+    """By :data:`LENS_PARAMETERS` (5,)."""
+    distortion, *higher = parameters[:3].tolist()
+    return Lens(distortion, tuple(higher) if any(higher) else (), parameters[3:])
 
 
 def folds(lens: FloatArray, reach: float = 1.0) -> bool:

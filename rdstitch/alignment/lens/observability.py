@@ -10,7 +10,7 @@ from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentR
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.lens.lens_selection import LensChoice, choose_lens, residual_coherence
-from rdstitch.alignment.noise import COHERENT_CORRELATION, LARGE_RELIEF
+from rdstitch.alignment.noise import COHERENT_CORRELATION, shows_relief
 from rdstitch.alignment.pairwise import pairwise_homographies, relations_at
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import LENS_STD
@@ -59,9 +59,8 @@ def _is_depth(free_lens: BundleAdjustmentResult, given_lens: BundleAdjustmentRes
     that are left, λ takes the blame for more of it than that.
     """
     without, with_lens = residual_coherence(given_lens), residual_coherence(free_lens)
-    if without.correlation <= COHERENT_CORRELATION or without.relative_size <= LARGE_RELIEF:
-        return False
-    return with_lens.correlation > COHERENT_CORRELATION and without.size < _LENS_OVER_DEPTH * with_lens.size
+    smaller = with_lens.correlation > COHERENT_CORRELATION and without.size < _LENS_OVER_DEPTH * with_lens.size
+    return shows_relief(without) and smaller
 
 
 def _observable(pairwise: BundleAdjustmentResult) -> bool:

@@ -245,7 +245,7 @@ def test_a_frame_that_corners_place_is_not_lost_where_they_make_no_link(
     tracker = _tracker(DISTORTION, lambda image: detect(image.grey, FeatureOptions(max_features=600)))
     for image in video[1][:30]:
         tracker.add(prepare(View(image), None), Camera(SIZE))
-    monkeypatch.setattr("rdstitch.tracking.tracker.links_with_map", lambda *_: [])
+    monkeypatch.setattr("rdstitch.tracking.keyframe_map.KeyframeMap.links_with", lambda *_: [])
     later = [tracker.add(prepare(View(image), None), Camera(SIZE))[-1] for image in video[1][30:36]]
     assert any(result.inliers for result in later)
     assert all(result.inliers > 0 for result in later if result.placement is not None)
