@@ -74,7 +74,8 @@ def followed(
 
     if len(inputs) != 1:
         raise click.UsageError("--follow takes one input: a folder, a video, the index of a camera, a stream or -")
-    (source,), output = inputs, files.bag or files.written[0]
+    # An address is text: as a path it would lose one of its slashes.
+    source, output = Path(inputs[0]), files.bag or files.written[0]
     if source.is_dir() and output.resolve().parent == source.resolve():
         raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
     with Outputs(run.options.overwrite) as outputs:
@@ -84,7 +85,7 @@ def followed(
     before = None if preview is None else file_state(preview)
     with TemporaryFolder() as folder:
         arrivals = open_frame_stream(
-            str(source),
+            str(inputs[0]),
             frames_folder=lambda: folder,
             names=sys.stdin,
             every=every or 1,

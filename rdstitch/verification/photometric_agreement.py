@@ -54,7 +54,7 @@ class Agreement:
         return self.confirming / self.cells if self.cells else 1.0
 
     @property
-    def unlike(self) -> float:
+    def unlike_cells(self) -> float:
         """Number of the cells that look different three times smaller, where depth and blur are no difference."""
         return 0.0 if math.isnan(self.coarsely) else self.cells * (1.0 - self.coarsely)
 
