@@ -32,7 +32,7 @@ from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message
 from rdstitch.results.pose import FollowedPoses, Pose
 from rdstitch.tracking import FrameTracker, TrackingOptions, TrackingResult
-from rdstitch.tracking.live_preview import LivePreview
+from rdstitch.tracking.preview import LivePreview
 
 _FEATURES = 600  # of a frame, that suffice to follow it
 _MEGAPIXELS = 0.1  # 10⁶ pixels in which they are detected: a frame of 640 x 480 pixels is halved once
