@@ -20,6 +20,7 @@ from rdstitch.system.dataclasses import dataclass
 # which the finer one is coarser for more than some 70 images, and both for more than 800.
 _COARSE, _FINE = (12, 120_000), (24, 40_000)
 _SLOPES = (0.2, 0.06, 0.02)
+_SLOPE_OF_GROUND = 0.5  # one surface for all images: many matches determine it, and it may be freer
 _HELD_OUT = 5  # every fifth match
 _WORTHWHILE = 0.15  # share by which what a person sees must get less for local alignment to be worth while
 # A person sees edges that do not go on across seams, as far as this percentile of the held-out residuals, and straight
@@ -107,7 +108,7 @@ def align_locally(
     straight = cache(lambda: _long_edges(edges, cameras))
     base = None
     if centers is not None:
-        stiffness = Stiffness(cells, _SLOPES[0])
+        stiffness = Stiffness(cells, _SLOPE_OF_GROUND)
         ground = fit_ground(fitted, images, images.scale * centers, stiffness).fields(images, stiffness)
         seams = _seam_residual(tested.residual_with(ground.delivered, images))
         if seams <= worthwhile and seams + _bend(ground.delivered, straight()) <= worthwhile:
