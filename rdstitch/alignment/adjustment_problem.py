@@ -27,11 +27,8 @@ POSE_TILT_SPREAD = math.radians(35.0)
 
 _TILT_SPREAD_START = math.radians(3.0)
 _MIN_TILT_SPREAD = math.radians(0.05)
-_ROUNDS, _SETTLED = 3, 0.1
-"""Of estimating scales of priors, and by how much they still change at the end."""
-
-_MISFIT = 1.5
-"""Times the errors of links on their own from which on those of a model are its own."""
+_ROUNDS, _SETTLED = 3, 0.1  # of estimating scales of priors, and by how much they still change at the end
+_MISFIT = 1.5  # times the errors of links on their own from which on those of a model are its own
 
 
 @dataclass(frozen=True, eq=False)

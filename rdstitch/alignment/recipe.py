@@ -42,8 +42,7 @@ _MATCHES_OF_A_TURN = 5000
 _MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 500_000, 40
 """Correspondences of all links together that are enough, and of a link that are used nevertheless."""
 
-_ROUNDS = 3
-"""Rounds of rejecting wrong pairs and adjusting again."""
+_ROUNDS = 3  # rounds of rejecting wrong pairs and adjusting again
 
 _REFERENCE_LEFT_OUT = Message("the reference image that was named is not among those aligned; another one is taken")
 

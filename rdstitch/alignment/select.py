@@ -33,8 +33,7 @@ from rdstitch.system.dataclasses import dataclass, replace
 _GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
 """Half diagonals: points of an image of usual proportions, out to the corners."""
 
-_FRAMES = 12
-"""Images that are tried as the frame of a plane without a metric."""
+_FRAMES = 12  # images that are tried as the frame of a plane without a metric
 
 
 def stretch(fit: Fit) -> float:

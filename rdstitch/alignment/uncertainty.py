@@ -39,8 +39,7 @@ _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
 _UNLIKELY_FOCAL = 4.0
 """Standard deviations of what is known of a focal length beyond which it may stand for something else."""
 
-_SINGULAR = 1e-12
-"""Least eigenvalue of a correlation matrix of parameters."""
+_SINGULAR = 1e-12  # least eigenvalue of a correlation matrix of parameters
 
 
 def covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray]:

@@ -13,11 +13,8 @@ from rdstitch.matching.links import Link, spread_choice
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, sigma_of
 from rdstitch.system.dataclasses import dataclass, replace
 
-_CHUNK = 4096
-"""Correspondences linearized at a time: what stays in cache."""
-
-_STATIC = 1.0
-"""Pixels that the displacements of most correspondences of a link stay below where the camera stood still."""
+_CHUNK = 4096  # correspondences linearized at a time: what stays in cache
+_STATIC = 1.0  # pixels that the displacements of most correspondences of a link stay below where the camera stood still
 
 
 @dataclass(frozen=True, eq=False)
