@@ -98,10 +98,6 @@ class Problem:
         )
         return part, images
 
-    def squared(self, model: MotionModel, parameters: Parameters) -> FloatArray:
-        """``|r|²`` of each correspondence (M,) at some parameters, px², whitened."""
-        return self.adjuster(model).squared(parameters)
-
     def refine(self, model: MotionModel, start: Parameters, tilt_spread: float | None = None) -> Fit:
         """Adjust a model from a given start, with the scales of its priors: the tilts' spread, the errors' dependence.
 

@@ -92,7 +92,7 @@ def sandwich_covariances(
 def _relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> ReliefField:
     """What relief does, by as many matches of each link as show its waves."""
     observations = adjuster.observations
-    few = observations.thinned_to(_ENOUGH, _MIN_MATCHES_PER_LINK)
+    few = observations.thinned(max(_ENOUGH // max(len(observations), 1), _MIN_MATCHES_PER_LINK))
     fraction = len(few.points1) / max(len(observations.points1), 1)
     if fraction < 1.0:  # each counts for several beside the priors
         adjuster = replace(adjuster, observations=few, overdispersion=adjuster.overdispersion * fraction)
