@@ -16,8 +16,8 @@ from rdstitch_cli.stitching import warn_of
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
-    from rdstitch.inputs.arrivals import Arrivals
     from rdstitch.inputs.frame import Named
+    from rdstitch.inputs.frame_stream import FrameStream
     from rdstitch.pipeline.run import Run
     from rdstitch.pipeline.run_files import RunFiles
     from rdstitch.results.pose import FollowedPoses
@@ -67,14 +67,15 @@ def followed(
 
     ``files`` are those of the recipe, and ``poses`` says how poses are printed: as the recipe writes them.
     """
-    from rdstitch.inputs.arrivals import open_arrivals
+    from rdstitch.inputs.frame_stream import open_frame_stream
     from rdstitch.system.file_access import file_state
     from rdstitch.system.outputs import Outputs
     from rdstitch.system.temporary_folder import TemporaryFolder
 
     if len(inputs) != 1:
         raise click.UsageError("--follow takes one input: a folder, a video, the index of a camera, a stream or -")
-    (source,), output = inputs, files.bag or files.written[0]
+    # An address is text: as a path it would lose one of its slashes.
+    source, output = Path(inputs[0]), files.bag or files.written[0]
     if source.is_dir() and output.resolve().parent == source.resolve():
         raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
     with Outputs(run.options.overwrite) as outputs:
@@ -83,8 +84,8 @@ def followed(
         reporter.tell(note)
     before = None if preview is None else file_state(preview)
     with TemporaryFolder() as folder:
-        arrivals = open_arrivals(
-            str(source),
+        arrivals = open_frame_stream(
+            str(inputs[0]),
             frames_folder=lambda: folder,
             names=sys.stdin,
             every=every or 1,
@@ -102,7 +103,7 @@ def followed(
 
 
 def _print_poses(
-    arrivals: "Arrivals",
+    arrivals: "FrameStream",
     options: StitchOptions,
     poses: "FollowedPoses | None",
     preview: Path | None,

@@ -20,7 +20,7 @@ from examples.benchmarks.driver import run
 from examples.judging.trajectories import compare_trajectories
 from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.inputs.arrivals import open_arrivals
+from rdstitch.inputs.frame_stream import open_frame_stream
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.follow import follow
@@ -65,7 +65,7 @@ def main(
         for index in range(frames):
             if not (file := images / f"frame_{index:05d}.jpg").exists():
                 write_image(file, drive.frame(index))
-        arrivals = open_arrivals(images, frames_folder=lambda: images, idle=0.5)
+        arrivals = open_frame_stream(images, frames_folder=lambda: images, idle=0.5)
         preview = images / ".preview.jpg"
         poses, spent, memory, last = list[Pose](), list[float](), 0.0, time.process_time()
         for frame in follow(arrivals, options, preview=preview, refresh=1.0):

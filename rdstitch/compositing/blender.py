@@ -54,7 +54,6 @@ class MultibandBlender:
     _weights: list[Float32Array] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        """Make room for the sums."""
         width, height = self.box[2] - self.box[0], self.box[3] - self.box[1]
         for band in range(self.bands + 1):
             shape = (height >> band, width >> band)
@@ -110,12 +109,10 @@ def per_channel(plane: Float32Array, channels: int) -> Float32Array:
 
 
 def _down(values: Float32Array) -> Float32Array:
-    """Half the resolution."""
     done = cv2.pyrDown(values)
     return np.asarray(done, dtype=np.float32).reshape(*done.shape[:2], values.shape[2])
 
 
 def _up(values: Float32Array) -> Float32Array:
-    """Twice the resolution."""
     done = cv2.pyrUp(values)
     return np.asarray(done, dtype=np.float32).reshape(*done.shape[:2], values.shape[2])

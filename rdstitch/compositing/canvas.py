@@ -4,7 +4,7 @@ A homography ``G`` maps the half-diagonal-normalized undistorted coordinates of 
 which have no unit; the canvas is the plane scaled, turned and shifted to pixels. Where images were taken by turning
 on the spot, G maps them to directions, and the canvas is what a projection makes of these.
 
-Of an oblique image the near part is drawn (:mod:`rdstitch.compositing.near_part`).
+Of an oblique image the near part is drawn (:mod:`rdstitch.compositing.visible_region`).
 """
 
 import math
@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.near_part import POINTS_PER_SIDE, PROBES, NearPart, near_parts
 from rdstitch.compositing.projection import PLANE, Projection
+from rdstitch.compositing.visible_region import POINTS_PER_SIDE, PROBES, VisibleRegion, visible_regions
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.geometry.radial_homography import to_directions, to_plane
@@ -39,7 +39,7 @@ class Canvas:
     projection: Projection = PLANE  # what ``matrix`` is applied to: the places that it gives to directions
     # width of a full turn, pixels, where the images go all the way round; None where they do not
     period: float | None = None
-    near: tuple[NearPart | None, ...] = ()  # what of each image is drawn; None for all of it, empty for all of all
+    near: tuple[VisibleRegion | None, ...] = ()  # what of each image is drawn; None for all of it, empty for all of all
     # (3, 3): what the registered images were turned by before, as it is recorded; None where they were not
     orientation: FloatArray | None = None
     cropped_to: Box | None = None  # what a crop leaves, instead of the largest part without holes
@@ -164,7 +164,7 @@ def plan_canvas(
     to_plane = [_oriented(c, g) for c, g in zip(cameras, matrices, strict=True)]
     px_per_unit = np.array([_resolution(c, g) for c, g in zip(cameras, to_plane, strict=True)])
     usual = abs(px_per_unit[reference]) if reference is not None else np.nanmedian(np.abs(px_per_unit))
-    near = near_parts(cameras, to_plane, float(usual), max_stretch)
+    near = visible_regions(cameras, to_plane, float(usual), max_stretch)
     outlines = [
         _outline_on_plane(c, g, part, name) for c, g, part, name in zip(cameras, to_plane, near, called, strict=True)
     ]
@@ -215,7 +215,7 @@ def _oriented(camera: Camera, matrix: FloatArray) -> FloatArray:
     return matrix if (flat @ matrix[2, :2] + matrix[2, 2] > 0).any() else -matrix
 
 
-def _outline_on_plane(camera: Camera, matrix: FloatArray, near: NearPart | None, name: str) -> FloatArray:
+def _outline_on_plane(camera: Camera, matrix: FloatArray, near: VisibleRegion | None, name: str) -> FloatArray:
     """Densely sampled outline of what is drawn, in plane coordinates."""
     outline = to_plane(camera, matrix, camera.outline(POINTS_PER_SIDE) if near is None else near.outline())
     # What is in front of the horizon on the outline is so inside.
@@ -226,8 +226,7 @@ def _outline_on_plane(camera: Camera, matrix: FloatArray, near: NearPart | None,
 
 def _resolution(camera: Camera, matrix: FloatArray) -> float:
     """Image pixels per plane unit at the image's centre, negative where the image is mirrored."""
-    width, height = camera.image_size
-    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    middle = np.array(camera.image_center)
     left, right, top, bottom = to_plane(camera, matrix, middle + np.array([(-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5)]))
     (ax, ay), (bx, by) = right - left, bottom - top
     area = ax * by - ay * bx

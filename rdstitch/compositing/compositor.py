@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.panorama_canvas import photo_sphere_xmp
+from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.preparation import Decisions, decide, prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap

@@ -104,5 +104,7 @@ def _samples(exposure: Exposure, survey: Survey, cameras: Sequence[Camera]) -> t
 
 
 def _common(light: FloatArray, log: FloatArray) -> float:
-    """What is to be added to ``log`` to leave the median of all samples where it was."""
-    return float(np.log(np.median((light * np.exp(-log)).mean(axis=1)) / np.median(light.mean(axis=1))))
+    """What is to be added to ``log`` to leave the median of all samples but black ones, which no gain moves."""
+    before, after = light.mean(axis=1), (light * np.exp(-log)).mean(axis=1)
+    lit = (before > 0.0) & (after > 0.0)
+    return float(np.log(np.median(after[lit]) / np.median(before[lit]))) if lit.any() else 0.0

@@ -115,7 +115,6 @@ class ImageCache:
         return sum(image.nbytes for image in self._held.values())
 
     def _find(self, index: int) -> LoadedImage | None:
-        """An image that is kept."""
         with self._lock:
             if (held := self._held.get(index)) is not None:
                 self._held.move_to_end(index)

@@ -52,10 +52,15 @@ class Cells:
 
     def by_image(self) -> Iterator[tuple[int, int, IntArray]]:
         """Side (0 or 1), image, and its cells."""
-        for side, images in enumerate(self.images):
-            order = np.argsort(images, kind="stable")
-            for cells in np.split(order, np.flatnonzero(np.diff(images[order])) + 1):
-                yield side, int(images[cells[0]]), cells
+        return _by_image(self.images)
+
+
+def _by_image(images: IntArray) -> Iterator[tuple[int, int, IntArray]]:
+    """Side (0 or 1), image, and its places in ``images`` (2, M)."""
+    for side, of_side in enumerate(images):
+        order = np.argsort(of_side, kind="stable")
+        for cells in np.split(order, np.flatnonzero(np.diff(of_side[order])) + 1):
+            yield side, int(of_side[cells[0]]), cells
 
 
 class _Layers(NamedTuple):
@@ -101,15 +106,14 @@ def compare_overlaps(survey: Survey) -> Cells | None:
     layers = _Layers.split(means)
     full = full_scale(next(iter(shown.values())).tile.pixels.dtype)
     values = np.moveaxis(layers.samples.reshape(len(means), 2, -1), 1, 0) / full
-    clipped, points = layers.clipped.T > 0.5, np.empty((2, len(pair), 2))
+    images, clipped, points = pairs[pair].T, layers.clipped.T > 0.5, np.empty((2, len(pair), 2))
     evidence = _evidence(layers.moments.T, np.asarray(clipped.any(axis=0)))
-    overlap = sparse.csr_array((shares, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    cells = Cells(pair, pairs[pair].T, points, values, clipped[2:], evidence, sparse.csr_array(overlap + overlap.T))
-    for end, image, chosen in cells.by_image():
-        points[end, chosen] = survey.warps[image].source_points(*middles[chosen].T)
+    for side, image, chosen in _by_image(images):
+        points[side, chosen] = survey.warps[image].source_points(*middles[chosen].T)
     known = np.isfinite(points).all(axis=(0, 2))
-    parts = (cells.images[:, known], points[:, known], values[:, known], cells.clipped[:, known], evidence[known])
-    return Cells(pair[known], *parts, cells.overlap)
+    overlap = sparse.csr_array((shares, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    parts = (images[:, known], points[:, known], values[:, known], clipped[2:, known], evidence[known])
+    return Cells(pair[known], *parts, sparse.csr_array(overlap + overlap.T))
 
 
 def _cells_of_overlap(a: _Shown, b: _Shown, box: Box) -> Iterator[tuple[FloatArray, FloatArray]]:

@@ -1,4 +1,4 @@
-"""The canvas of images taken by turning on the spot: projection, size, a full turn, Photo Sphere XMP."""
+"""The canvas of images taken by turning on the spot: projection, size, a full turn."""
 
 import math
 from collections.abc import Sequence
@@ -98,13 +98,7 @@ def plan_panorama(
     chosen = choose_projection(seen) if projection == "auto" else PROJECTIONS[projection]
     if chosen == PLANE:
         return plan_canvas(
-            cameras,
-            directions,
-            scale=scale,
-            rotate=rotate,
-            reference=reference,
-            names=names,
-            max_stretch=max_stretch,
+            cameras, directions, scale=scale, rotate=rotate, reference=reference, names=names, max_stretch=max_stretch
         )
     called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
     lengths = np.linalg.norm(directions, axis=1)
@@ -256,35 +250,3 @@ def center_of_view(canvas: Canvas) -> tuple[float, float]:
     width, height = canvas.size
     x, y, z = directions_on(canvas, np.array([((width - 1) / 2, (height - 1) / 2)]))[0]
     return math.atan2(x, z), math.asin(max(-1.0, min(1.0, float(y))))
-
-
-def photo_sphere_xmp(canvas: Canvas) -> bytes:
-    """XMP packet (GPano) by which viewers recognize an equirectangular image and turn it; empty for others.
-
-    The metadata of Google's Photo Sphere, which also describes images that are only a part of the sphere.
-    """
-    upright = canvas.matrix[0, 1] == 0.0 and canvas.matrix[1, 0] == 0.0
-    if canvas.projection.name != "sphere" or not upright:
-        return b""
-    resolution = float(canvas.matrix[0, 0])
-    full_width, full_height = round(TURN * resolution), round(TURN * resolution / 2.0)
-    origin = canvas.matrix[:2, 2] + 0.5
-    width, height = canvas.size
-    left = 0 if canvas.period is not None else min(max(round(full_width / 2 - origin[0]), 0), full_width - width)
-    top = min(max(round(full_height / 2 - origin[1]), 0), full_height - height)
-    numbers = {
-        "FullPanoWidthPixels": full_width,
-        "FullPanoHeightPixels": full_height,
-        "CroppedAreaLeftPixels": left,
-        "CroppedAreaTopPixels": top,
-        "CroppedAreaImageWidthPixels": width,
-        "CroppedAreaImageHeightPixels": height,
-    }
-    attributes = " ".join(f'GPano:{name}="{number}"' for name, number in numbers.items())
-    return (
-        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>'
-        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-        '<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
-        f'GPano:ProjectionType="equirectangular" GPano:UsePanoramaViewer="True" {attributes}/>'
-        '</rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
-    ).encode()

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Float32Array
-from rdstitch.compositing.warp import LATTICE_STEPS, Geometry, interpolated
+from rdstitch.compositing.lattice import LATTICE_STEPS, interpolated
+from rdstitch.compositing.warp import Geometry
 from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import nodes_around
 from rdstitch.system.dataclasses import dataclass, field, replace
@@ -48,6 +49,11 @@ class Exposure:
     # rms_before, rms_after: robust difference between overlapping images, share of the full range
     rms_before: float = 0.0
     rms_after: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse factors that are NaN, which would silently become black."""
+        if not all(np.isfinite(part).all() for part in (self.log_gain, self.vignetting, self.fields, self.white)):
+            raise ValueError("exposure is not finite")
 
     def part(self, images: Sequence[int]) -> "Exposure":
         """The same for some of the images."""

@@ -11,6 +11,7 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.cropping import covered_pixels, crop_box, crop_rows
 from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.image_cache import ImageCache
+from rdstitch.compositing.lattice import LATTICE_STEPS
 from rdstitch.compositing.photometric import Exposure, no_exposure
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.radiometry import are_measurements, exposure_by_metadata
@@ -18,9 +19,9 @@ from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import SeamMap, find_seams
 from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.compositing.source_images import ImageReader, PlacedImage
-from rdstitch.compositing.survey import survey_factor, survey_images
+from rdstitch.compositing.survey import Survey, survey_factor, survey_images
 from rdstitch.compositing.tiles import BlockRunner, OutputStrip, TiledOutput, strips_of_blocks
-from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
+from rdstitch.compositing.warp import plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.results.messages import Message
@@ -126,38 +127,48 @@ def prepare_composite(decisions: Decisions, elsewhere: BlockRunner | None = None
 
 def _decided(task: _Task) -> Decisions:
     """Everything that small images say."""
-    images, canvas, options, plan = task.images, task.canvas, task.options, task.plan
-    exposure, seams, quality = no_exposure(len(images), task.reader.samples[0]), None, SeamQuality()
-    messages: list[Message] = []
-    method = options.exposure
-    if method == "auto":
-        method = "exif" if are_measurements(images, *task.reader.samples) else "balanced"
-    joined = len(images) > 1 and (options.exposure != "none" or options.seam != "none")
-    whole = task.turn or (0, 0, *canvas.size)
+    options, whole = task.options, task.turn or (0, 0, *task.canvas.size)
+    joined = len(task.images) > 1 and (options.exposure != "none" or options.seam != "none")
+    exposure, seams = no_exposure(len(task.images), task.reader.samples[0]), None
     if not joined and options.crop != "auto":
         return Decisions(task, exposure, None, whole)
-    survey = survey_images(task.reader, images, canvas, min(plan.workers, _READERS))
-    if joined and method == "exif":
-        exposure, said = exposure_by_metadata(images, task.reader.samples[0])
-        messages.append(said)
-    elif joined and method != "none":
-        exposure = estimate_exposure(survey, images, method)
+    survey = survey_images(task.reader, task.images, task.canvas, min(task.plan.workers, _READERS))
+    messages, quality, cropped = list[Message](), SeamQuality(), task.canvas.cropped_to
+    if joined and options.exposure != "none":
+        exposure, messages = _decide_exposure(task, survey)
     if joined and options.seam != "none":
-        seams = find_seams(survey, exposure, options.seam == "graphcut")
-        quality = survey.seam_quality(seams.labels)
-        if canvas.period is not None:
-            seams = seams.repeated(round(canvas.period))
-        if options.blend == "feather":
-            seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
-    box, note = whole, ""
-    if canvas.cropped_to is not None and options.crop == "auto":
-        box = canvas.cropped_to
-    elif options.crop == "auto":
-        find = crop_box if task.turn is None else partial(crop_rows, whole=task.turn)
-        cropped_box, note = find(covered_pixels(survey), survey.factor, canvas.size)
-        box = cropped_box or box
-    messages += [Message(note)] if note else []
+        seams, quality = _decide_seams(task, survey, exposure)
+    if options.crop == "auto" and cropped is None:
+        cropped, note = _decide_crop(task, survey)
+        messages = [*messages, Message(note)] if note else messages
+    box = cropped if cropped is not None and options.crop == "auto" else whole
     return Decisions(task, exposure, seams, box, tuple(messages), quality.cropped(box))
+
+
+def _decide_exposure(task: _Task, survey: Survey) -> tuple[Exposure, list[Message]]:
+    method = task.options.exposure
+    if method == "auto":
+        method = "exif" if are_measurements(task.images, *task.reader.samples) else "balanced"
+    if method == "exif":
+        exposure, message = exposure_by_metadata(task.images, task.reader.samples[0])
+        return exposure, [message]
+    return estimate_exposure(survey, task.images, method), []
+
+
+def _decide_seams(task: _Task, survey: Survey, exposure: Exposure) -> tuple[SeamMap, SeamQuality]:
+    seams = find_seams(survey, exposure, task.options.seam == "graphcut")
+    quality = survey.seam_quality(seams.labels)
+    if task.canvas.period is not None:
+        seams = seams.repeated(round(task.canvas.period))
+    if task.options.blend == "feather":
+        seams = replace(seams, softness=max(1, (1 << task.plan.bands) // (2 * seams.factor)))
+    return seams, quality
+
+
+def _decide_crop(task: _Task, survey: Survey) -> tuple[Box | None, str]:
+    """What a crop leaves, None for everything, and what the user should know of it."""
+    find = crop_box if task.turn is None else partial(crop_rows, whole=task.turn)
+    return find(covered_pixels(survey), survey.factor, task.canvas.size)
 
 
 def _wrap_margin(canvas: Canvas, bands: int) -> int:

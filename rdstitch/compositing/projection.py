@@ -57,7 +57,6 @@ class Plane(Projection):
         return places
 
     def directions(self, x: FloatArray, y: FloatArray) -> Directions:
-        """Direction of each place."""
         return x, y, np.ones(())
 
     def extent(self, max_stretch: float) -> tuple[float, float]:
@@ -78,7 +77,6 @@ class _Longitude(Projection):
             return np.stack([np.arctan2(x, z), self._height(y / np.hypot(x, z))], axis=-1)
 
     def directions(self, x: FloatArray, y: FloatArray) -> Directions:
-        """Direction of each place."""
         with np.errstate(over="ignore"):
             return np.sin(x), self._slope(y), np.cos(x)
 
@@ -160,7 +158,6 @@ class Panini(Projection):
         return places
 
     def directions(self, x: FloatArray, y: FloatArray) -> Directions:
-        """Direction of each place."""
         return x, y, 1.0 - x**2 / 4.0
 
     def extent(self, max_stretch: float) -> tuple[float, float]:
@@ -182,7 +179,6 @@ class Stereographic(Projection):
         return places
 
     def directions(self, x: FloatArray, y: FloatArray) -> Directions:
-        """Direction of each place."""
         return x, y, 1.0 - (x**2 + y**2) / 4.0
 
     def extent(self, max_stretch: float) -> tuple[float, float]:

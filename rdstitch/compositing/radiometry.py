@@ -20,11 +20,11 @@ def are_measurements(images: Sequence[PlacedImage], channels: int, dtype: np.dty
 def exposure_by_metadata(images: Sequence[PlacedImage], channels: int) -> tuple[Exposure, Message]:
     """What makes samples proportional to reflectance by what images say of exposure and light, and a line on it."""
     exposure = np.array([image.exposure or np.nan for image in images])
-    told = [image.radiometry for image in images if image.radiometry is not None]
-    irradiance = np.array([one.irradiance or np.nan for one in told])
+    known = [image.radiometry for image in images if image.radiometry is not None]
+    irradiance = np.array([each.irradiance or np.nan for each in known])
     parts = [(exposure, "exposure by EXIF (time x sensitivity / f-number²)")]
-    if len(told) == len(images) and np.isfinite(irradiance).all():
-        parts.append((irradiance, f"irradiance by XMP ({', '.join(sorted({one.source for one in told}))})"))
+    if len(known) == len(images) and np.isfinite(irradiance).all():
+        parts.append((irradiance, f"irradiance by XMP ({', '.join(sorted({each.source for each in known}))})"))
     light = np.prod([values for values, _ in parts], axis=0)
     if not (np.isfinite(light).all() and (light > 0.0).all()):
         text = "samples are as the camera wrote them: not every image says its exposure"
@@ -36,7 +36,7 @@ def exposure_by_metadata(images: Sequence[PlacedImage], channels: int) -> tuple[
     ranges = " and ".join(
         f"{what}, which differs by a factor of {values.max() / values.min():.3g}" for values, what in parts
     )
-    black = float(np.mean([one.black for one in told])) if told else 0.0
+    black = float(np.mean([each.black for each in known])) if known else 0.0
     level = f", above a black level of {black:.2%} of the full range" if black else ""
     text = f"samples are those of one {ranges}{level}"
     return Exposure(-black, np.repeat(away[:, None], channels, axis=1)), Message(text, severity="note")

@@ -12,8 +12,9 @@ from rdstitch.compositing.blender import MultibandBlender, margin, per_channel, 
 from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, grown, intersection, without
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.photometric import Exposure, full_scale
+from rdstitch.compositing.resample import border_weight, sample, sample_opacity
 from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
-from rdstitch.compositing.warp import Geometry, Warp, border_weight, locate, sample, sample_opacity
+from rdstitch.compositing.warp import Geometry, Warp, locate
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.system.dataclasses import dataclass, replace
 
@@ -211,7 +212,6 @@ class Renderer:
         return locate(self.warps[index], intersection(self.support(part), box) or part).on(part)
 
     def _opacity(self, index: int, geometry: Geometry) -> Float32Array | None:
-        """Opacity of an image that has a mask."""
         if not self.images.masked(index):
             return None
         return sample_opacity(self.images.get(index), geometry)

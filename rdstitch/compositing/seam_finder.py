@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.photometric import Exposure, full_scale
+from rdstitch.compositing.resample import border_weight
 from rdstitch.compositing.survey import Survey
-from rdstitch.compositing.warp import border_weight, locate
+from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean
 from rdstitch.system.dataclasses import dataclass, replace
 
@@ -119,9 +120,9 @@ def find_seams(survey: Survey, exposure: Exposure, graphcut: bool) -> SeamMap:
                 won = tile.inside & (weight > weights[cut])
             else:
                 pixels = exposure.correct(index, geometry, tile.pixels)
-                apart = survey.canvas.period is not None
+                in_pieces = survey.canvas.period is not None
                 shares = weight / np.maximum(weight + weights[cut], np.float32(1e-12))
-                won = _cut(tile.inside, pixels, composite[cut], labels[cut] != NO_OWNER, shares, apart=apart)
+                won = _cut(tile.inside, pixels, composite[cut], labels[cut] != NO_OWNER, shares, in_pieces=in_pieces)
                 cv2.copyTo(pixels, won.view(np.uint8), composite[cut])
             labels[cut][won] = index
             weights[cut][won] = weight[won]
@@ -135,11 +136,11 @@ def _cut(
     covered: NDArray[np.bool_],
     share: Float32Array,
     *,
-    apart: bool,
+    in_pieces: bool,
 ) -> NDArray[np.bool_]:
     """Where a new image, with its share of both border weights, replaces what lies below it.
 
-    ``apart``: in several places, one by one.
+    ``in_pieces``: in several places, one by one.
     """
     both = inside & covered
     alone: NDArray[np.bool_] = inside & ~covered
@@ -153,14 +154,14 @@ def _cut(
     if not surely_new.any():
         return surely_new
     won = surely_new.copy()
-    for part in _parts(free) if apart else [_around(free)]:
+    for part in _parts(free) if in_pieces else [_around(free)]:
         masks = [(free | sure)[part].astype(np.uint8) * np.uint8(255) for sure in (surely_old, surely_new)]
         won[part] |= free[part] & _graph_cut(_visibility(pixels[part], below[part], share[part]), masks)
     return won
 
 
 def _parts(free: NDArray[np.bool_]) -> list[tuple[slice, slice]]:
-    """Where cuts are free to run, column by column apart: an image across the edge of a full turn has both ends."""
+    """Where cuts are free to run, column by column: an image across the edge of a full turn has both ends."""
     columns = np.flatnonzero(free.any(axis=0))
     groups = np.split(columns, np.flatnonzero(np.diff(columns) > 2 * _AROUND_FREE + 1) + 1)
     parts = []

@@ -7,15 +7,15 @@ surroundings: gravel and leaves hide it.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection
+from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.system.late_imports import csgraph, sparse, spatial
 
@@ -25,10 +25,9 @@ DIAGONAL = 1000.0
 _HALF, _REACH, _STEP = 12, 16, 8  # half a window, how far it is searched for, and how far windows are apart
 _BORDER = 2  # pixels on either side of a seam at which a difference shows
 # Of the range of grey levels: standard deviation in a window that has texture, and of a difference that is seen.
-_CONTRAST = 6.0 / 255.0
+CONTRAST = 6.0 / 255.0
 _ALIKE, _GAIN, _MOVED = 0.75, 0.2, 3.0  # correlation of a moved window, its lead, and by how much it is moved
-_UNLIKE = 0.4  # correlation below which edges on both sides are not the same
-_COARSER, _CELL, _MIN_CELLS = 3, 13, 8  # overlaps are compared so many times smaller, in cells; fewer say nothing
+UNLIKE = 0.4  # correlation below which edges on both sides are not the same
 # Share of the overlaps that images of a scene reach where they do not belong, in nine of ten cases (0.1 in the median);
 # and share that what fills less than half of the images cannot reach.
 _CHANCE, _MIN_ALIKE = 0.2, 0.5
@@ -112,106 +111,34 @@ class SeamQuality:
 
 
 def measure_seams(
-    tiles: Sequence[SeamTile | None],
-    labels: NDArray[np.int32],
-    label_size: float,
-    unit: float,
-    full: float = 255.0,
+    tiles: Sequence[SeamTile | None], labels: NDArray[np.int32], label_size: float, unit: float, full: float = 255.0
 ) -> SeamQuality:
     """Compare both sides of all seams.
 
-    Parameters
-    ----------
-    labels : ndarray of shape (h, w), int32
-        Owner of each pixel of a reduced canvas; -1 where there is none.
-    label_size : float
-        Pixels of the tiles for one of the labels.
-    unit : float
-        Pixels of the output for one of the tiles.
-    full : float
-        Grey level of white.
+    ``labels`` (h, w) are the owners of the pixels of a reduced canvas, -1 where there is none, each ``label_size``
+    pixels of the tiles long; ``unit`` is pixels of the output for one of the tiles, ``full`` the grey level of white.
     """
-    contrast = _CONTRAST * full
     pairs, at = _border_places(labels, label_size)
-    rows = []
-    clear: dict[int, list[BoolArray]] = {}
+    clearances: dict[int, _Clearance] = {}
+    found: list[tuple[IntArray, FloatArray, _Verdict]] = []
     for pair in np.unique(pairs, axis=0):
         first, second = (tiles[k] for k in pair)
         if first is None or second is None:
             continue
         for k, tile in zip(pair.tolist(), (first, second), strict=True):
-            if k not in clear:
-                clear[k] = [_eroded(tile.inside, _HALF + reach) for reach in (_REACH, _REACH // 2)]
-        here = at[(pairs == pair).all(axis=1)]
-        border = _on_border(labels, label_size, pair)
-        rows.append((pair, _compared(first, second, [clear[k] for k in pair.tolist()], here, border, contrast)))
-    found = [(pair, *row) for pair, part in rows for row in part]
+            if k not in clearances:
+                clearances[k] = _Clearance.of(tile.inside)
+        clear1, clear2 = (clearances[k] for k in pair.tolist())
+        here, reaches = _comparable_places((first, clear1), (second, clear2), at[(pairs == pair).all(axis=1)])
+        near_border = _on_border(labels, label_size, pair)
+        verdicts = _verdicts(first, second, np.rint(here).astype(np.intp), reaches, near_border, CONTRAST * full)
+        found += [(pair, place, verdict) for place, verdict in zip(here, verdicts, strict=True) if verdict is not None]
     if not found:
         return SeamQuality(spacing=_STEP * unit)
-    images = np.array([row[0] for row in found])
-    places, broken = np.array([row[1] for row in found]), np.array([row[2] for row in found])
-    size = np.array([row[3] for row in found])
-    breaks = _breaks(images, places, broken, size, unit)
+    images, places = np.array([pair for pair, _, _ in found]), np.array([place for _, place, _ in found])
+    broken, shift = (np.array(values) for values in zip(*(verdict for _, _, verdict in found), strict=True))
+    breaks = _breaks(images, places, broken, shift, unit)
     return SeamQuality((places + 0.5) * unit - 0.5, broken, breaks, _STEP * unit)
-
-
-class Likeness(NamedTuple):
-    """What the overlaps of images look like; NaN and None where there is nothing to compare."""
-
-    alike: float = math.nan
-    fills: float = math.nan
-    least_alike: tuple[int, int] | None = None
-
-
-def likeness(tiles: Sequence[SeamTile | None], pairs: IntArray, full: float = 255.0) -> Likeness:
-    """Compare the overlaps of pairs (P, 2) in place, a few pixels more or less; see :class:`SeamQuality`."""
-    small = [None if tile is None else _smaller(tile) for tile in tiles]
-    textured = [0 if tile is None else int(_textured(tile.grey, tile.inside, full)[1].sum()) for tile in small]
-    found: dict[tuple[int, int], tuple[int, int]] = {}
-    shown = 0
-    for i, j in pairs.tolist():
-        first, second = small[i], small[j]
-        if first is None or second is None or (box := intersection(first.box, second.box)) is None:
-            continue
-        (cells1, known1), (cells2, known2) = (
-            _textured(cut(tile.grey, tile.box, box), cut(tile.inside, tile.box, box), full) for tile in (first, second)
-        )
-        known = known1 & known2
-        alike = _correlation(cells1[known], cells2[known]) > _UNLIKE
-        if len(alike) >= _MIN_CELLS:
-            found[min(i, j), max(i, j)] = len(alike), int(alike.sum())
-            shown += min(textured[i], textured[j])
-    if not found:
-        return Likeness()
-    cells, alike_cells = (sum(counts) for counts in zip(*found.values(), strict=True))
-    worst = min(found, key=lambda pair: found[pair][1] / found[pair][0])
-    return Likeness(alike_cells / cells, 1.0 - (cells - alike_cells) / max(shown, cells), worst)
-
-
-def _textured(grey: Float32Array, inside: BoolArray, full: float) -> tuple[Float32Array, BoolArray]:
-    """Cells (N, side, side) of an image, and which of them show something."""
-    cells = _in_cells(grey)
-    shows = _in_cells(inside).all(axis=(1, 2)) & (cells.std(axis=(1, 2)) > _CONTRAST * full)
-    return cells, np.asarray(shows)
-
-
-def _in_cells(values: NDArray[Any]) -> NDArray[Any]:
-    """Values (h, w) by cells (N, side, side)."""
-    rows, columns = (n // _CELL for n in values.shape)
-    whole = values[: rows * _CELL, : columns * _CELL].reshape(rows, _CELL, columns, _CELL)
-    return whole.swapaxes(1, 2).reshape(-1, _CELL, _CELL)
-
-
-def _smaller(tile: SeamTile) -> SeamTile:
-    """A tile with larger pixels, which begin where they do on the whole canvas."""
-    x, y = (-start % _COARSER for start in tile.box[:2])
-    rows, columns = (n // _COARSER for n in (tile.grey.shape[0] - y, tile.grey.shape[1] - x))
-    part = np.s_[y : y + rows * _COARSER, x : x + columns * _COARSER]
-    left, top = (tile.box[0] + x) // _COARSER, (tile.box[1] + y) // _COARSER
-    shape = rows, _COARSER, columns, _COARSER
-    grey = tile.grey[part].reshape(shape).mean(axis=(1, 3), dtype=np.float32)
-    inside: BoolArray = np.asarray(tile.inside[part].reshape(shape).all(axis=(1, 3)))
-    return SeamTile((left, top, left + columns, top + rows), grey, inside)
 
 
 def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArray, FloatArray]:
@@ -237,43 +164,64 @@ def _eroded(inside: BoolArray, radius: int) -> BoolArray:
     return cv2.erode(inside.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0
 
 
-def _compared(
+class _Clearance(NamedTuple):
+    """Where windows can be searched for in a tile (h, w)."""
+
+    far: BoolArray  # as far as _REACH
+    near: BoolArray  # half as far
+
+    @classmethod
+    def of(cls, inside: BoolArray) -> Self:
+        return cls(_eroded(inside, _HALF + _REACH), _eroded(inside, _HALF + _REACH // 2))
+
+
+class _Verdict(NamedTuple):
+    """Whether a seam is broken at a place, and by how much it is shifted; NaN where it does not match at all."""
+
+    broken: bool
+    shift: float
+
+
+def _comparable_places(
+    first: tuple[SeamTile, _Clearance], second: tuple[SeamTile, _Clearance], at: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Those of the places (N, 2) of one border where windows fit into both tiles, and how far they can be searched."""
+    whole, reaches = np.rint(at).astype(np.intp), np.zeros(len(at), dtype=np.intp)
+    (tile1, clear1), (tile2, clear2) = first, second
+    for mask1, mask2, reach in ((clear1.near, clear2.near, _REACH // 2), (clear1.far, clear2.far, _REACH)):
+        reaches[_looked_up(mask1, tile1.box, whole) & _looked_up(mask2, tile2.box, whole)] = reach
+    return at[reaches > 0], reaches[reaches > 0]
+
+
+def _verdicts(
     first: SeamTile,
     second: SeamTile,
-    clear: Sequence[Sequence[BoolArray]],
-    at: FloatArray,
-    border: Callable[[IntArray], BoolArray],
+    at: IntArray,
+    reaches: IntArray,
+    near_border: Callable[[IntArray], BoolArray],
     contrast: float,
-) -> list[tuple[FloatArray, bool, float]]:
-    """Of the places (N, 2) of one border that can be compared: where, whether broken, and by how much shifted."""
-    whole = np.rint(at).astype(np.intp)
-    reaches = np.zeros(len(at), dtype=np.intp)
-    for one, two, reach in reversed(list(zip(*clear, (_REACH, _REACH // 2), strict=True))):
-        reaches[_looked_up(one, first.box, whole) & _looked_up(two, second.box, whole)] = reach
-    at, whole, reaches = at[reaches > 0], whole[reaches > 0], reaches[reaches > 0]
+) -> Iterator[_Verdict | None]:
+    """Of each place (N, 2), pixels; None where neither image has texture."""
     if not len(at):
-        return []
-    windows1, windows2 = _windows(first, whole), _windows(second, whole)
+        return
+    windows1, windows2, near = _windows(first, at), _windows(second, at), near_border(at)
     spread = np.stack([windows1.std(axis=(1, 2)), windows2.std(axis=(1, 2))])
-    near = border(whole)
-    differ = _difference(windows1, windows2, near)
-    alike = _correlation(windows1, windows2)
-    result = []
-    for k in range(len(at)):
-        shift, broken = math.nan, False
+    differ, alike = _difference(windows1, windows2, near), correlation(windows1, windows2)
+    for k, (place, reach) in enumerate(zip(at, reaches.tolist(), strict=True)):
         if spread[:, k].max() < contrast:
-            continue
-        if spread[:, k].min() < contrast:  # one side is empty of what the other has
+            yield None
+        elif spread[:, k].min() < contrast:  # one side is empty of what the other has
             broken = bool(differ[k] > 2.0 * contrast)
-        elif differ[k] > contrast and alike[k] < _SURELY_ALIKE:
-            best, shift = _best_shift(first, second, whole[k], int(reaches[k]))
+            yield _Verdict(broken, math.nan if broken else 0.0)
+        elif differ[k] <= contrast or alike[k] >= _SURELY_ALIKE:
+            yield _Verdict(False, 0.0)
+        else:
+            best, shift = _best_shift(first, second, place, reach)
             moved = shift > _MOVED and best > _ALIKE and best - alike[k] > _GAIN
             edges, directions = zip(_edges(windows1[k]), _edges(windows2[k]), strict=True)
-            unlike = alike[k] < _UNLIKE and max(edges) > contrast and max(directions) > _DIRECTED
+            unlike = alike[k] < UNLIKE and max(edges) > contrast and max(directions) > _DIRECTED
             broken = bool(moved or unlike) and _differ_coarsely(windows1[k], windows2[k], near[k], contrast)
-            shift = shift if moved else math.nan
-        result.append((at[k], broken, shift if broken else 0.0))
-    return result
+            yield _Verdict(broken, (shift if moved else math.nan) if broken else 0.0)
 
 
 def _looked_up(mask: BoolArray, box: Box, whole: IntArray) -> BoolArray:
@@ -332,7 +280,7 @@ def _differ_coarsely(window1: Float32Array, window2: Float32Array, mask: BoolArr
     return bool(_difference(first, second, mask[None])[0] > contrast)
 
 
-def _correlation(windows1: Float32Array, windows2: Float32Array) -> FloatArray:
+def correlation(windows1: Float32Array, windows2: Float32Array) -> FloatArray:
     """Normalized correlation of windows (N, h, w)."""
     u, v = (w - w.mean(axis=(1, 2), keepdims=True) for w in (windows1, windows2))
     norms = np.sqrt((u * u).sum(axis=(1, 2)) * (v * v).sum(axis=(1, 2)))

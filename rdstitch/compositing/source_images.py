@@ -123,11 +123,17 @@ def prepare_image(image: DecodedImage, shrink: float, reduction: int = 1) -> Loa
     return LoadedImage(pixels, *opacity(opaque), reduction)
 
 
+def block_side(shrink: float) -> int:
+    """Pixels along a side that become one before an image is shrunk so much.
+
+    Blocks alone alias; a Gaussian on at least two pixels per output pixel does not.
+    """
+    return max(1, int(shrink / 2))
+
+
 def smoothed(pixels: NDArray[Any], shrink: float, reduction: int = 1) -> tuple[NDArray[Any], int]:
     """Pixels without what an output that shrinks them cannot show, and what they are smaller by than the original."""
-    # Blocks alone alias; a Gaussian on at least two pixels per output pixel does not.
-    further = max(1, int(shrink / reduction / 2))
-    if further > 1:
+    if (further := block_side(shrink / reduction)) > 1:
         pixels = block_mean(pixels, further)
         reduction *= further
     rest = shrink / reduction

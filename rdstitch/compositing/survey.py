@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection, overlapping_pairs
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, likeness, measure_seams
+from rdstitch.compositing.likeness import likeness
+from rdstitch.compositing.resample import sample, sample_opacity
+from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, measure_seams
 from rdstitch.compositing.source_images import ImageReader, LoadedImage, PlacedImage
-from rdstitch.compositing.warp import Warp, locate, plan_warps, sample, sample_opacity
+from rdstitch.compositing.warp import Warp, locate, plan_warps
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.system.dataclasses import dataclass, replace
 
@@ -31,7 +33,7 @@ class SurveyTile:
     pixels: NDArray[Any]  # (h, w, C): in the image's sample type
     inside: NDArray[np.bool_]  # (h, w), bool
     opacity: Float32Array | None = None  # (h, w), float32: of an image with a mask
-    seen: SeamTile | None = None  # the same, larger, where seams are looked at
+    seam_tile: SeamTile | None = None  # the same, larger, where seams are looked at
 
 
 @dataclass(frozen=True)
@@ -64,9 +66,9 @@ class Survey:
         if shown and shown[0].pixels.dtype != np.uint8:  # any part of the range may be what such images use
             low, high = np.mean([np.quantile(t.pixels[t.inside], [0.005, 0.995]) for t in shown], axis=0)
             full = max(float(high - low), 1e-12)
-        seen = [None if tile is None else tile.seen for tile in self.tiles]
-        quality = measure_seams(seen, labels, self.enlarged, self.factor / self.enlarged, full)
-        return replace(quality, **likeness(seen, self.pairs(), full)._asdict())
+        seam_tiles = [None if tile is None else tile.seam_tile for tile in self.tiles]
+        quality = measure_seams(seam_tiles, labels, self.enlarged, self.factor / self.enlarged, full)
+        return replace(quality, **likeness(seam_tiles, self.pairs(), full)._asdict())
 
 
 def survey_factor(canvas: Canvas) -> int:
@@ -100,7 +102,6 @@ def seen_reduction(canvas: Canvas, shrinks: Sequence[float]) -> float:
 
 
 def _survey_tile(reader: ImageReader, enlarged: float, index: int, warp: Warp) -> SurveyTile | None:
-    """One image, small."""
     geometry = locate(warp, warp.box)
     finer = warp.enlarged(enlarged)
     image, larger = reader.prepared_twice(index, warp.shrink, finer.shrink)
@@ -117,11 +118,11 @@ def _survey_tile(reader: ImageReader, enlarged: float, index: int, warp: Warp) -
         warp, box=(warp.box[0] + int(widest[0]), warp.box[1], warp.box[0] + int(widest[-1]) + 1, warp.box[3])
     )
     return SurveyTile(
-        warp.box, pixels.reshape(*inside.shape, -1), inside, opacity, _seen(larger, part.enlarged(enlarged))
+        warp.box, pixels.reshape(*inside.shape, -1), inside, opacity, _seam_tile(larger, part.enlarged(enlarged))
     )
 
 
-def _seen(image: LoadedImage, warp: Warp) -> SeamTile:
+def _seam_tile(image: LoadedImage, warp: Warp) -> SeamTile:
     """An image, grey, as its seams are looked at."""
     geometry = locate(warp, warp.box)
     inside, opacity = geometry.inside, sample_opacity(image, geometry)

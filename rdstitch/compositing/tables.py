@@ -16,8 +16,8 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.photometric import DEPTHS, full_scale
 from rdstitch.compositing.preparation import decide, prepare_composite
 from rdstitch.compositing.render import Layer
-from rdstitch.compositing.source_images import LoadedImage, PlacedImage, smoothed
-from rdstitch.compositing.warp import INTERPOLATION, remap, sample_places
+from rdstitch.compositing.resample import INTERPOLATION, remap, sample_places
+from rdstitch.compositing.source_images import PlacedImage, block_side, smoothed
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.system.dataclasses import dataclass, replace
@@ -115,8 +115,5 @@ class CompositeTables:
 def _share(layer: Layer, box: Box, factors: Float32Array) -> _Share:
     """The tables of a layer on a box of the canvas, in pixels of the box."""
     warp, (x, y), (x0, y0, x1, y1) = layer.geometry.warp, box[:2], layer.box
-    width, height = warp.camera.image_size
-    # How much smaller an image gets depends on its size, not on its samples.
-    stand_in, reduction = smoothed(np.zeros((height, width), dtype=np.uint8), warp.shrink)
-    places = sample_places(LoadedImage(stand_in, reduction=reduction), layer.geometry)
+    places = sample_places(block_side(warp.shrink), layer.geometry)
     return _Share(layer.index, (x0 - x, y0 - y, x1 - x, y1 - y), places, layer.weight, factors)

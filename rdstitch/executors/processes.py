@@ -68,7 +68,7 @@ class ProcessExecutor(Executor):
                 worker.stdin.write(task)
                 worker.stdin.flush()
                 succeeded, result = pickle.load(worker.stdout)
-            except (EOFError, OSError, pickle.UnpicklingError):
+            except (EOFError, OSError, ValueError, pickle.UnpicklingError):  # ended from outside, or by _stop
                 _end(worker)
                 continue
             if not succeeded:

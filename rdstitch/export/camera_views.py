@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import Camera
@@ -16,6 +16,12 @@ ComplexArray = NDArray[np.complex128]
 
 _TILT_STD = math.radians(3.0)  # of a camera that is taken to look straight down, and of an attitude
 _METRIC = 1e-4  # by which the axes of a plane seen from above differ, of their length: rounding
+
+
+def as_complex(points: ArrayLike) -> ComplexArray:
+    """Pixels (..., 2), y down, as x - i y: as complex numbers maps have them, north up."""
+    x, y = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
+    return np.asarray(x - 1j * y)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +58,8 @@ def views_of(
 ) -> Views:
     """The cameras of images that ``to_output`` (N, 3, 3) takes to the output; straight down by each one's attitude."""
     each = list(zip(cameras, to_output, strict=True))
-    middle = np.array([_in_output(c, h, _middle(c)) for c, h in each])
-    next_pixel = np.array([_in_output(c, h, _middle(c) + np.array([1.0, 0.0])) for c, h in each])
+    middle = np.array([_in_output(c, h, np.array(c.image_center)) for c, h in each])
+    next_pixel = np.array([_in_output(c, h, np.array(c.image_center) + np.array([1.0, 0.0])) for c, h in each])
     right = (next_pixel - middle) / np.abs(next_pixel - middle)
     pixel = float(np.median(np.abs(next_pixel - middle)))
     focal = np.array([np.nan if c.focal is None else c.focal for c in cameras])
@@ -63,7 +69,7 @@ def views_of(
         # Tilt and focal length are known together far better than each is.
         rest = np.square(tilt_std) - np.square(np.array(tilt) * known.focal_log_std)
         tilt_alone = math.sqrt(max(float(rest.max()), 0.0))
-        foot = centres[:, 0] - 1j * centres[:, 1]
+        foot = as_complex(centres[:, :2])
         return Views(middle, foot, centres[:, 2], right, "poses", pixel, known.focal_log_std, tilt_alone)
     # A guess where nobody knows the focal length.
     height = np.array([c.with_focal().focal or 0.0 for c in cameras]) * np.abs(next_pixel - middle)
@@ -74,15 +80,8 @@ def views_of(
     return Views(middle, middle, height, right, "centres", pixel, 0.0, _TILT_STD)
 
 
-def _middle(camera: Camera) -> FloatArray:
-    """The centre of an image, pixels."""
-    width, height = camera.image_size
-    return np.array([(width - 1) / 2, (height - 1) / 2])
-
-
 def _in_output(camera: Camera, homography: FloatArray, pixel: FloatArray) -> complex:
-    x, y = to_plane(camera, homography, pixel[None]).reshape(2)
-    return complex(x, -y)
+    return complex(as_complex(to_plane(camera, homography, pixel[None]))[0])
 
 
 def _below(camera: Camera, nadir: tuple[float, float, float] | None) -> FloatArray | None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.export.camera_views import as_complex
 from rdstitch.geometry.crs import Crs, middle
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.system.dataclasses import dataclass, replace
@@ -107,7 +108,7 @@ class Georeference:
         points = np.asarray(pixels, dtype=np.float64)
         latitude, longitude = self.crs.geographic(self.to_map(points)).T
         places = crs.project(latitude, longitude) @ np.array([1, 1j])
-        flipped = points @ np.array([1, -1j])
+        flipped = as_complex(points)
         system = np.stack([flipped, np.ones_like(flipped)], axis=1)
         scale, origin = np.linalg.lstsq(system, places, rcond=None)[0].tolist()
         map_scale = crs.map_scale(*middle(latitude, longitude))

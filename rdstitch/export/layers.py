@@ -11,6 +11,7 @@ from rdstitch.compositing.boxes import intersection
 from rdstitch.compositing.preparation import decide, prepare_composite
 from rdstitch.errors import OutputError
 from rdstitch.io.cropped_tiff import write_cropped_tiff
+from rdstitch.io.samples import as_alpha
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_outputs, file_name
@@ -31,11 +32,7 @@ def layer_files(names: Sequence[str], folder: str | Path) -> dict[str, tuple[Pat
 
 @one_native_thread()
 def write_layers(
-    result: OutputImage,
-    folder: str | Path,
-    *,
-    whole: bool = False,
-    overwrite: bool = False,
+    result: OutputImage, folder: str | Path, *, whole: bool = False, overwrite: bool = False
 ) -> list[Path]:
     """Write each image of a result as a layer, and its mask, as TIFF.
 
@@ -83,7 +80,7 @@ def stage_layers(result: OutputImage, files: Mapping[str, tuple[Path, Path]], ou
             shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
             tags = () if result.georeference is None else result.georeference.after(shift).tiff_tags()
             write = partial(write_cropped_tiff, offset=offset, size=size, extra_tags=tags)
-            alpha, shown = (np.where(where, np.uint8(255), np.uint8(0)) for where in (covered, mask))
+            alpha, shown = (as_alpha(where) for where in (covered, mask))
             layer, mask_file = files[source.name]
             with outputs.writing(layer) as staged:
                 write(staged, samples, alpha)

@@ -8,13 +8,7 @@ import numpy as np
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import TrajectoryFrame
 from rdstitch.errors import OutputError
-from rdstitch.export.trajectory_files import (
-    NOT_MEASURED,
-    has_times,
-    heading,
-    positions_in_frame,
-    ros_covariance,
-)
+from rdstitch.export.trajectory_files import NOT_MEASURED, has_times, heading, positions_in_frame, ros_covariance
 from rdstitch.system.outputs import naming, replace_folder
 from rdstitch.system.temporary_folder import TemporaryFolder
 

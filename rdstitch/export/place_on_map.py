@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.export.camera_views import Views, views_of
+from rdstitch.export.camera_views import Views, as_complex, views_of
 from rdstitch.export.georeference import CONTROL, GPS, Georeference, PositionKind, Residual
 from rdstitch.export.georeference_text import metres
 from rdstitch.export.map_fit import MapFit, Measured, fit_map
@@ -37,7 +37,7 @@ class Located:
     cameras: Sequence[Camera]
     to_output: FloatArray  # (N, 3, 3): normalized undistorted coordinates of each image to pixels of the output
     names: Sequence[str]
-    nadirs: Sequence[tuple[float, float, float] | None] = ()  # straight down by each camera's attitude, where known
+    nadirs: Sequence[tuple[float, float, float] | None]  # straight down by each camera's attitude, where known
     control: Sequence[Sequence[GroundControl]] = ()
     relief: float = 0.0  # pixels of the images that neighbours are off together: hills on what is mapped as a plane
     lever_std: float = 0.0  # how far hills move the ground against what is below the cameras, in heights; 0: not known
@@ -77,8 +77,8 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
     shown: dict[tuple[str, bool], list[tuple[GroundControl, complex]]] = {}
     for k, points in enumerate(located.control):
         for point in points:
-            x, y = to_plane(located.cameras[k], located.to_output[k], np.array([point.pixel])).reshape(2)
-            shown.setdefault((point.name, point.check), []).append((point, complex(x, -y)))
+            pixel = as_complex(to_plane(located.cameras[k], located.to_output[k], np.array([point.pixel])))[0]
+            shown.setdefault((point.name, point.check), []).append((point, complex(pixel)))
     means = {key: (same[0][0], complex(np.mean([pixel for _, pixel in same]))) for key, same in shown.items()}
     control = [mean for (_, check), mean in means.items() if not check]
     checks = [mean for (_, check), mean in means.items() if check]
@@ -119,7 +119,6 @@ class _MeasuredPlaces:
 def _placed(
     located: Located, views: Views, measured: _MeasuredPlaces, epsg: int | None, force: bool
 ) -> tuple[Georeference | None, str]:
-    """Place the output by some positions."""
     latitude, longitude = np.array([(place.latitude, place.longitude) for place in measured.places]).T
     crs = Crs.nearest(latitude, longitude) if epsg is None else Crs(epsg)
     map_scale = crs.map_scale(*middle(latitude, longitude))

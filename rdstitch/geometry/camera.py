@@ -145,10 +145,15 @@ class Camera:
         if width < 1 or height < 1:
             raise ArgumentError(f"image size must be at least 1 x 1 pixel, not {width} x {height}")
         if self.center is _IMAGE_CENTER:
-            object.__setattr__(self, "center", ((width - 1) / 2, (height - 1) / 2))
+            object.__setattr__(self, "center", self.image_center)
         self._check_numbers()
         self._check_focal()
         self._check_lens()
+
+    @property
+    def image_center(self) -> tuple[float, float]:
+        """The middle of the image, pixels."""
+        return (self.image_size[0] - 1) / 2, (self.image_size[1] - 1) / 2
 
     def _check_numbers(self) -> None:
         for name, values in (("value", (*self.coefficients, *self.center)), ("tilt", self.tilt or ())):

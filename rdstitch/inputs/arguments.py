@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, Named
-from rdstitch.inputs.image_folders import READABLE_SUFFIXES, images_in, natural_key, place_of
+from rdstitch.inputs.image_folders import READABLE_SUFFIXES, images_in, is_raw_or_heif, natural_key, place_of
 from rdstitch.inputs.keyframes import wanted_frames
 from rdstitch.inputs.rosbag import extract_images, is_bag
 from rdstitch.io.opening import HEIF_SUFFIXES
@@ -143,8 +143,16 @@ def _in_folder(folder: Path) -> tuple[list[Path], list[Message]]:
     others = sorted({path for path in folder.iterdir() if not path.name.startswith(".")} - set(images), key=natural_key)
     if not images:
         raise InputError(f"{folder}: there are no images in this folder{_elsewhere(others)}")
-    text = f"{folder}: not taken for images: {shortened([path.name for path in others])}"
-    return images, [Message(text, severity="detail")] if others else []
+    versions = [path for path in others if is_raw_or_heif(path)]
+    reasons = {
+        "are raw or HEIC versions of images that are taken": versions,
+        "not taken for images": [path for path in others if path not in versions],
+    }
+    return images, [
+        Message(f"{folder}: {reason}: {shortened([path.name for path in paths])}", severity="detail")
+        for reason, paths in reasons.items()
+        if paths
+    ]
 
 
 def _has_images(folder: Path) -> bool:

@@ -105,7 +105,6 @@ class _AttitudeTable:
 
 @cached_by_file_state
 def _read_attitudes(file: str | Path) -> _AttitudeTable:
-    """The table of a file."""
     wanted = ("name,psi,theta", "timestamp,psi,theta", "timestamp,qx,qy,qz,qw")
     rows = csv_rows(read_text(file), str(file), _COLUMNS, wanted, ("deg", "degrees", "s"))
     by_name = any("name" in row.values for row in rows)

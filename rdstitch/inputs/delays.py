@@ -11,6 +11,7 @@ DELAYS = np.linspace(-0.3, 0.3, 61)
 DELAY_STD = 0.05
 """Seconds: what is to be expected of that; buses and drivers of IMUs take milliseconds, queues tenths of a second."""
 
+# Degree 5 over 0.6 s follows swaying at a few hertz, and not the noise between samples.
 _POLYNOMIALS = np.linalg.qr(np.vander(DELAYS / DELAYS[-1], 6))[0]
 _SLOW = _POLYNOMIALS @ _POLYNOMIALS.T
 

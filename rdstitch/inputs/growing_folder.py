@@ -77,5 +77,4 @@ class GrowingFolder:
 
 
 def _age(state: _State) -> float:
-    """Seconds since the last change."""
     return time.time() - state[1] / 1e9

@@ -23,11 +23,13 @@ def images_in(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
     images = [path for path in entries if path.suffix.lower() in READABLE_SUFFIXES]
     # Many cameras write a raw file beside each image, and phones that export JPEG leave the HEIC there.
-    stems = {path.stem for path in images}
-    images += [
-        path for path in entries if path.suffix.lower() in HEIF_SUFFIXES | RAW_SUFFIXES and path.stem not in stems
-    ]
+    stems = {path.stem.casefold() for path in images}
+    images += [path for path in entries if is_raw_or_heif(path) and path.stem.casefold() not in stems]
     return sorted(images, key=natural_key)
+
+
+def is_raw_or_heif(path: Path) -> bool:
+    return path.suffix.lower() in HEIF_SUFFIXES | RAW_SUFFIXES
 
 
 def natural_key(path: Path) -> list[tuple[int, str | int]]:

@@ -1,17 +1,15 @@
 """Files that change during a run, or whose pixels a decoder has doubts about: noticed once for all who read them."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from rdstitch.errors import InputError
 from rdstitch.io.read import DecodedImage
 from rdstitch.results.messages import Message
-from rdstitch.system.file_access import file_state, is_url, remote_status
+from rdstitch.system.file_access import ContentState, content_state
 
-_Stamp = tuple[int, int] | str
-
-GuardState = tuple[dict[Path, _Stamp | None], dict[Path, str]]
+GuardState = tuple[dict[Path, ContentState | None], dict[Path, str]]
 """Stamps of files, and why they may be damaged."""
 
 
@@ -23,20 +21,20 @@ class InputGuard:
 
     def __init__(self, strict: bool = False) -> None:
         self._strict = strict
-        self._stamps: dict[Path, _Stamp | None] = {}
+        self._stamps: dict[Path, ContentState | None] = {}
         self.damaged: dict[Path, str] = {}  # files of which parts may be wrong, and why
         self.unreadable: dict[Path, str] = {}  # files that were left out, and why
 
     @contextmanager
     def reading(self, path: Path) -> Iterator[None]:
         """Read a file inside the block; it must be what it was before."""
-        before = _stamp(path)
+        before = content_state(path)
         self._note(path, before)
         yield
-        if _stamp(path) != before:
+        if content_state(path) != before:
             raise InputError(f"{path}: is being written to; run again when that has ended")
 
-    def _note(self, path: Path, stamp: _Stamp | None) -> None:
+    def _note(self, path: Path, stamp: ContentState | None) -> None:
         if self._stamps.setdefault(path, stamp) != stamp:
             raise InputError(f"{path}: has changed during the run; run again")
 
@@ -79,10 +77,3 @@ class InputGuard:
     def __reduce__(self) -> tuple[type["InputGuard"], tuple[bool]]:
         """Copies and other processes begin anew."""
         return InputGuard, (self._strict,)
-
-
-def _stamp(path: Path) -> _Stamp | None:
-    """What changes with a file and is the same on every machine that sees it; None where it is gone."""
-    with suppress(OSError):
-        return remote_status(path)[2] if is_url(path) else file_state(path)
-    return None

@@ -6,7 +6,7 @@ around it. What two frames share is known by corners, which are followed on smal
 and an affine motion that is fitted to them.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -89,7 +89,7 @@ def _small(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class FrameSelection:
     """Which frames of a video are wanted."""
 
     every: int = 1  # every n-th one, unless they are chosen one by one
@@ -108,24 +108,32 @@ class Wanted:
         return [Message(f"{used}; --every 1 takes all", (str(path),), "note", code="frames-passed-over")]
 
 
-def wanted_frames(every: int | None, grey: Callable[[], Iterable[NDArray[np.uint8]]]) -> Wanted:
-    """Every n-th frame of a video; with None those that show new ground, by all of its grey frames."""
+def wanted_frames(every: int | None, grey: Callable[[], Iterable[NDArray[np.uint8] | None]]) -> FrameSelection:
+    """Every n-th frame of a video; with None those that show new ground, by all of its grey frames that are decoded."""
     if every is not None:
-        return Wanted(every)
-    places = tracked(grey())
-    return Wanted(chosen=frozenset(keyframes(places)), total=len(places.places))
+        return FrameSelection(every)
+    decoded: list[int] = []
+
+    def frames() -> Iterator[NDArray[np.uint8]]:
+        for number, frame in enumerate(grey()):
+            if frame is not None:
+                decoded.append(number)
+                yield frame
+
+    chosen = keyframes(tracked(frames()))
+    return FrameSelection(chosen=frozenset(decoded[k] for k in chosen), total=len(decoded))
 
 
 def keyframes(places: FramePlaces) -> list[int]:
     """Numbers of the frames of a video that are worth stitching, the first among them."""
     for shared in _SHARED:
-        chosen = choose(places, shared)
+        chosen = select_keyframes(places, shared)
         if len(chosen) >= _ENOUGH:
             break
     return chosen
 
 
-def choose(places: FramePlaces, shared: float) -> list[int]:
+def select_keyframes(places: FramePlaces, shared: float) -> list[int]:
     """The frames of which two in a row share so much, and that show what all of them show."""
     count = len(places.places)
     chosen = [0] if count else []

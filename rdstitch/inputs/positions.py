@@ -25,7 +25,7 @@ from rdstitch.geometry.crs import WGS84
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import Row, by_image, csv_rows, json_rows, listed_rows
+from rdstitch.inputs.tables import NUMERAL, Row, by_image, csv_rows, json_rows, listed_rows
 from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points
 from rdstitch.system.file_access import read_text
 
@@ -43,6 +43,8 @@ COLUMNS = {
     "up_std": "rtkstdhgt upstd verticalaccuracy vaccuracy vacc",
 }
 _SIDES = (("latitude", "south"), ("longitude", "west"))
+_SIDE_WORDS = {"latitude": ("n", "north", "s", "south"), "longitude": ("e", "east", "w", "west")}
+_UNIT_WORDS = ["d", "deg", "degree", "degrees", "º", "m", "min", "minute", "minutes", "sec", "second", "seconds"]
 _LISTED = ("name", "x", "y", "altitude", "yaw", "pitch", "roll", "north_std", "up_std")  # in geo.txt
 _WANTED = ("name,latitude,longitude", "name,x,y")
 UNITS = ("deg", "degrees", "m", "metres", "meters")
@@ -157,10 +159,16 @@ def _degrees(row: Row, column: str, reference: str) -> float | None:
         return None
     text = row.values[column]
     value = sum(abs(part) / 60.0**k for k, part in enumerate(parts[:3]))
-    side = re.search(r"(?:\b|(?<=[\d.'\"°]))([NSEW])\w*\s*$", f"{text} {row.values.get(reference, '')}", re.IGNORECASE)
-    if side is None and "deg" in text:
+    words = re.findall(r"[^\W\d_]+", NUMERAL.sub(" ", text).lower())
+    if "m" in words and "s" in words:
+        words.remove("s")  # 33d 51m 20s N: seconds
+    given = row.values.get(reference, "").lower()
+    sides = {word[0] for word in (*words, given) if word in _SIDE_WORDS[column]}
+    if len(sides) > 1 or not {*words} <= {*_SIDE_WORDS[column], *_UNIT_WORDS}:
+        raise InputError(f"{row.where}: expected a {column} like 33.85, -33.85 or 33 51 S, not '{text}'")
+    if not sides and "deg" in text:
         raise InputError(f"{row.where}: '{text}' does not say whether north or south, east or west; add N, S, E or W")
-    return -value if text.startswith("-") or (side is not None and side[1] in "SsWw") else value
+    return -value if math.copysign(1.0, parts[0]) < 0.0 or sides & {"s", "w"} else value
 
 
 def _same_names(sources: Sequence[Source], listed: Iterable[str]) -> dict[str, str]:

@@ -14,7 +14,7 @@ from PIL import Image
 from rdstitch.errors import InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
-from rdstitch.inputs.keyframes import Wanted, wanted_frames
+from rdstitch.inputs.keyframes import FrameSelection, wanted_frames
 from rdstitch.inputs.odometry import Odometry, odometry_of, yaw_of
 from rdstitch.io.video import write_frame
 from rdstitch.system.dataclasses import dataclass
@@ -28,6 +28,7 @@ _DESCRIPTION, _KEY, _HEADER = "metadata.yaml", b"rosbag2_bagfile_information", 4
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_WHITE = 0.999  # fraction of a frame's pixels of more than 8 bits up to which 8 bits reach
 _TYPES = {
     **dict.fromkeys(("mono8", "8UC1", "rgb8", "bgr8", "8UC3", "rgba8", "bgra8", "8UC4"), np.uint8),
     **dict.fromkeys(("mono16", "16UC1", "rgb16", "bgr16", "16UC3", "rgba16", "bgra16"), np.uint16),
@@ -81,7 +82,7 @@ def opened_bag(path: Path) -> "Iterator[Any]":
 
 def extract_images(
     path: Path, folder: Path, every: int | None = 1, topic: str | None = None
-) -> tuple[list[Frame], Wanted]:
+) -> tuple[list[Frame], FrameSelection]:
     """Write images of a topic to a folder, losslessly, with number and time stamp (s) of the header."""
     with opened_bag(path) as reader:
         messages = _Messages.of(reader, path, topic)
@@ -92,7 +93,7 @@ def extract_images(
 def images_in_bag(path: Path, folder: Path, every: int, topic: str | None = None) -> Iterator[Frame]:
     """The same one after the other, every n-th one."""
     with opened_bag(path) as reader:
-        yield from _Messages.of(reader, path, topic).frames(folder, Wanted(every))
+        yield from _Messages.of(reader, path, topic).frames(folder, FrameSelection(every))
 
 
 def camera_in_bag(path: Path, topic: str | None = None) -> "tuple[CameraFile, str] | None":
@@ -183,20 +184,17 @@ class _Messages:
         images = [c for c in reader.connections if c.topic == chosen and c.msgtype in (_IMAGE, _COMPRESSED)]
         return cls(reader, images, path)
 
-    def grey(self) -> Iterator[NDArray[np.uint8]]:
-        """All of them, (H, W), 8 bits; black where one cannot be decoded."""
-        bits = 8
+    def grey(self) -> Iterator[NDArray[np.uint8] | None]:
+        """All of them, (H, W), 8 bits; None where one cannot be decoded."""
         for connection, _, data in self.reader.messages(connections=self.connections):
             message = self.reader.deserialize(data, connection.msgtype)
             compressed = connection.msgtype == _COMPRESSED
             pixels = _grey_of_compressed(message.data) if compressed else _pixels(self.path, message)
-            if pixels.dtype != np.uint8:
-                # Sensors of 10 or 12 bits leave the highest ones empty.
-                bits = max(bits, int(pixels.max()).bit_length())
-                pixels = (pixels >> (bits - 8)).astype(np.uint8)
-            yield pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+            if pixels is not None and pixels.ndim == 3:
+                pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))
+            yield None if pixels is None else _eight_bits(pixels)
 
-    def frames(self, folder: Path, wanted: Wanted) -> Iterator[Frame]:
+    def frames(self, folder: Path, wanted: FrameSelection) -> Iterator[Frame]:
         """Those that are wanted, written to a folder."""
         for number, (connection, time_ns, data) in enumerate(self.reader.messages(connections=self.connections)):
             if number not in wanted:
@@ -215,15 +213,23 @@ class _Messages:
             yield Frame(file, number, stamp or time_ns * 1e-9)
 
 
-def _grey_of_compressed(data: NDArray[np.uint8]) -> NDArray[Any]:
-    """A JPEG or PNG image, (H, W), of 8 or 16 bits; black where it cannot be decoded."""
+def _eight_bits(grey: NDArray[Any]) -> NDArray[np.uint8]:
+    """The same picture at any exposure: sensors of 10 or 12 bits leave the highest ones empty."""
+    if grey.dtype == np.uint8:
+        return grey
+    brightest = max(1.0, float(np.quantile(grey[::4, ::4], _WHITE)))
+    return np.clip(grey * (255.0 / brightest), 0.0, 255.0).astype(np.uint8)
+
+
+def _grey_of_compressed(data: NDArray[np.uint8]) -> NDArray[Any] | None:
+    """A JPEG or PNG image, (H, W), of 8 or 16 bits; None where it cannot be decoded."""
     try:
         # Not by OpenCV, whose decoders write on standard error.
         with Image.open(BytesIO(data.tobytes()), formats=("JPEG", "PNG")) as image:
             deep = image.mode.startswith("I")
             return np.asarray(image).astype(np.uint16) if deep else np.asarray(image.convert("L"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return np.zeros((1, 1), np.uint8)
+        return None
 
 
 def _pixels(path: Path, message: Any) -> NDArray[Any]:

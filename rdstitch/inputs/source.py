@@ -24,6 +24,7 @@ from rdstitch.io.mask import Mask
 from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import DecodedImage, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
+from rdstitch.io.samples import as_alpha
 from rdstitch.options.feature_options import WORK_MEGAPIXELS
 from rdstitch.results.messages import Message, left_out
 from rdstitch.system.cache import Cache
@@ -101,6 +102,7 @@ class Source:
         usual = self.reduction(WORK_MEGAPIXELS)
         if reduction % usual:
             return self._within_circle(self._load(reduction), reduction)
+        # Frames of videos are files of their own by now, so that the path names the frame too.
         key = (self.path, self.mask, self.flat_field, self.camera.lens_model)
         image = self.decoded_images.take(key) or self._load(usual)
         if keep:
@@ -146,7 +148,7 @@ class Source:
             for count, center in zip(image.pixels.shape[1::-1], self.camera.center, strict=True)
         )
         inside = x**2 + y[:, None] ** 2 <= self.camera.image_circle**2
-        return _masked(image, np.where(inside, np.uint8(255), np.uint8(0)))
+        return _masked(image, as_alpha(inside))
 
 
 def _masked(image: DecodedImage, alpha: NDArray[np.uint8]) -> DecodedImage:

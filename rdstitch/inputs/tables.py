@@ -39,7 +39,7 @@ _NOTATIONS = {
     for mark, other in (".,", ",.")
 }
 _GROUPED = re.compile(r"(?<=\d)[\s'’](?=\d{3}(?!\d))")
-_NUMERAL = re.compile(r"[-+]?[.,]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+)?")
+NUMERAL = re.compile(r"[-+\u2212]?[.,]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Row:
 
     def numbers_within(self, column: str) -> list[float]:
         """All numbers in a text like ``48 deg 51' 29.60" N``."""
-        values = (self._parsed(part) for part in _NUMERAL.findall(self.values.get(column, "")))
+        values = (self._parsed(part) for part in NUMERAL.findall(self.values.get(column, "")))
         return [value for value in values if value is not None]
 
     def _parsed(self, text: str) -> float | None:
@@ -178,7 +178,7 @@ def _rows(found: Iterable[tuple[str, Iterable[tuple[str | None, Any]]]]) -> list
         for _, values in rows
         for column, text in values.items()
         if column != "name"
-        for numeral in _NUMERAL.findall(text)
+        for numeral in NUMERAL.findall(text)
     }
     # Those that can be read in one way only.
     readings = [_readings(text) for text in numerals]
@@ -189,7 +189,7 @@ def _rows(found: Iterable[tuple[str, Iterable[tuple[str | None, Any]]]]) -> list
 
 def _readings(text: str) -> dict[str, float]:
     """What a numeral is, by the decimal mark."""
-    numbers = {}
+    numbers, text = {}, text.replace("\u2212", "-")  # as spreadsheets and web pages write minus
     for mark, notation in _NOTATIONS.items():
         if notation.fullmatch(text):
             numbers[mark] = float(text.replace("," if mark == "." else ".", "").replace(mark, "."))

@@ -16,11 +16,7 @@ if TYPE_CHECKING:
 _WHITE = np.array([0.9642, 1.0, 0.8249])  # of D50, to which CIELAB in TIFF and in profiles refers
 # From XYZ of D50, adapted to D65 after Bradford, to linear sRGB (IEC 61966-2-1).
 _XYZ_TO_RGB = np.array(
-    [
-        [3.1338561, -1.6168667, -0.4906146],
-        [-0.9787684, 1.9161415, 0.0334540],
-        [0.0719453, -0.2289914, 1.4052427],
-    ]
+    [[3.1338561, -1.6168667, -0.4906146], [-0.9787684, 1.9161415, 0.0334540], [0.0719453, -0.2289914, 1.4052427]]
 )
 _EDGE = 6.0 / 29.0  # where the cube root of CIE 1976 becomes a line
 

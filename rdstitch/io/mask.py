@@ -9,7 +9,7 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import inverse, turned, turned_size
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
-from rdstitch.io.samples import OPAQUE
+from rdstitch.io.samples import OPAQUE, as_alpha
 from rdstitch.system.dataclasses import dataclass
 
 
@@ -21,7 +21,7 @@ class Mask:
     frame: int | None = None  # how it is turned, see :func:`mask_frame`
 
     def read(self, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """Alpha of an image of a size, see :func:`read_mask`."""
+        """Alpha of an image of a size."""
         return read_mask(self.path, size, self.frame)
 
 
@@ -64,4 +64,4 @@ def read_mask(path: str | Path, size: tuple[int, int], frame: int | None = None)
     rows = (np.arange(size[1]) + 0.5) * (height / size[1])
     columns = (np.arange(size[0]) + 0.5) * (width / size[0])
     resized = counts[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
-    return np.where(resized, np.uint8(OPAQUE), np.uint8(0))
+    return as_alpha(resized)

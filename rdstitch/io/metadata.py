@@ -31,6 +31,7 @@ from rdstitch.io.opening import (
     has_late_metadata,
     is_raw,
     opened_image,
+    stored_bits,
 )
 from rdstitch.io.radiometric_tags import Radiometry, read_radiometry
 from rdstitch.io.raw import own_exif, raw_exif, raw_size
@@ -40,7 +41,6 @@ from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
 
-_BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
 _BLACK_LEVEL = 50714
 
 MAX_PROFILE = 2**20 - 2**10
@@ -141,7 +141,6 @@ def _tiff_metadata(file: Path, stream: BinaryIO) -> Metadata:
 
 
 def _raw_metadata(file: Path) -> Metadata:
-    """Metadata of a raw file, which is read upright."""
     size = raw_size(file)
     # A small image carries the tags; its focal length is in its own pixels.
     header = Image.new("L", (max(1, size[0] // _HEADER), max(1, size[1] // _HEADER)))
@@ -154,7 +153,7 @@ def _raw_metadata(file: Path) -> Metadata:
 def metadata_of(image: Image.Image) -> Metadata:
     """Metadata of an image that Pillow has opened."""
     # First, since looking for EXIF at the end of a PNG file decodes it, and Pillow then forgets.
-    bit_depth = _bit_depth(image)
+    bit_depth = stored_bits(image)
     return _metadata(image.getexif(), image.info, image.size, bit_depth, _channels(image))
 
 
@@ -189,14 +188,6 @@ def _metadata(
         profile_lost=profile_lost,
         channels=channels,
     )
-
-
-def _bit_depth(image: Image.Image) -> int:
-    """Bits per sample as stored; Pillow shows 16-bit colour PNG as 8-bit."""
-    pieces = getattr(image, "tile", None)
-    if image.format == "PNG" and pieces and "16" in str(pieces[0][3]):
-        return 16
-    return _BIT_DEPTHS.get(image.mode, 8)
 
 
 def _colour_profile(profile: object) -> tuple[bytes, str]:

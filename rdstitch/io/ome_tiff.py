@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.io.pyramid import pyramid, pyramid_sizes
-from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip
+from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip, placed_rows, zero_uncovered
 from rdstitch.io.tiff import MIN_OVERVIEW, ExtraTag, copied_tags
 from rdstitch.io.tiff_tiles import TILE, encoded_tile, has_predictor, tiles_of
 from rdstitch.system.late_imports import tifffile
@@ -26,15 +26,13 @@ def write_ome_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_t
     """
     sizes = pyramid_sizes(spec.size, MIN_OVERVIEW)
     apart = spec.metadata.planes or spec.channels != 3
-    shown = (pixels if alpha is None else np.where(alpha[..., None] > 0, pixels, 0) for pixels, alpha in strips)
+    passing_levels = pyramid(sizes, zero_uncovered(strips), path.parent, transparent=False)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         levels: list[NDArray[Any]] = []
-        for number, ((width, height), passing) in enumerate(pyramid(sizes, shown, path.parent, transparent=False)):
+        for number, ((width, height), passing) in enumerate(passing_levels):
             level = np.memmap(Path(folder) / str(number), spec.dtype, "w+", shape=(height, width, spec.channels))
-            top = 0
-            for rows in passing:
-                level[top : top + len(rows)] = rows
-                top += len(rows)
+            for at, rows in placed_rows(passing):
+                level[at] = rows
             levels.append(level)
         total = sum(level.nbytes for level in levels)
         with tifffile.TiffWriter(path, ome=True, bigtiff=total > 2**31) as tiff:

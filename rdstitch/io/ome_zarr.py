@@ -11,7 +11,7 @@ import numpy as np
 
 from rdstitch.errors import OutputError
 from rdstitch.io.pyramid import pyramid, pyramid_sizes
-from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip
+from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip, placed_rows, zero_uncovered
 
 _SMALLEST = 512  # pixels of the longer side of the last level, at most
 _COLOURS = ("FFFFFF", "FF00FF", "00FF00", "00FFFF", "FFFF00", "FF8000")
@@ -32,8 +32,8 @@ def write_ome_zarr(folder: Path, spec: ImageSpec, strips: Iterable[Strip]) -> No
 
     sizes = pyramid_sizes(spec.size, _SMALLEST)
     group = zarr.open_group(folder, mode="w", zarr_format=2)
-    shown = (pixels if alpha is None else np.where(alpha[..., None] > 0, pixels, 0) for pixels, alpha in strips)
-    for number, ((width, height), passing) in enumerate(pyramid(sizes, shown, folder.parent, transparent=False)):
+    passing_levels = pyramid(sizes, zero_uncovered(strips), folder.parent, transparent=False)
+    for number, ((width, height), passing) in enumerate(passing_levels):
         level = group.create_array(
             str(number),
             shape=(spec.channels, height, width),
@@ -41,10 +41,8 @@ def write_ome_zarr(folder: Path, spec: ImageSpec, strips: Iterable[Strip]) -> No
             dtype=spec.dtype,
             chunk_key_encoding={"name": "v2", "separator": "/"},
         )
-        top = 0
-        for rows in passing:
-            level[:, top : top + len(rows)] = np.moveaxis(rows, -1, 0)
-            top += len(rows)
+        for at, rows in placed_rows(passing):
+            level[:, at] = np.moveaxis(rows, -1, 0)
     group.attrs.update(_attributes(spec, len(sizes)))
 
 

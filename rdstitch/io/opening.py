@@ -67,6 +67,7 @@ _FORMATS = {
     **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), "PIL.PpmImagePlugin.PpmImageFile"),
 }
 
+_BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
 _MAX_MAGIC = max(map(len, _FORMATS))
 _NAMES = "JPEG, PNG, TIFF, WebP, AVIF, HEIC, BMP, TGA, GIF, JPEG 2000, PBM, PGM, PPM"
 MAX_IMAGE_GB = "RDSTITCH_MAX_IMAGE_GB"
@@ -139,8 +140,17 @@ def decoding(path: Path) -> Iterator[None]:
 def opened_image(file: Path) -> Iterator[ImageFile.ImageFile]:
     """An image whose header has been read."""
     with open_regular(file) as stream, _factory(file, stream)(stream, str(file)) as image:
-        check_decoded_size(file, image.size)
+        bands = image.getbands()
+        check_decoded_size(file, image.size, 4 if "P" in bands else len(bands), stored_bits(image))
         yield image
+
+
+def stored_bits(image: Image.Image) -> int:
+    """Bits per sample as stored; Pillow shows 16-bit colour PNG as 8-bit."""
+    pieces = getattr(image, "tile", None)
+    if image.format == "PNG" and pieces and "16" in str(pieces[0][3]):
+        return 16
+    return _BIT_DEPTHS.get(image.mode, 8)
 
 
 def has_late_metadata(file: Path) -> bool:
@@ -162,7 +172,7 @@ def has_late_metadata(file: Path) -> bool:
     return True
 
 
-def check_decoded_size(file: Path, size: tuple[int, int], channels: int = 3, bits: int = 8) -> None:
+def check_decoded_size(file: Path, size: tuple[int, int], channels: int, bits: int) -> None:
     """Refuse by its header what would fill the machine's memory, as only a damaged or malicious file does."""
     need = size[0] * size[1] * channels * -(-bits // 8) / 1e9
     setting = os.environ.get(MAX_IMAGE_GB, "")
@@ -209,7 +219,6 @@ def _imported(name: str) -> Factory:
 
 
 def _avif_factory(path: Path) -> Factory:
-    """What opens AVIF: Pillow, since version 11.3."""
     try:
         return _imported("PIL.AvifImagePlugin.AvifImageFile")
     except ImportError:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.io.colour import srgb_of_lab, without_inks
-from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME
+from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, as_alpha
 from rdstitch.system.late_imports import tifffile
 
 Pixels = NDArray[Any]
@@ -64,7 +64,7 @@ def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[Pix
         masks.append(as_opacity(alpha, full))
     if (empty := _lacks_data(page, colours, data)) is not None:
         colours[empty] = data[empty] = 0
-        masks.append(np.where(empty, np.uint8(0), np.uint8(OPAQUE)))
+        masks.append(as_alpha(~empty))
     samples = _grey_or_rgb(page, kind, colours, full)
     if kind not in _INDIRECT:
         if data.shape[2]:

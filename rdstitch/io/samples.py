@@ -1,7 +1,15 @@
 """What readers and writers of samples share."""
 
+import numpy as np
+from numpy.typing import NDArray
+
 OPAQUE = 255
 """Alpha of what is there."""
 
 ROWS_AT_A_TIME = 128
 """Rows that are converted at once, so that no second image is in memory."""
+
+
+def as_alpha(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Opaque where shown, else 0."""
+    return np.where(shown, np.uint8(OPAQUE), np.uint8(0))

@@ -155,10 +155,12 @@ def _stack(plain: StoredTile, tiff: "tifffile.TiffFile") -> StoredTile:
         at = {axis: k for (axis, _), k in zip(leading, index, strict=True)}
         planes[at.get("C", 0), at.get("Z", 0), at.get("T", 0)] = Page(plain.name, number)
     size, about = None, tiff.imagej_metadata or {}
-    unit = MICROMETRES.get(str(about.get("unit", "")).encode().decode("unicode_escape", "ignore"))
+    unit = str(about.get("unit", ""))
+    # ImageJ escapes letters beyond ASCII, as \u00B5m.
+    unit_size = MICROMETRES.get(unit.encode().decode("unicode_escape", "ignore") if "\\u" in unit else unit)
     resolution = tiff.pages.first.tags.get("XResolution")
-    if unit and resolution is not None and min(resolution.value) > 0:
-        size = resolution.value[1] / resolution.value[0] * unit
+    if unit_size and resolution is not None and min(resolution.value) > 0:
+        size = resolution.value[1] / resolution.value[0] * unit_size
     return replace(plain, planes=planes, pixel_size=size)
 
 

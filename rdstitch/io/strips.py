@@ -61,6 +61,20 @@ def check_strips(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[Strip]:
         raise ArgumentError(f"{rows} of {height} rows were given")
 
 
+def zero_uncovered(strips: Iterable[Strip]) -> Iterator[NDArray[Any]]:
+    """The samples of strips, 0 where nothing covers them."""
+    for samples, alpha in strips:
+        yield samples if alpha is None else np.where(alpha[..., None] > 0, samples, 0)
+
+
+def placed_rows(parts: Iterable[NDArray[Any]]) -> Iterator[tuple[slice, NDArray[Any]]]:
+    """Parts of an image from top to bottom, and which rows of it they are."""
+    top = 0
+    for rows in parts:
+        yield slice(top, top + len(rows)), rows
+        top += len(rows)
+
+
 def as_eight_bit(samples: NDArray[Any]) -> NDArray[np.uint8]:
     """16 bits rounded to 8."""
     if samples.dtype == np.uint8:

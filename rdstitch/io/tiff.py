@@ -17,6 +17,7 @@ from PIL import ExifTags, Image
 
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.pyramid import pyramid, pyramid_sizes
+from rdstitch.io.samples import as_alpha
 from rdstitch.io.strips import ImageSpec, Strip, with_alpha
 from rdstitch.io.tiff_order import put_in_order
 from rdstitch.io.tiff_tiles import BUFFER, TILE, deflated, encoded_tile, has_predictor, tiles_of
@@ -69,7 +70,7 @@ def written_strips(path: Path) -> Iterator[Strip]:
                 if each is not None
             ]
             if mask is not None:
-                yield rows[0], np.where(rows[1][..., 0] > 0, 255, 0).astype(np.uint8)
+                yield rows[0], as_alpha(rows[1][..., 0] > 0)
             elif last_is_alpha:
                 full = np.iinfo(rows[0].dtype).max if rows[0].dtype.kind == "u" else 1.0
                 yield rows[0][..., :-1], np.rint(rows[0][..., -1] * (255.0 / full)).astype(np.uint8)

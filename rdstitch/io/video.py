@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import NamedTuple
 
 import cv2
@@ -15,6 +16,7 @@ from rdstitch.io.opening import check_readable
 from rdstitch.system.opencv_state import silent_opencv
 
 _FFMPEG_LEVEL, _FFMPEG_QUIET = "OPENCV_FFMPEG_LOGLEVEL", "-8"
+_ffmpeg_unloaded = Lock()  # until the first video of the process
 
 VIDEO_SUFFIXES = frozenset((".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"))
 
@@ -27,12 +29,11 @@ class VideoFrame(NamedTuple):
     timestamp: float
 
 
-def grey_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
-    """All frames of a video, (H, W); black where one cannot be decoded."""
-    black = np.zeros((1, 1), dtype=np.uint8)
+def grey_frames(path: Path) -> Iterator[NDArray[np.uint8] | None]:
+    """All frames of a video, (H, W); None where one cannot be decoded."""
     for _, _, capture in _grabbed(path):
         decoded, frame = capture.retrieve()
-        yield np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8) if decoded else black
+        yield np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8) if decoded else None
 
 
 def extract_frames(path: Path, folder: Path, wanted: Callable[[int], bool]) -> list[VideoFrame]:
@@ -64,9 +65,10 @@ def _grabbed(path: Path) -> Iterator[tuple[int, float, cv2.VideoCapture]]:
 def opened_capture(source: str | int) -> Iterator[cv2.VideoCapture]:
     """A video, stream or camera, whether it can be opened or not, while neither OpenCV nor FFmpeg logs anything."""
     with silent_opencv():
-        # What OpenCV gives to FFmpeg as its level when it loads it, once.
-        unset = _FFMPEG_LEVEL not in os.environ
-        os.environ.setdefault(_FFMPEG_LEVEL, _FFMPEG_QUIET)
+        # What OpenCV gives to FFmpeg as its level when it loads it, once: later the environment is left alone.
+        unset = _ffmpeg_unloaded.acquire(blocking=False) and _FFMPEG_LEVEL not in os.environ
+        if unset:
+            os.environ[_FFMPEG_LEVEL] = _FFMPEG_QUIET
         try:
             capture = cv2.VideoCapture(source)
         finally:

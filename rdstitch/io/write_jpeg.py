@@ -121,7 +121,6 @@ def bare_exif(metadata: Metadata) -> bytes:
 
 
 def _segment(marker: int, body: bytes) -> bytes:
-    """One JPEG marker segment."""
     return struct.pack(">BBH", 0xFF, marker, len(body) + 2) + body
 
 

@@ -32,7 +32,7 @@ from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message
 from rdstitch.results.pose import FollowedPoses, Pose
 from rdstitch.tracking import FrameTracker, TrackingOptions, TrackingResult
-from rdstitch.tracking.live_preview import LivePreview
+from rdstitch.tracking.preview import LivePreview
 
 _FEATURES = 600  # of a frame, that suffice to follow it
 _MEGAPIXELS = 0.1  # 10⁶ pixels in which they are detected: a frame of 640 x 480 pixels is halved once
@@ -52,7 +52,7 @@ def follow(
     Poses are for watching: loops are closed, and every pair is used, only when all frames are registered together
     afterwards, by :func:`rdstitch.mosaic` or :func:`rdstitch.trajectory`. Features are fewer and from smaller images
     than there. Memory does not grow with the number of frames. ``comes_again`` says of a frame that could not be read
-    whole whether it will come again (:class:`rdstitch.inputs.arrivals.Arrivals`); ``preview`` is written every
+    whole whether it will come again (:class:`rdstitch.inputs.frame_stream.FrameStream`); ``preview`` is written every
     ``refresh`` seconds at most. One pose a frame, and more for those that find their
     place, or another one, only later.
     """

@@ -14,7 +14,7 @@ from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.results.messages import Message, names_of
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
-from rdstitch.verification.rival_planes import planes_of_pairs, second_motions
+from rdstitch.verification.second_motions import planes_of_pairs, second_motions
 
 Rejected = Mapping[tuple[int, ...], Message]
 """What is left out, with what is wrong: images (k,), and pairs (i, j) without which other images may fall off."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 from rdstitch.choices import TrajectoryFormat
 from rdstitch.export.georeference import world_file_paths
@@ -39,7 +40,7 @@ class RunFiles:
         names: Sequence[str] = (),
         more_images: Iterable[Path] = (),
         more_files: Iterable[Path] = (),
-    ) -> "RunFiles":
+    ) -> Self:
         """Those of a run over images of these names; ``more_images`` may follow its output."""
         options, beside = run.options, run.beside
         images = [*([] if run.output is None else [run.output]), *more_images]
@@ -70,7 +71,7 @@ class RunFiles:
         output: str | Path | None,
         plot: str | Path | None,
         file_format: TrajectoryFormat,
-    ) -> "RunFiles":
+    ) -> Self:
         """Those of a trajectory."""
         written, bag = [Path(file) for file in (output, plot) if file is not None], None
         if file_format == "bag" and output is not None:

@@ -94,9 +94,7 @@ def _cut_away(placed: PlacedImages, options: CompositeOptions, matrix: FloatArra
 
 def _upright(placed: PlacedImages, options: CompositeOptions) -> tuple[FloatArray | None, list[Message]]:
     """What takes the images to where the scene is upright; None where nothing shows how."""
-    if placed.reference is None:
-        raise ArgumentError("the reference image is not among the images: nothing can be turned upright")
-    frame, focal = placed.homographies[placed.reference], _focal(placed)
+    frame, focal = placed.homographies[_reference(placed)], _focal(placed)
     start = nearest_rotation(np.asarray(np.linalg.inv(to_axes(frame, focal.value))))
     upright: Upright | None
     message: Message | None
@@ -112,10 +110,16 @@ def _upright(placed: PlacedImages, options: CompositeOptions) -> tuple[FloatArra
     return None if upright is None else upright.matrix(frame, turned=placed.turned), messages
 
 
+def _reference(placed: PlacedImages) -> int:
+    """The reference image, in whose frame everything is turned."""
+    if placed.reference is None:
+        raise ArgumentError("the reference image is not among the images: nothing can be turned upright")
+    return placed.reference
+
+
 def _by_rectangle(placed: PlacedImages, corners: FloatArray, focal: Focal) -> tuple[Upright, Message]:
     """By the corners (4, 2) of what is a rectangle in the scene, pixels of the reference image."""
-    assert placed.reference is not None
-    camera = placed.cameras[placed.reference]
+    camera = placed.cameras[_reference(placed)]
     pixel = 1.0 / camera.scale
     upright, aspect, error = of_rectangle(_in_reference(placed, corners), focal, pixel)
     text = f"rectangle: {aspect:.4g} times as wide as high ± {error:.1%}"
@@ -134,9 +138,8 @@ def _by_edges(placed: PlacedImages, start: FloatArray, focal: Focal) -> tuple[Up
 
 def _by_lines(placed: PlacedImages, ends: FloatArray, start: FloatArray, focal: Focal) -> Upright:
     """By ends (2 L, 2) of lines that are upright or level in the scene, pixels of the reference image."""
-    assert placed.reference is not None
     lines = _in_reference(placed, ends).reshape(-1, 2, 2)
-    error = _POINTING / placed.cameras[placed.reference].scale
+    error = _POINTING / placed.cameras[_reference(placed)].scale
     edges = _between(placed, np.concatenate([lines, np.ones((len(lines), 2, 1))], axis=2), error)
     return of_edges(edges, nearest_axis(edges, start[:2], focal.value), start, focal, focal.value)
 
@@ -151,19 +154,17 @@ def _by_gravity(placed: PlacedImages, start: FloatArray, focal: Focal) -> tuple[
 
 def _focal(placed: PlacedImages) -> Focal:
     """The focal length of the reference image, as the alignment has it."""
-    assert placed.reference is not None
     if placed.turned:
-        lengths = np.linalg.norm(placed.homographies[placed.reference], axis=0)
+        lengths = np.linalg.norm(placed.homographies[_reference(placed)], axis=0)
         return Focal(float(lengths[2] / lengths[0]))
-    camera = placed.cameras[placed.reference].with_focal()
+    camera = placed.cameras[_reference(placed)].with_focal()
     assert camera.focal is not None
     return Focal(camera.focal / camera.scale, camera.focal_log_std)
 
 
 def _in_reference(placed: PlacedImages, points: FloatArray) -> FloatArray:
     """Undistorted places (N, 2) of pixels of the reference image, half diagonals from its centre."""
-    assert placed.reference is not None
-    camera = placed.cameras[placed.reference]
+    camera = placed.cameras[_reference(placed)]
     flat = camera.normalize(camera.undistort(points))
     if not np.isfinite(flat).all():
         raise ArgumentError("rectangle, straighten: a place lies where the lens of the reference image shows nothing")
@@ -172,8 +173,7 @@ def _in_reference(placed: PlacedImages, points: FloatArray) -> FloatArray:
 
 def _edges(placed: PlacedImages) -> Edges:
     """Straight edges in the images."""
-    assert placed.reference is not None
-    to_reference = np.linalg.inv(placed.homographies[placed.reference]) @ placed.homographies
+    to_reference = np.linalg.inv(placed.homographies[_reference(placed)]) @ placed.homographies
     segments, error = [], 0.0
     for k in evenly_spaced(len(placed.sources), _MAX_IMAGES).tolist():
         camera, (ends, pixel) = placed.cameras[k], line_segments(placed.sources[k].view(MEGAPIXELS))
@@ -194,8 +194,7 @@ def _between(placed: PlacedImages, ends: FloatArray, error: float) -> Edges:
 
 def _level(placed: PlacedImages, start: FloatArray, focal: Focal) -> Upright | None:
     """With what is down in the scene, or else in most images, down in the output; None where that is ahead."""
-    assert placed.reference is not None
-    to_reference = np.linalg.inv(placed.homographies[placed.reference]) @ placed.homographies
+    to_reference = np.linalg.inv(placed.homographies[_reference(placed)]) @ placed.homographies
     calibration = np.diag([1.0, 1.0, focal.value])
     measured = [source.down for source in placed.sources]
     known = any(down is not None for down in measured)

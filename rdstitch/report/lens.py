@@ -7,7 +7,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.report.pairs import pairs_of, residuals
-from rdstitch.report.svg import BLUE, RED, Markup, counted, drawing, element, label, line, path, section
+from rdstitch.report.svg import BLUE, RED, Markup, counted, drawing, element, label, line, polyline, section
 from rdstitch.results.registration import Registration
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 720.0, 280.0, 60.0, 40.0, 24.0
@@ -77,9 +77,9 @@ def _curve(camera: Camera, radii: FloatArray) -> str:
     band = np.concatenate([at(difference + spread), at(difference - spread)[::-1]])
     shares = np.linspace(0.0, 1.0, _TICKS)
     parts = [
-        path(band, closed=True, fill=BLUE, fill_opacity=0.2, stroke="none"),
+        polyline(band, closed=True, fill=BLUE, fill_opacity=0.2, stroke="none"),
         line((_LEFT, middle), (_RIGHT, middle), stroke=RED, stroke_width=1.5),
-        path(at(difference), stroke=BLUE, stroke_width=2),
+        polyline(at(difference), stroke=BLUE, stroke_width=2),
         *(
             label(_LEFT - 6, y + 4, f"{value:+.2f}" if value else "0", text_anchor="end")
             for value, y in ((high, _TOP), (0.0, middle), (-high, _BASE))

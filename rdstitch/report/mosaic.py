@@ -8,8 +8,7 @@ import numpy as np
 from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.errors import InputError
 from rdstitch.io.preview import read_preview
-from rdstitch.report.svg import GREEN, RED, YELLOW, counted, data_address, drawing, element, label, section
-from rdstitch.report.svg import path as outline
+from rdstitch.report.svg import GREEN, RED, YELLOW, counted, data_address, drawing, element, label, polyline, section
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.viewer.page import viewer_path
 
@@ -18,7 +17,7 @@ _MAX_NAMES, _MAX_BREAKS, _MAX_DOTS = 12, 20, 5000
 _OUTLINED = {"stroke_width": 3.0, "paint_order": "stroke"}
 
 
-def mosaic(result: StitchResult, staged: Path | None = None) -> str:
+def mosaic_section(result: StitchResult, staged: Path | None = None) -> str:
     """The output, small; every outline has its image's name as title, and a few images have it written."""
     image = _thumbnail(result, staged)
     if image is None:
@@ -35,7 +34,7 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
     for text, borders in zip(names, result.canvas.outlines, strict=True):
         places = [(border + 0.5) * scale for border in borders]
         shapes = (
-            outline(place, closed=True, stroke=YELLOW, stroke_opacity=0.7, pointer_events="all") for place in places
+            polyline(place, closed=True, stroke=YELLOW, stroke_opacity=0.7, pointer_events="all") for place in places
         )
         parts.append(element("g", element("title", text), shapes))
         if len(names) <= _MAX_NAMES:

@@ -9,18 +9,10 @@ import numpy as np
 
 from rdstitch.export.georeference_text import map_summary
 from rdstitch.report.lens import lens_curve, votes
-from rdstitch.report.mosaic import mosaic
+from rdstitch.report.mosaic import mosaic_section
 from rdstitch.report.pairs import match_graph, matched, residual_map
-from rdstitch.report.stage import stage
-from rdstitch.report.svg import (
-    Content,
-    Markup,
-    element,
-    joined,
-    of_source,
-    section,
-    table,
-)
+from rdstitch.report.stage import stage_section
+from rdstitch.report.svg import Content, Markup, element, joined, of_source, section, table
 from rdstitch.results.messages import of_severity
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
@@ -90,18 +82,18 @@ def report_page(
     title, output = "rdstitch report", list[str]()
     if isinstance(result, StitchResult):
         title = title if result.output is None else result.output.name
-        output = [mosaic(result, staged), place(result), local_alignment(result)]
+        output = [mosaic_section(result, staged), place_section(result), local_alignment(result)]
     body: list[Content] = [
         summary(result),
         notices(registration),
-        stage(registration),
+        stage_section(registration),
         *output,
         match_graph(registration),
         votes(registration),
         lens_curve(registration),
         matched(registration),
         residual_map(registration),
-        run(stages, command),
+        run_section(stages, command),
     ]
     head = Markup(f'<meta charset="utf-8"><meta name="viewport" content="{_VIEWPORT}"><style>{_STYLE}</style>')
     return joined(
@@ -150,12 +142,12 @@ def summary(result: StitchResult | Registration) -> str:
 
 def notices(registration: Registration) -> str:
     """Warnings, and images that were left out, each with the reason."""
-    told = [
+    texts = [
         message.clause for severity in ("warning", "note") for message in of_severity(registration.messages, severity)
     ]
     listed = element("p", "No warnings.")
-    if told:
-        listed = joined(element("h3", "What to look at"), element("ul", (element("li", item) for item in told)))
+    if texts:
+        listed = joined(element("h3", "What to look at"), element("ul", (element("li", item) for item in texts)))
     return section("Warnings and left-out images", "", listed, _left_out(registration))
 
 
@@ -183,7 +175,7 @@ def _lambda(registration: Registration) -> str:
     )
 
 
-def run(stages: Sequence[tuple[str, float]], command: str) -> str:
+def run_section(stages: Sequence[tuple[str, float]], command: str) -> str:
     """Date, version and command line, and the seconds of each stage in their order."""
     rows = [("date", datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")), ("rdstitch", version("rdstitch"))]
     rows += [("command", command)] if command else []
@@ -191,8 +183,8 @@ def run(stages: Sequence[tuple[str, float]], command: str) -> str:
     return section("Run", f"{sum(seconds for _, seconds in stages):.1f} s on the clock." if stages else "", table(rows))
 
 
-def place(result: StitchResult) -> str:
-    """Give where the output lies on the Earth, and the largest residuals of the positions that say so."""
+def place_section(result: StitchResult) -> str:
+    """Where the output lies on the Earth, and the largest residuals of the positions that say so."""
     if (placed := result.georeference) is None:
         return ""
     residuals = sorted(placed.residuals, key=lambda residual: -residual.off)[:_MAX_ROWS]
@@ -200,11 +192,11 @@ def place(result: StitchResult) -> str:
     explanation = (
         f"{map_summary(placed)}. Where the output has them less where they were measured to be, the largest first:"
     )
-    return section("Place on the Earth", explanation, table([("", "east, m", "north, m", ""), *rows]))
+    return section("Place on the Earth", explanation, table(rows, ("", "east, m", "north, m", "")))
 
 
 def local_alignment(result: StitchResult) -> str:
-    """Give how much local alignment mended, and the image that it moved farthest."""
+    """How much local alignment mended, and the image that it moved farthest."""
     local = result.local_alignment
     if result.plan is not None:
         return ""
@@ -218,6 +210,5 @@ def local_alignment(result: StitchResult) -> str:
     return section(
         "Local alignment",
         f"No {'turn' if result.registration.alignment.on_sphere else 'plane'} fits quite, so that each image's content "
-        f"is moved a little, that of {name} by up to "
-        f"{field.largest:.1f} pixels; {local.reason}{spread}.",
+        f"is moved a little, that of {name} by up to {field.largest:.1f} pixels; {local.reason}{spread}.",
     )

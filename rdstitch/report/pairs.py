@@ -23,7 +23,7 @@ from rdstitch.report.svg import (
     label,
     line,
     of_source,
-    path,
+    polyline,
     section,
 )
 from rdstitch.results.registration import Registration
@@ -44,14 +44,14 @@ def match_graph(registration: Registration) -> str:
     alignment = registration.alignment
     used = np.flatnonzero(alignment.used)
     outlines = {int(k): footprint(registration, int(k)) for k in used}
-    centers = {int(k): middle(registration, int(k)) for k in used}
+    centers = {int(k): image_centre(registration, int(k)) for k in used}
     points = np.concatenate(list(outlines.values()))
     low = np.nanmin(points, axis=0)
     extent = np.maximum(np.nanmax(points, axis=0) - low, 1e-9)
     scale = float((_GRAPH_SIDE - 2 * _GRAPH_MARGIN) / extent.max())
     (width, height), shift = (extent * scale + 2 * _GRAPH_MARGIN).tolist(), _GRAPH_MARGIN / scale - low
     parts = [
-        path((outline + shift) * scale, closed=True, stroke=BLUE, fill=BLUE, fill_opacity=0.05, stroke_opacity=0.5)
+        polyline((outline + shift) * scale, closed=True, stroke=BLUE, fill=BLUE, fill_opacity=0.05, stroke_opacity=0.5)
         for outline in outlines.values()
     ]
     links = [fit for fit in alignment.links if fit.used]
@@ -194,7 +194,7 @@ def footprint(registration: Registration, index: int) -> FloatArray:
     return _on_plane(registration, index, camera.outline(_POINTS_PER_SIDE))
 
 
-def middle(registration: Registration, index: int) -> FloatArray:
+def image_centre(registration: Registration, index: int) -> FloatArray:
     """Centre (2,) of an image, as :func:`footprint`."""
     width, height = registration.alignment.cameras[index].image_size
     return _on_plane(registration, index, np.array([[(width - 1) / 2, (height - 1) / 2]])).reshape(2)

@@ -10,7 +10,7 @@ from rdstitch.results.registration import Registration
 from rdstitch.stage.register_tiles import TileRegistration
 
 
-def stage(registration: Registration) -> str:
+def stage_section(registration: Registration) -> str:
     """Backlash, and a table for rows and one for columns; nothing where the images are no tiles."""
     tiled = registration.tiles
     if tiled is None:
@@ -35,14 +35,14 @@ def stage(registration: Registration) -> str:
         f"{counted(len(grid), 'tile')}; the error of links is what overlaps disagree by after all places are adjusted.",
         table(rows),
         element("h3", "Rows"),
-        table([header, *_lines(tiled, grid.rows, model.rows)]),
+        table(_lines(tiled, grid.rows, model.rows), header),
         element("h3", "Columns"),
-        table([header, *_lines(tiled, grid.columns, model.columns)]),
+        table(_lines(tiled, grid.columns, model.columns), header),
     )
 
 
 def backlash(rows: FloatArray) -> tuple[float, float]:
-    """Give what every other row is off against the rows between, (x, y), pixels: rows (R, 2) are taken to and fro."""
+    """What every other row is off against the rows between, (x, y), pixels: rows (R, 2) are taken to and fro."""
     if len(rows) < 2:
         return 0.0, 0.0
     x, y = (np.median(rows[1::2], axis=0) - np.median(rows[::2], axis=0)).tolist()

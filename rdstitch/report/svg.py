@@ -64,7 +64,7 @@ def label(x: float, y: float, text: str, **attributes: Any) -> Markup:
     return element("text", text, x=x, y=y, **{"font_size": 12, **attributes})
 
 
-def path(points: FloatArray, closed: bool = False, **attributes: Any) -> Markup:
+def polyline(points: FloatArray, closed: bool = False, **attributes: Any) -> Markup:
     """A line through points (N, 2); points that are not finite interrupt it."""
     pieces, lifted = [], True
     for x, y in points:
@@ -76,9 +76,11 @@ def path(points: FloatArray, closed: bool = False, **attributes: Any) -> Markup:
     return element("path", d=" ".join(pieces) + ("Z" if closed else ""), **{"fill": "none", **attributes})
 
 
-def table(rows: Iterable[Iterable[str]]) -> Markup:
+def table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> Markup:
     """A table of texts."""
-    return element("table", (element("tr", (element("td", cell) for cell in row)) for row in rows))
+    head = [element("th", cell) for cell in header]
+    lines = (element("tr", (element("td", cell) for cell in row)) for row in rows)
+    return element("table", element("tr", head) if head else "", lines)
 
 
 def counted(count: int, one: str) -> str:
@@ -88,7 +90,8 @@ def counted(count: int, one: str) -> str:
 
 def section(title: str, explanation: str, *content: Content) -> Markup:
     """A part of the page with its heading."""
-    return element("section", element("h2", title), element("p", explanation), *content)
+    explained = element("p", explanation) if explanation else ""
+    return element("section", element("h2", title), explained, *content)
 
 
 def _text(value: Any) -> str:

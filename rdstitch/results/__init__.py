@@ -1,1 +1,1 @@
-"""What a recipe takes and gives: options, registration, stitch result, messages."""
+"""What a recipe gives: registration, stitch result, poses, messages."""

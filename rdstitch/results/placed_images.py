@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
-from rdstitch.compositing.near_part import NearPart
 from rdstitch.compositing.source_images import Displacement, PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
+from rdstitch.compositing.visible_region import VisibleRegion
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference
 from rdstitch.export.place_on_map import Located, has_place
@@ -116,7 +116,7 @@ class PlacedImages:
             self.leverage,
         )
 
-    def images(self, near: Sequence[NearPart | None]) -> list[PlacedImage]:
+    def images(self, near: Sequence[VisibleRegion | None]) -> list[PlacedImage]:
         """As the compositor takes them, with only the near parts of those that are not drawn whole."""
         read: list[Callable[..., DecodedImage]] = [
             source.read if part is None else partial(_read_near, source.read, part)
@@ -161,7 +161,7 @@ def _read_moving(read: Callable[..., DecodedImage], static: NDArray[np.bool_], r
     return replace(image, alpha=np.where(static[np.ix_(rows, columns)], np.uint8(0), alpha))
 
 
-def _read_near(read: Callable[..., DecodedImage], part: NearPart, reduction: int = 1) -> DecodedImage:
+def _read_near(read: Callable[..., DecodedImage], part: VisibleRegion, reduction: int = 1) -> DecodedImage:
     """An image, whole or reduced, of which only its near part is drawn."""
     return part.masked(read(reduction))
 

@@ -2,41 +2,35 @@
 
 import dataclasses
 import math
-import platform
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-import cv2
 import numpy as np
 
-from rdstitch.arrays import FloatArray
-from rdstitch.compositing import Canvas, SeamQuality
-from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
-from rdstitch.compositing.projection import PLANE
-from rdstitch.export.georeference import Georeference, Residual
 from rdstitch.geometry.camera_record import FocalSource, camera_record, lens_fields
-from rdstitch.inputs.source import Source
-from rdstitch.local_alignment import DisplacementField
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
-from rdstitch.results.stitch_result import OutputImage, StitchResult
+from rdstitch.results.stitch_result import StitchResult
+from rdstitch.sidecar.parts import (
+    displacement_record,
+    in_degrees,
+    output_record,
+    seams_record,
+    taken_fields,
+    to_lists,
+    to_output,
+    versions,
+)
 from rdstitch.sidecar.records import (
     VERSION,
     BeforeAfter,
-    BreakRecord,
-    Displacement,
-    GeoreferenceRecord,
     ImageRecord,
     Lens,
     LocalAlignmentRecord,
     Model,
-    OutputRecord,
     PairRecord,
     PoseRecord,
     ReliefRecord,
-    ResidualRecord,
-    SeamsRecord,
     SidecarRecord,
     StageRecord,
     TileRecord,
@@ -67,7 +61,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         lens=cast(Lens, alignment.lens),
         lens_reason=alignment.lens_reason,
         camera=camera_record(camera),
-        tilt_deg=_degrees(alignment.tilt),
+        tilt_deg=in_degrees(alignment.tilt),
         focal_px=camera.focal,
         focal_source=cast(FocalSource | None, camera.focal_source),
         model=cast(Model, alignment.model),
@@ -112,7 +106,7 @@ def _images(result: StitchResult) -> list[ImageRecord]:
                 used,
                 reasons.pop(source.path, ""),
                 registration.keypoints[index],
-                to_plane=_plain(homography) if used else None,
+                to_plane=to_lists(homography) if used else None,
                 to_output=to_output(result.canvas, homography) if used else None,
                 displacement=displacement_record(next(fields, None) if used else None),
                 pose=_pose(registration, index) if used else None,
@@ -132,72 +126,9 @@ def _pose(registration: Registration, index: int) -> PoseRecord | None:
         poses.position[index, 1],
         poses.height[index],
         np.degrees(poses.yaw[index]),
-        _degrees(poses.tilt[index]),
-        None if poses.covariance is None else _plain(poses.covariance[index]),
+        in_degrees(poses.tilt[index]),
+        None if poses.covariance is None else to_lists(poses.covariance[index]),
     )
-
-
-def taken_fields(source: Source) -> dict[str, Any]:
-    """When and where an image was taken, as fields of its record."""
-    gps = source.metadata.gps
-    return {
-        "timestamp": source.metadata.timestamp,
-        "gps": None if gps is None else (gps.latitude, gps.longitude, gps.altitude),
-    }
-
-
-def output_record(output: OutputImage, *, turned: bool) -> OutputRecord:
-    """The output: by size and digest a reader sees whether the sidecar still belongs to it."""
-    canvas, written = output.canvas, output.fingerprint
-    return OutputRecord(
-        file=None if output.output is None else output.output.name,
-        bytes=None if written is None else written.size,
-        sha256=None if written is None else written.sha256,
-        size=canvas.size,
-        plane_to_output=_plain(canvas.matrix),
-        projection=canvas.projection.name,
-        orientation=_plain(canvas.orientation),
-        wraps_around=canvas.period is not None,
-        field_of_view_deg=_degrees(field_of_view(canvas)) if turned else None,
-        center_deg=_degrees(center_of_view(canvas)) if turned else None,
-        georeference=_georeference(output.georeference, output.not_georeferenced),
-    )
-
-
-def _georeference(place: Georeference | None, reason: str) -> GeoreferenceRecord:
-    if place is None:
-        return GeoreferenceRecord(reason=reason)
-    return GeoreferenceRecord(
-        crs=f"EPSG:{place.crs.epsg}",
-        gsd_m=place.gsd,
-        pixel_to_map=_plain(place.pixel_to_map),
-        north_up=place.north_up,
-        source=place.source,
-        positions=len(place.residuals),
-        positions_used=place.used,
-        rms_m=place.rms,
-        std_m=place.std,
-        residuals=_residuals(place.residuals),
-        check_points=_residuals(place.checks),
-    )
-
-
-def _residuals(residuals: Iterable[Residual]) -> list[ResidualRecord]:
-    return [ResidualRecord(each.name, each.east, each.north, each.used) for each in residuals]
-
-
-def seams_record(seams: SeamQuality, names: Sequence[str]) -> SeamsRecord:
-    """Where the seams of an output hold and where they break; ``names`` are those of its images."""
-    breaks = [
-        BreakRecord((names[each.images[0]], names[each.images[1]]), *each.position, each.length, each.size)
-        for each in seams.breaks
-    ]
-    return SeamsRecord(len(seams.places), int(seams.broken.sum()), breaks)
-
-
-def to_output(canvas: Canvas, homography: FloatArray) -> Any:
-    """From undistorted coordinates to pixels of the output, where one matrix can say that: on a plane."""
-    return _plain(canvas.matrix @ homography) if canvas.projection == PLANE else None
 
 
 def _stage(registration: Registration) -> StageRecord | None:
@@ -213,9 +144,9 @@ def _stage(registration: Registration) -> StageRecord | None:
         pixel_um=grid.pixel_size,
         z=registration.tiles.z,
         time=registration.tiles.time,
-        matrix=_plain(model.matrix),
-        rows_px=_plain(model.rows),
-        columns_px=_plain(model.columns),
+        matrix=to_lists(model.matrix),
+        rows_px=to_lists(model.rows),
+        columns_px=to_lists(model.columns),
         row_std_px=model.row_std,
         column_std_px=model.column_std,
         tile_std_px=model.std,
@@ -224,13 +155,6 @@ def _stage(registration: Registration) -> StageRecord | None:
             for source, row, column, linked, std in lines
         ],
     )
-
-
-def displacement_record(field: DisplacementField | None) -> Displacement | None:
-    if field is None:
-        return None
-    rows, columns, _ = field.values.shape
-    return Displacement((columns, rows), _plain(field.values.reshape(-1, 2)))
 
 
 def _pairs(registration: Registration) -> list[PairRecord]:
@@ -247,7 +171,7 @@ def _pairs(registration: Registration) -> list[PairRecord]:
             lambda_=relation.distortion,
             lambda_std=relation.distortion_std if relation.ok else None,
             model=cast(Model | None, relation.model or None),
-            homography=_plain(relation.homography) if relation.ok else None,
+            homography=to_lists(relation.homography) if relation.ok else None,
             solver=relation.solver or None,
             iterations=relation.iterations,
             ok=relation.ok,
@@ -259,28 +183,3 @@ def _pairs(registration: Registration) -> list[PairRecord]:
         )
 
     return [record(pair) for pair in registration.pairs]
-
-
-def versions() -> dict[str, str]:
-    """Versions of what has a say in the result."""
-    from importlib.metadata import version
-
-    import scipy
-
-    return {
-        "rdstitch": version("rdstitch"),
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-        # Whichever of its wheels is installed.
-        "opencv": cv2.__version__,
-        "python": platform.python_version(),
-    }
-
-
-def _plain(array: FloatArray | None) -> Any:
-    """An array as the lists that JSON has of a record's tuples, for fields whose types NumPy's do not tell."""
-    return None if array is None else array.tolist()
-
-
-def _degrees(angles: Any) -> Any:
-    return None if angles is None else np.degrees(angles).tolist()

@@ -12,9 +12,9 @@ from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.inputs.source import Source
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import OutputImage
+from rdstitch.sidecar.parts import displacement_record, output_record, seams_record, taken_fields, to_output, versions
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import VERSION, Applied, ImageRecord, MatchedBy
-from rdstitch.sidecar.write import displacement_record, output_record, seams_record, taken_fields, to_output, versions
 from rdstitch.system.records import to_jsonable
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.stage.coarse_tile import Image
+from rdstitch.stage.coarse_tile import CORRELATED, Image
 from rdstitch.system.dataclasses import dataclass
 
 _SMOOTHING = 1.2  # standard deviation of the filter before derivatives are taken, pixels
@@ -19,7 +19,7 @@ _STEP = 8  # pixels between which the lens is straight
 _ITERATIONS, _SETTLED = 5, 0.003  # pixels
 _MIN_SIDE = 12  # pixels of a block
 _SIGNIFICANT = 5.0  # standard deviations by which the correlation of a block must exceed that of noise
-_CORRELATED = 4.0 * np.pi * _SMOOTHING**2  # pixels that share their noise after the filter
+_CORRELATED = CORRELATED * _SMOOTHING**2  # pixels that share their noise after the filter
 
 PointMap = Callable[[FloatArray], FloatArray]
 Gradient = list[Image]

@@ -71,7 +71,7 @@ def register_tiles(
     ``distortion``: λ, or "auto" to estimate it; else it is 0 unless pairs along rows and along columns agree on it.
     """
     if distortion == "auto" and plan.grid.own_sizes is not None:
-        raise ArgumentError("tiles of different sizes do not show λ; give a number with --distortion, or leave it out")
+        raise ArgumentError("tiles of different sizes do not show λ; give it with --lambda, or leave that out")
     pairs = plan.grid.neighbours(plan.search)
     known = distortion if isinstance(distortion, float | int) else None
     finder = PairFinder(plan, pairs)

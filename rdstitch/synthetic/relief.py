@@ -18,7 +18,7 @@ _MAX_LEVELS = 96
 _BISECTIONS = 10
 _ROW = 1024
 # A place outside every height map, for rays that meet nothing.
-_NOWHERE = np.float32(-1e6)
+NOWHERE = np.float32(-1e6)
 # OpenCV resamples from no side as long as this, texels.
 _TOO_LONG = 32767
 
@@ -70,7 +70,7 @@ class Relief:
 
         def in_ground(level: NDArray[np.float32]) -> NDArray[np.bool_]:
             places = start + along * (np.float32(1.0) - level / np.float32(height))[..., None]
-            places[np.isnan(places)] = _NOWHERE
+            places[np.isnan(places)] = NOWHERE
             ground = _interpolate(self.height, places[..., 0], places[..., 1], bottom)
             return np.asarray(ground >= level)
 
@@ -140,6 +140,5 @@ def _interpolate(values: HeightMap, x: NDArray[np.float32], y: NDArray[np.float3
 
 
 def _scaled(ground: HeightMap, height: float) -> HeightMap:
-    """Heights from 0 to ``height``."""
     low, high = float(ground.min()), float(ground.max())
     return ((ground - np.float32(low)) * np.float32(height / max(high - low, 1e-12))).astype(np.float32)

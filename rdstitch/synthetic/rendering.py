@@ -18,13 +18,12 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.synthetic.lenses import Lens
 from rdstitch.synthetic.poses import Poses, fit_to_plane, pixels_of_texels, plane_outline, texels_of_pixels
-from rdstitch.synthetic.relief import Relief
+from rdstitch.synthetic.relief import NOWHERE, Relief
 from rdstitch.synthetic.textures import LinearPixels, Texture
 
 _PIXELS_PER_STRIP = 400_000
+_SIXTEEN_BITS = (".png", ".tif", ".tiff")
 _MAX_SAMPLES_PER_SIDE = 6
-# A place that is in no image, for rays that meet nothing.
-_NOWHERE = -1e6
 # A ray that ends so far from a point, texels, does not see it.
 _HIDDEN = 0.5
 # What cubic interpolation needs around a sample, texels.
@@ -124,18 +123,15 @@ class Sequence:
         return [self.frame(index) for index in range(len(self))]
 
     def write(self, folder: str | Path, name: str = "frame_{:04d}.png") -> list[Path]:
-        """Render all images into a folder, one at a time.
-
-        Parameters
-        ----------
-        name : str
-            Format of the file names, with the suffix of the file type.
-        """
+        """Render all images into a folder, one at a time; ``name`` is the format of the file names, with a suffix."""
         paths = []
         for index in range(len(self)):
             path = Path(folder) / name.format(index)
             image = self.frame(index)
             bgr = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
+            eight_only = image.dtype == np.uint16 and path.suffix.lower() not in _SIXTEEN_BITS
+            if eight_only or not cv2.haveImageWriter(path.name):
+                raise OutputError(f"{path}: cannot hold images of {self.photometry.bits} bits; use .png or .tif")
             _, encoded = cv2.imencode(path.suffix, bgr)
             try:
                 path.write_bytes(encoded.tobytes())
@@ -214,7 +210,7 @@ def _sample(texture: Texture, place: FloatArray) -> LinearPixels:
         low.append(max(int(least) - _APRON, 0))
         high.append(min(int(most) + _APRON + 2, size))
     part = texture.region(low[0], low[1], high[0], high[1])
-    x, y = (np.nan_to_num(axis - start, nan=_NOWHERE) for axis, start in zip(axes, low, strict=True))
+    x, y = (np.nan_to_num(axis - start, nan=float(NOWHERE)) for axis, start in zip(axes, low, strict=True))
     samples = cv2.remap(
         part, x.astype(np.float32), y.astype(np.float32), cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT
     )

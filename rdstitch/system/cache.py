@@ -79,8 +79,20 @@ class Cache:
 
     @classmethod
     def at(cls, folder: Path | None) -> Self:
-        """A cache in a folder, if there is one, by its whole name, which holds in processes elsewhere too."""
-        return cls(None if folder is None else Path(folder).absolute())
+        """A cache in a folder, if there is one, by its whole name, which holds in processes elsewhere too.
+
+        The folder is made before long work begins.
+        """
+        if folder is None:
+            return cls()
+        place = Path(folder).absolute()
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{place}: cannot make the folder of the cache: {error.strerror}") from error
+        if not os.access(place, os.W_OK | os.X_OK):
+            raise OutputError(f"{place}: no permission to write into the folder of the cache")
+        return cls(place)
 
     @classmethod
     def for_this_run(cls, parent: Path | None = None) -> Self:
@@ -94,17 +106,6 @@ class Cache:
         except OSError:
             return cls()
         return cls(owner.path, owner)
-
-    def __post_init__(self) -> None:
-        """Make the folder before long work begins."""
-        if self.folder is None:
-            return
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{self.folder}: cannot make the folder of the cache: {error.strerror}") from error
-        if not os.access(self.folder, os.W_OK | os.X_OK):
-            raise OutputError(f"{self.folder}: no permission to write into the folder of the cache")
 
     def recall(self, stage: str, inputs: tuple[Any, ...], compute: Callable[[], Value]) -> Value:
         """Give what a stage gives for its inputs: from an earlier run, else computed now and kept."""
@@ -280,7 +281,7 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(data: bytes) -> Any:
-    """The value that :func:`pack` made bytes of; nothing in them can name other code to be run."""
+    """The value that :func:`pack` made bytes of; of other code they can name constructors of dataclasses alone."""
     body = memoryview(data)[_HEAD:]
     if data[:_HEAD] != _MAGIC + hashlib.sha256(body).digest():
         raise InputError("damaged: it is not what was written")

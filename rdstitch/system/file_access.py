@@ -29,6 +29,7 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 _LOCAL = ("file", "local")  # schemes of what is on this machine
 _SEVERAL = "::"  # between the parts of a chain, as in simplecache::s3://bucket/name
 _Content = TypeVar("_Content")
+ContentState = tuple[int, int] | str
 _held: ContextVar[tuple[str, bytes] | None] = ContextVar("held", default=None)
 
 
@@ -150,16 +151,23 @@ def file_state(path: str | Path) -> tuple[int, int] | None:
     return status.st_size, status.st_mtime_ns
 
 
+def content_state(path: str | Path) -> ContentState | None:
+    """What changes with the content of a file or URL, and is the same on every machine; None where there is none."""
+    with suppress(OSError):
+        return remote_status(path)[2] if is_url(path) else file_state(path)
+    return None
+
+
 def cached_by_file_state(read: Callable[[str | Path], _Content]) -> Callable[[str | Path], _Content]:
     """A reader that reads a file again only if it has changed, or after another one: for one value after the other."""
 
     @lru_cache(maxsize=1)
-    def of_state(path: str | Path, state: tuple[int, int] | None) -> _Content:
+    def of_state(path: str | Path, state: ContentState | None) -> _Content:
         return read(path)
 
     @wraps(read)
     def cached(path: str | Path) -> _Content:
-        return of_state(path, file_state(path))
+        return of_state(path, content_state(path))
 
     return cached
 

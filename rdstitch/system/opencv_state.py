@@ -14,11 +14,7 @@ _SILENT = 0  # the log level of that name
 # OpenCV 4 has the same functions at its top level; its stubs know neither.
 _logging: Any = getattr(cv2.utils, "logging", cv2)
 # Functions that do nothing but wait: those of events, conditions and queues, of event loops, and of idle pools.
-_WAITING = {
-    threading.Condition.wait.__code__,
-    selectors.DefaultSelector.select.__code__,
-    _worker.__code__,
-}
+_WAITING = {threading.Condition.wait.__code__, selectors.DefaultSelector.select.__code__, _worker.__code__}
 _lock = threading.Lock()
 _silenced: list[int] = []  # the log level before each of the blocks that hold it
 

@@ -219,6 +219,7 @@ class Outputs:
         self._folders: dict[Path, TemporaryFolder] = {}
         self._made: list[Path] = []  # folders for outputs, the inner ones first
         self._items: list[_Item] = []
+        self._number = 0  # of what is staged next, also after something was dropped
 
     @classmethod
     def or_own(cls, outputs: "Outputs | None", overwrite: bool = True) -> AbstractContextManager["Outputs"]:
@@ -226,13 +227,11 @@ class Outputs:
         return cls(overwrite) if outputs is None else nullcontext(outputs)
 
     def __enter__(self) -> Self:
-        """Begin; nothing is made before it is needed."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Put everything in its place, or throw it away."""
         try:
             for act in (self._check, self._place) if kind is None else ():
                 for item in self._items:
@@ -295,6 +294,7 @@ class Outputs:
             yield
         except BaseException:
             del self._items[count:]
+            self._number += 1
             raise
 
     def staged(self, path: str | Path) -> Path | None:
@@ -309,10 +309,10 @@ class Outputs:
             raise OutputError(f"{name}: is the name of two outputs; choose another one for each")
         if place.parent not in self._folders:
             self._folders[place.parent] = TemporaryFolder(place.parent, ".rdstitch-")
+        is_tiles = is_folder and not is_zarr(name)
         # Tiles are staged just before their description, and are found beside it by its name.
-        number = sum(not item.is_folder for item in self._items)
-        suffix = "_files" if is_folder and not is_zarr(name) else name.suffix
-        staged = self._folders[place.parent].path / f"new{number}{suffix}"
+        staged = self._folders[place.parent].path / f"new{self._number}{'_files' if is_tiles else name.suffix}"
+        self._number += not is_tiles
         self._items.append(_Item(name, place, staged, is_folder))
         return staged
 

@@ -29,7 +29,6 @@ class StageTimer:
         self._since = time.perf_counter()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Note a step of a stage."""
         if stage != self._stage:
             self._close()
             self._stage = stage

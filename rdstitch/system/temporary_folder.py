@@ -41,14 +41,12 @@ class TemporaryFolder:
         _folders[self.path] = self
 
     def __reduce__(self) -> tuple[Callable[[Path], "TemporaryFolder"], tuple[Path]]:
-        """See the class."""
         return _folder_at, (self.path,)
 
     def __enter__(self) -> Path:
         return self.path
 
     def __exit__(self, *failure: object) -> None:
-        """Remove the folder with everything in it."""
         self.close()
 
 

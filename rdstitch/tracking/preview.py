@@ -1,5 +1,8 @@
-"""An image of what has been seen so far, painted frame by frame, of bounded size."""
+"""An image of what has been seen so far, painted frame by frame, of bounded size, and written now and then."""
 
+import math
+from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import cv2
@@ -7,11 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.errors import RdstitchError
 from rdstitch.geometry.radial_homography import from_plane
+from rdstitch.inputs.source import Source
+from rdstitch.io.write import write_image
+from rdstitch.results.messages import Message
 from rdstitch.tracking.placement import Placement
+from rdstitch.tracking.tracked_frame import TrackingResult
 
 _FRAME_SIDE = 240  # longer side of a frame in the preview at first, pixels
 _OUTLINE = 8  # points a side of a frame's outline
+_MEGAPIXELS = 0.08  # 10⁶ pixels that a keyframe is read with
 
 
 class Preview:
@@ -72,6 +81,39 @@ class Preview:
         if size.all():
             self._part(before, before + size)[...] = painted
         return low, high
+
+
+class LivePreview:
+    """The preview and its file."""
+
+    def __init__(self, file: Path, refresh: float) -> None:
+        self._file, self._refresh, self._mosaic = file, refresh, Preview()
+        self._written, self._changed, self._failed = -math.inf, False, False
+
+    def add(self, source: Source, result: TrackingResult) -> list[Message]:
+        """Paint a keyframe; write the file when that is due. What fails is told once: the frames are worth more."""
+        if self._failed:
+            return []
+        try:
+            self._add(source, result)
+        except RdstitchError as error:
+            self._failed = True
+            return [Message(f"no preview any more: {error}")]
+        return []
+
+    def _add(self, source: Source, result: TrackingResult) -> None:
+        if result.keyframe and result.placement is not None:
+            image = source.read(source.reduction(_MEGAPIXELS))
+            self._mosaic.paint(image.pixels, result.placement)
+            self._changed = True
+        if monotonic() - self._written >= self._refresh:
+            self.write()
+
+    def write(self) -> None:
+        """Replace the file, if there is anything new."""
+        if self._changed and self._mosaic.pixels.size:
+            write_image(self._file, self._mosaic.pixels, overwrite=True)
+            self._written, self._changed = monotonic(), False
 
 
 def _as_rgb(image: NDArray[Any]) -> NDArray[np.uint8]:

@@ -69,7 +69,7 @@ class ResultEvidence:
         return self.purpose.picture and self.looks_right(images)
 
     @cached_property
-    def alike(self) -> float:
+    def alike_fraction(self) -> float:
         """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
         shares = [link.agreement.share for link in self.checked if link.agreement.cells >= Limits.min_cells.value]
         return float(np.median(shares)) if shares else 0.0

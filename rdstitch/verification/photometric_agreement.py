@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.seam_quality import SeamTile, likeness
-from rdstitch.compositing.warp import Lattice
+from rdstitch.compositing.lattice import Lattice
+from rdstitch.compositing.likeness import likeness
+from rdstitch.compositing.seam_quality import SeamTile
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.io.read import DecodedImage
@@ -53,7 +54,7 @@ class Agreement:
         return self.confirming / self.cells if self.cells else 1.0
 
     @property
-    def unlike(self) -> float:
+    def unlike_cells(self) -> float:
         """Number of the cells that look different three times smaller, where depth and blur are no difference."""
         return 0.0 if math.isnan(self.coarsely) else self.cells * (1.0 - self.coarsely)
 

@@ -17,7 +17,7 @@ from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind, Measured
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import wrong_at_most
-from rdstitch.verification.rival_planes import fills_at_most
+from rdstitch.verification.second_motions import fills_at_most
 
 
 def _disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -83,9 +83,9 @@ def _errors(evidence: ResultEvidence) -> Iterator[Finding]:
     # Without what neighbours have in common, errors are those of a plane.
     explained = rms <= largest and rms**2 - relief.size**2 <= (Limits.max_rms.value * threshold) ** 2
     # Where the pixels agree, depth that one surface does not explain has been found a place all the same.
-    rough = (rms <= Limits.max_rough_rms.value * threshold and evidence.alike >= Limits.min_alike_fraction.value) or (
-        relief.found and explained and evidence.alike >= Limits.min_clearly_alike_fraction.value
-    )
+    rough = (
+        rms <= Limits.max_rough_rms.value * threshold and evidence.alike_fraction >= Limits.min_alike_fraction.value
+    ) or (relief.found and explained and evidence.alike_fraction >= Limits.min_clearly_alike_fraction.value)
     values: Measured = {"rms": rms, "threshold": threshold}
     if rough or evidence.purpose.picture:
         severity = _warning_if(evidence.flat or _depth_seen(evidence))
@@ -108,7 +108,7 @@ def _depth(evidence: ResultEvidence) -> Iterator[Finding]:
 
 def _depth_seen(evidence: ResultEvidence) -> bool:
     """Whether depth leaves the images unlike; pictures have their seams."""
-    return not evidence.purpose.picture and evidence.alike < Limits.min_alike_fraction.value
+    return not evidence.purpose.picture and evidence.alike_fraction < Limits.min_alike_fraction.value
 
 
 def _warning_if(warns: bool) -> Severity:
@@ -138,7 +138,7 @@ def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
             yield Finding(Kind.UNLIKE, link.pair, "failure", values)
 
 
-def _looked_at(evidence: ResultEvidence) -> Iterator[Finding]:
+def _compared_overlaps(evidence: ResultEvidence) -> Iterator[Finding]:
     """How many of many overlaps were compared in their pixels, and what that says of the others."""
     checked, share = evidence.checked, wrong_at_most(evidence.checked)
     if share < Limits.max_wrong_overlaps.value:
@@ -199,7 +199,7 @@ def _focal_share(source: Source) -> float:
 
 
 class Rule(NamedTuple):
-    """What finds something, and for which recipes it speaks."""
+    """What finds something, and the recipes that it applies to."""
 
     find: Callable[[ResultEvidence], Iterable[Finding]]
     purposes: frozenset[Purpose] = frozenset(Purpose)
@@ -212,16 +212,16 @@ _POSES = frozenset({Purpose.TRAJECTORY})
 """Pictures have their seams, a lens is the same."""
 
 OF_MATCHES = Rule(_mixed_lenses), Rule(_matches_disagree), Rule(_misfitting_images)
-"""Failures by which the pixels need not be asked: of images that may be left out."""
+"""Failures by matches: images are left out before any pixels are compared."""
 
 OF_MATCHED_PAIRS = (Rule(_disagreeing_pairs, _PLACES),)
-"""The same of pairs: failures where images hang on them alone."""
+"""The same of pairs: failures where images are connected by them alone."""
 
 OF_PAIRS = *OF_MATCHED_PAIRS, Rule(_unlike, _PLACES), Rule(_ambiguous, _PLACES)
-"""Suspicions of pairs, the last of each counts: a failure where images hang on it alone."""
+"""Suspicions of pairs, of which the last of each pair counts."""
 
 OF_THE_WHOLE = (
-    Rule(_looked_at),
+    Rule(_compared_overlaps),
     Rule(_pattern, _PLACES),
     Rule(_rival_motion, _POSES),
     Rule(_two_left),
@@ -234,5 +234,5 @@ OF_THE_WHOLE = (
 
 
 def found(rules: Iterable[Rule], evidence: ResultEvidence) -> list[Finding]:
-    """What those of some rules find that speak for the recipe."""
+    """What those of some rules find that apply to the recipe."""
     return [finding for rule in rules if evidence.purpose in rule.purposes for finding in rule.find(evidence)]

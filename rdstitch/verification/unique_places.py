@@ -36,12 +36,12 @@ class UniqueShift:
     # what is unique in both and the same, in squared spreads of the pattern times pixels, times ``share``
     matched: float
     share: float  # of what is unique in either, in the overlap: their correlation, in [-1, 1]
-    rival: float  # the most that is matched so at any other shift
+    matched_elsewhere: float  # the most that is matched so at any other shift
 
     @property
     def decides(self) -> bool:
         """Whether the images lie here and nowhere else."""
-        clear = self.matched >= max(Limits.min_matched_departures.value, Limits.min_lead.value * self.rival)
+        clear = self.matched >= max(Limits.min_matched_departures.value, Limits.min_lead.value * self.matched_elsewhere)
         return clear and self.share >= Limits.min_departure_correlation.value
 
 
@@ -123,8 +123,8 @@ def unique_shift(first: Drawing, second: Drawing, unique1: Grey, unique2: Grey) 
         matched[k] = share[k] * overlaps.products[box].max(initial=0.0)
     best = int(matched.argmax())
     elsewhere = np.hypot(*(peaks.shift - peaks.shift[best]).T) > _MIN_SHIFT
-    rival = float(matched[elsewhere].max(initial=0.0))
-    return UniqueShift(peaks.shift[best], float(matched[best]), float(share[best]), rival)
+    best_elsewhere = float(matched[elsewhere].max(initial=0.0))
+    return UniqueShift(peaks.shift[best], float(matched[best]), float(share[best]), best_elsewhere)
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,7 +46,7 @@ def judge(evidence: ResultEvidence) -> tuple[Finding, ...]:
     """
     if failures := failures_of_matches(evidence):
         return failures
-    decisive, outvoted = _by_what_hangs_on_them(rules.found(rules.OF_PAIRS, evidence), evidence)
+    decisive, outvoted = _split_by_dependence(rules.found(rules.OF_PAIRS, evidence), evidence)
     whole = rules.found(rules.OF_THE_WHOLE, evidence)
     return _limit_warnings([*decisive, *whole, *_outvoted(outvoted)])
 
@@ -56,10 +56,10 @@ def failures_of_matches(evidence: ResultEvidence) -> tuple[Finding, ...]:
     found = rules.found(rules.OF_MATCHES, evidence)
     if evidence.static:  # matches of what is static in the images agree with nothing
         return tuple(finding for finding in found if not finding.images)
-    return *found, *_by_what_hangs_on_them(rules.found(rules.OF_MATCHED_PAIRS, evidence), evidence)[0]
+    return *found, *_split_by_dependence(rules.found(rules.OF_MATCHED_PAIRS, evidence), evidence)[0]
 
 
-def _by_what_hangs_on_them(
+def _split_by_dependence(
     suspicions: Iterable[Finding], evidence: ResultEvidence
 ) -> tuple[list[Finding], list[Finding]]:
     """Suspicions of pairs without which the images fall apart, and those of pairs on which nothing depends."""

@@ -112,7 +112,7 @@ def viewer_page(
 
 def _described(image: ViewedImage) -> dict[str, Any]:
     """For the script, which counts pixels from the corner of the first one."""
-    outlines = [outline[:: max(1, len(outline) // _CORNERS)] + 0.5 for outline in image.outlines]
+    outlines = [outline[:: max(1, -(-len(outline) // _CORNERS))] + 0.5 for outline in image.outlines]
     return {
         "name": image.name.encode("utf-8", "backslashreplace").decode("utf-8"),
         "outlines": [np.round(outline, 1).tolist() for outline in outlines],

@@ -6,12 +6,16 @@ import signal
 import subprocess
 import threading
 import time
+from contextlib import nullcontext
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from rdstitch.inputs.arrivals import open_arrivals
+from rdstitch.inputs import frame_stream
+from rdstitch.inputs.frame_stream import open_frame_stream
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
@@ -162,11 +166,48 @@ def test_the_line_of_what_cannot_be_read(rdstitch: Run, drive: list[Path], folde
 
 
 def test_a_preview_that_cannot_be_written_ends_nothing(drive: list[Path], tmp_path: Path) -> None:
-    arrivals = open_arrivals(drive[0].parent, frames_folder=Path, idle=0.5)
+    arrivals = open_frame_stream(drive[0].parent, frames_folder=Path, idle=0.5)
     options, gone = StitchOptions(workers=1, distortion=DISTORTION), tmp_path / "gone" / "preview.jpg"
     poses = list(follow(arrivals, options, preview=gone, refresh=0.0))
     assert len({pose.name for pose in poses}) == len(drive)
     assert [message.text[:14] for pose in poses for message in pose.messages] == ["no preview any"]
+
+
+class _Camera:
+    """A camera that drops every third frame, and whose connection breaks after the sixth until it is opened again."""
+
+    def __init__(self) -> None:
+        self.grabbed = self.opened = 0
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return True
+
+    def open(self, _: int | str) -> bool:
+        self.opened += 1
+        return True
+
+    def get(self, _: int) -> float:
+        return -1.0
+
+    def grab(self) -> bool:
+        self.grabbed += 1
+        return self.grabbed % 3 != 0 and (self.grabbed < 7 or self.opened > 0)
+
+    def retrieve(self) -> tuple[bool, Any]:
+        return True, np.full((4, 6, 3), self.grabbed, np.uint8)
+
+
+@pytest.mark.parametrize("idle", [None, 60.0])
+def test_a_stream_goes_on_after_a_lost_frame_and_is_opened_again(
+    idle: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = _Camera()
+    monkeypatch.setattr(frame_stream, "opened_capture", lambda _: nullcontext(camera))
+    monkeypatch.setattr(frame_stream, "_POLL_SECONDS", 0.0)
+    monkeypatch.setattr(frame_stream, "_REOPEN_SECONDS", 0.01)
+    stream = open_frame_stream("rtsp://camera", frames_folder=lambda: tmp_path, idle=idle)
+    assert [frame.number for frame in islice(stream, 7)] == list(range(7))
+    assert camera.opened
 
 
 def test_files_whose_writers_pause_are_read_when_they_are_whole(drive: list[Path], folder: Path) -> None:
@@ -174,7 +215,7 @@ def test_files_whose_writers_pause_are_read_when_they_are_whole(drive: list[Path
     for name, image in zip(names, drive, strict=False):
         write_image(folder.parent / name, read_image(image).pixels)
     whole = {name: (folder.parent / name).read_bytes() for name in names}
-    arrivals = open_arrivals(folder, frames_folder=Path, idle=2.0)
+    arrivals = open_frame_stream(folder, frames_folder=Path, idle=2.0)
     frames = follow(arrivals, StitchOptions(workers=1), comes_again=arrivals.comes_again)
     (folder / "a.png").write_bytes(whole["a.png"])
     assert next(frames).name == "a.png"

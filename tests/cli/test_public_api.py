@@ -50,7 +50,7 @@ def test_the_package_shows_its_names_and_loads_them_when_they_are_used() -> None
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == f"{metadata.version('rdstitch')}\n[]\n"
     with pytest.raises(AttributeError, match="no attribute 'stitch'"):
-        rdstitch.stitch  # noqa: B018
+        rdstitch.stitch  # type: ignore[attr-defined]  # noqa: B018
 
 
 @pytest.mark.usefixtures("images")

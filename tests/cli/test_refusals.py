@@ -85,6 +85,7 @@ def _check(rdstitch: Run, folder: Path, arguments: list[str], status: int, *told
         ("pano A.png b.png -o out.png", 3, "A.png: no such file; did you mean a.png?"),
         ("pano nofolder/a.png b.png -o out.png", 3, "there is no folder nofolder"),
         ("pano a.png nowhere://example.org/b.png -o out.png", 3, "nowhere:/example.org/b.png: "),
+        ("trajectory nowhere://example.org/b -o path --follow", 3, "nowhere://example.org/b: OpenCV cannot open"),
         ("mosaic nofolder/ -o out.png", 3, "nofolder: no such folder"),
         ("mosaic *.nothing -o out.png", 3, "*.nothing: "),
         ("mosaic @more -o out.png", 3, "more: "),

@@ -240,6 +240,8 @@ def _members(
 
 def dissection(count: int, image1: IntArray, image2: IntArray) -> tuple[IntArray, IntArray]:
     """The front of each image (N,), and how many times the graph was divided before each front, (F,)."""
+    if count <= _UNDIVIDED:
+        return np.zeros(count, dtype=np.intp), np.zeros(1, dtype=np.intp)
     edges = sparse.coo_array((np.ones(len(image1)), (image1.astype(np.int32), image2.astype(np.int32))), (count, count))
     graph = edges.tocsr()
     part = csgraph.connected_components(graph, directed=False)[1].astype(np.intp)
@@ -304,8 +306,6 @@ def _coordinates(graph: "sparse.csr_array", part: IntArray) -> FloatArray:
         order = np.lexsort((-away, part))
         return order[np.flatnonzero(np.diff(part[order], prepend=-1))]
 
-    if np.bincount(part).max() <= _UNDIVIDED:
-        return np.zeros((len(part), 1))
     one = distances(farthest(distances(farthest(np.zeros(len(part))))))
     other = distances(farthest(one))
     aside = distances(farthest(np.minimum(one, other)))

@@ -201,9 +201,10 @@ def assemble(
             # One row for each image: its block, its rows of the coupling, and its gradient.
             rows = np.concatenate([local[:, own, own], local[:, own, pair:], gradient[:, own, None]], axis=2)
             # Summed over the links of each image.
-            found, number = np.unique(of, return_inverse=True)
-            places, shape = (number.reshape(-1), np.arange(len(of))), (len(found), len(of))
-            by_image[found] += sparse.csr_array((np.ones(len(of)), places), shape=shape) @ rows.reshape(len(rows), -1)
+            order = np.argsort(of, kind="stable")
+            found, first_link = np.unique(of[order], return_index=True)
+            sums = sparse.csr_array((np.ones(len(of)), order, np.append(first_link, len(of))), (len(found), len(of)))
+            by_image[found] += sums @ rows.reshape(len(rows), -1)
         shared += local[:, pair:, pair:].sum(axis=0)
         gradient_shared += gradient[:, pair:].sum(axis=0)
     poses, coupling, gradient_poses = np.split(by_image.reshape(count, size, -1), [size, size + others], axis=2)

@@ -14,6 +14,7 @@ from examples.worlds.compositing_scenes import as_image, place_images, render, s
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import gain_compensation, overlap_cells, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
+from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.gain_fit import Differences, fit_gain_and_vignetting
 from rdstitch.compositing.overlap_cells import compare_overlaps
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
@@ -125,6 +126,21 @@ def test_nothing_but_full_scale_becomes_full_scale(fields: FloatArray) -> None:
     below = clipped < 0.74 * 65535
     assert np.abs(compressed[below].astype(int) - clipped[below]).max() <= 1
     np.testing.assert_array_equal(compressed[..., 2], clipped[..., 2])
+
+
+@pytest.mark.parametrize("black", [0.2, 0.8])
+def test_most_of_a_scene_may_be_black(black: float) -> None:
+    """As of stars, fluorescence or X-rays; what is lit stays as bright as it was."""
+    lens = Camera((64, 48), distortion=0.0, focal=64.0)
+    ground = np.random.default_rng(2).integers(40, 160, (48, 96, 3)) * np.ones((1, 96, 1), np.int64)
+    ground[: round(48 * black)] = 0
+    frames = [ground[:, :64].astype(np.uint8), (1.5 * ground[:, 32:]).astype(np.uint8)]
+    places = np.array([[[1, 0, x / lens.scale], [0, 1, 0], [0, 0, 1]] for x in (0.0, 32.0)])
+    images = place_images([partial(as_image, frame) for frame in frames], [lens] * 2, places)
+    survey = survey_images(ImageReader(images), images, plan_canvas([lens] * 2, places))
+    gains = np.exp(estimate_exposure(survey, images, "gain").log_gain)
+    np.testing.assert_allclose(gains[1] / gains[0], 1.5, rtol=0.03)
+    assert 0.75 < gains[0].mean() < 0.95
 
 
 def test_an_image_without_overlap_has_the_gain_that_its_camera_wrote_down() -> None:

@@ -11,15 +11,10 @@ from examples.worlds.turns import TurningSequence, camera_rotations, turning_seq
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
 from rdstitch.compositing.canvas import plan_canvas
-from rdstitch.compositing.near_part import NearPart, near_parts
-from rdstitch.compositing.panorama_canvas import (
-    center_of_view,
-    choose_projection,
-    field_of_view,
-    photo_sphere_xmp,
-    seen_directions,
-)
+from rdstitch.compositing.panorama_canvas import center_of_view, choose_projection, field_of_view, seen_directions
+from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.projection import PLANE, PROJECTIONS
+from rdstitch.compositing.visible_region import VisibleRegion, visible_regions
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.geometry.camera import Camera
@@ -256,9 +251,9 @@ def _image_to_plane(tilt: float) -> FloatArray:
     return np.asarray(np.linalg.inv(np.diag([FOCAL, FOCAL, 1.0]) @ rotation_from_tilt((tilt, 0.0))), dtype=np.float64)
 
 
-def _near(tilt: float, max_stretch: float = 3.0) -> NearPart | None:
+def _near(tilt: float, max_stretch: float = 3.0) -> VisibleRegion | None:
     resolution = FOCAL * NEAR.scale  # of the image straight from above
-    return near_parts([NEAR], [_image_to_plane(tilt)], resolution, max_stretch)[0]
+    return visible_regions([NEAR], [_image_to_plane(tilt)], resolution, max_stretch)[0]
 
 
 @pytest.mark.parametrize("tilt", [0.9, 1.2])

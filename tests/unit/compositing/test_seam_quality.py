@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from rdstitch.compositing.boxes import Box, Float32Array
-from rdstitch.compositing.seam_quality import SeamBreak, SeamQuality, SeamTile, likeness, measure_seams
+from rdstitch.compositing.likeness import likeness
+from rdstitch.compositing.seam_quality import SeamBreak, SeamQuality, SeamTile, measure_seams
 from rdstitch.synthetic.textures import ground
 
 SIZE = (400, 300)

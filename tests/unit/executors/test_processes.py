@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rdstitch.errors import ArgumentError, InputError, LimitError
-from rdstitch.executors import ProcessExecutor, in_order, open_executor
+from rdstitch.executors import ProcessExecutor, in_order, open_executor, processes
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
@@ -71,6 +71,18 @@ def test_a_worker_that_dies_costs_its_task_only(tmp_path: Path) -> None:
     with ProcessExecutor(1) as executor:
         with pytest.raises(LimitError, match="worker process was ended"):
             executor.submit(tasks.die, signal.SIGKILL).result()
+        assert executor.submit(tasks.square, 3).result() == 9
+
+
+def test_a_worker_whose_pipes_another_thread_has_closed_is_no_failure_of_the_task(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with ProcessExecutor(1) as executor:
+        assert executor.submit(tasks.square, 2).result() == 4
+        ended, start = executor._workers[0], ProcessExecutor._worker
+        processes._end(ended)
+        given = iter([ended])
+        monkeypatch.setattr(ProcessExecutor, "_worker", lambda self: next(given, None) or start(self))
         assert executor.submit(tasks.square, 3).result() == 9
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.frame import Frame
-from rdstitch.inputs.rosbag import _grey_of_compressed
+from rdstitch.inputs.rosbag import _eight_bits, _grey_of_compressed
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
 from tests.videos import write_video
@@ -143,11 +143,18 @@ def test_compressed_images_are_decoded() -> None:
         assert np.abs(found.astype(int) - samples).max() <= off
 
 
-def test_damaged_images_are_black_or_what_is_left_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
+def test_of_a_deep_image_eight_bits_are_the_same_at_any_exposure() -> None:
+    dark, bright = (_eight_bits((SMOOTH >> by).astype(np.uint16)) for by in (6, 2))
+    assert dark.max() == bright.max() == 255
+    assert np.abs(dark.astype(int) - bright).max() <= 2
+    assert not _eight_bits(np.zeros((8, 8), np.uint16)).any()
+
+
+def test_damaged_images_are_none_or_what_is_left_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
     for suffix in (".jpg", ".png"):
         data = cv2.imencode(suffix, (SMOOTH >> 8).astype(np.uint8))[1].copy()
         _grey_of_compressed(data[: len(data) // 2])
         data[len(data) // 2 : len(data) // 2 + 9] = 7
         _grey_of_compressed(data)
-    assert (_grey_of_compressed(np.frombuffer(b"no image", np.uint8)) == 0).all()
+    assert _grey_of_compressed(np.frombuffer(b"no image", np.uint8)) is None
     assert capfd.readouterr().err == ""

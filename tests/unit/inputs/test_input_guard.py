@@ -17,9 +17,9 @@ from PIL import ExifTags, Image
 from rdstitch.errors import ArgumentError, InputError, LimitError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs import source as sources
-from rdstitch.inputs.arrivals import open_arrivals
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.frame_stream import open_frame_stream
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import Metadata, write_image
@@ -212,7 +212,7 @@ def test_what_is_in_a_folder_comes_in_natural_order_but_for_what_rdstitch_wrote(
     for name in ("f10.png", "f9.png", ".hidden.png", "notes.txt", "out.png"):
         _arriving(tmp_path / name) if name.endswith("png") else (tmp_path / name).write_text("")
     (tmp_path / "out.png.json").write_text('{"format": "rdstitch sidecar", "output": {"file": "out.png"}}')
-    arrivals = open_arrivals(tmp_path, frames_folder=_nowhere, idle=0.5)
+    arrivals = open_frame_stream(tmp_path, frames_folder=_nowhere, idle=0.5)
     assert _names(iter(arrivals)) == ["f9.png", "f10.png"]
     assert arrivals.inputs == [str(tmp_path)]
 
@@ -222,11 +222,11 @@ def test_names_that_do_not_come_are_waited_for_no_longer_than_that() -> None:
     try:
         os.write(writing, b"one.png\n\n")
         stream = os.fdopen(reading, encoding="utf-8", closefd=False)
-        assert _names(iter(open_arrivals("-", frames_folder=_nowhere, names=stream, idle=0.1))) == ["one.png"]
+        assert _names(iter(open_frame_stream("-", frames_folder=_nowhere, names=stream, idle=0.1))) == ["one.png"]
     finally:
         os.close(writing)
     with pytest.raises(ArgumentError, match="no list"):
-        open_arrivals("-", frames_folder=_nowhere)
+        open_frame_stream("-", frames_folder=_nowhere)
 
 
 @pytest.fixture
@@ -236,7 +236,7 @@ def video(tmp_path: Path) -> Path:
 
 
 def test_every_nth_frame_of_a_video_with_its_number_and_time(video: Path) -> None:
-    arrivals = open_arrivals(video, frames_folder=_nowhere, every=2)
+    arrivals = open_frame_stream(video, frames_folder=_nowhere, every=2)
     frames = list(arrivals)
     assert [frame.number for frame in frames] == [0, 2, 4]
     assert [frame.timestamp for frame in frames] == pytest.approx([0.0, 0.4, 0.8])
@@ -249,7 +249,7 @@ def test_every_nth_frame_of_a_video_with_its_number_and_time(video: Path) -> Non
 def test_frames_of_a_stream_are_kept_since_they_come_only_once(video: Path, tmp_path: Path) -> None:
     folder = tmp_path / "kept"
     folder.mkdir()
-    arrivals = open_arrivals(f"file://{video}", frames_folder=lambda: folder)
+    arrivals = open_frame_stream(f"file://{video}", frames_folder=lambda: folder)
     frames = list(arrivals)
     if not frames:
         pytest.skip("this OpenCV opens no addresses")
@@ -261,17 +261,17 @@ def test_frames_of_a_stream_are_kept_since_they_come_only_once(video: Path, tmp_
 
 def test_what_cannot_be_followed_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be followed"):
-        open_arrivals(tmp_path / "nothing", frames_folder=_nowhere)
+        open_frame_stream(tmp_path / "nothing", frames_folder=_nowhere)
     with pytest.raises(InputError, match="cannot be followed"):
-        open_arrivals(_arriving(tmp_path / "image.png"), frames_folder=_nowhere)
+        open_frame_stream(_arriving(tmp_path / "image.png"), frames_folder=_nowhere)
     with pytest.raises(InputError, match="cannot open"):
-        next(iter(open_arrivals("tcp://127.0.0.1:9", frames_folder=_nowhere)))
+        next(iter(open_frame_stream("tcp://127.0.0.1:9", frames_folder=_nowhere)))
     empty = io.StringIO("")
-    assert list(open_arrivals("-", frames_folder=_nowhere, names=empty)) == []
+    assert list(open_frame_stream("-", frames_folder=_nowhere, names=empty)) == []
 
 
 @pytest.mark.parametrize("names", [b"a.jpg\nb\xff.jpg\r\n\nc.jpg", "a.jpg\nb\udcff.jpg\nc.jpg\n"])
 def test_names_need_not_be_utf8(names: bytes | str) -> None:
     stream = StringIO(names) if isinstance(names, str) else TextIOWrapper(BytesIO(names), encoding="utf-8")
-    arrivals = open_arrivals("-", frames_folder=Path, names=stream)
+    arrivals = open_frame_stream("-", frames_folder=Path, names=stream)
     assert [os.fsencode(frame.path) for frame in arrivals] == [b"a.jpg", b"b\xff.jpg", b"c.jpg"]

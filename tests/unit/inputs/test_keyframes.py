@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rdstitch.inputs.find import find_images
-from rdstitch.inputs.keyframes import Wanted, choose, keyframes, tracked, wanted_frames
+from rdstitch.inputs.keyframes import FrameSelection, keyframes, select_keyframes, tracked, wanted_frames
 from tests.videos import write_video
 
 _WIDTH, _HEIGHT = 160, 120
@@ -33,18 +33,18 @@ def _share(frames: list[int], places: list[float]) -> list[float]:
 
 def test_frames_in_a_row_share_enough_and_no_more_are_taken_than_that_needs() -> None:
     places = [8.0 * k for k in range(90)]
-    found = choose(tracked(_film(places)), 0.65)
+    found = select_keyframes(tracked(_film(places)), 0.65)
     assert found[0] == 0
     assert 0.62 < min(_share(found, places)) <= max(_share(found, places)[:-1]) < 0.75
     assert places[-1] - places[found[-1]] <= 0.05 * _WIDTH
     large = [frame.repeat(4, axis=0).repeat(4, axis=1) for frame in _film(places[:30])]
-    assert choose(tracked(large), 0.65)[:3] == pytest.approx(found[:3], abs=1)
+    assert select_keyframes(tracked(large), 0.65)[:3] == pytest.approx(found[:3], abs=1)
 
 
 def test_where_the_camera_turns_back_the_outermost_frame_is_taken() -> None:
     out = [4.0 * k for k in range(9)]
     places = [*out, *out[-2::-1], *(-x for x in out[1:])]
-    found = choose(tracked(_film(x + 200.0 for x in places)), 0.65)
+    found = select_keyframes(tracked(_film(x + 200.0 for x in places)), 0.65)
     assert max(places[k] for k in found) >= 32.0 - 0.03 * _WIDTH
     assert min(places[k] for k in found) <= -32.0 + 0.03 * _WIDTH
 
@@ -59,10 +59,10 @@ def test_what_stays_in_the_image_is_no_ground() -> None:
     frames = _film([4.0 * k for k in range(60)])
     body = np.asarray(np.random.default_rng(1).integers(0, 255, (70, _WIDTH)), dtype=np.uint8)
     body = np.asarray(cv2.GaussianBlur(body, (5, 5), 0), dtype=np.uint8)
-    bare = choose(tracked(frames), 0.65)
+    bare = select_keyframes(tracked(frames), 0.65)
     for frame in frames:
         frame[50:] = body
-    assert len(bare) <= len(choose(tracked(frames), 0.65)) <= 1.5 * len(bare)
+    assert len(bare) <= len(select_keyframes(tracked(frames), 0.65)) <= 1.5 * len(bare)
 
 
 def test_after_a_cut_a_new_track_begins() -> None:
@@ -76,10 +76,20 @@ def test_every_nth_frame_is_taken_unseen_and_what_was_passed_over_is_said() -> N
     wanted = wanted_frames(3, lambda: pytest.fail("nothing is to be decoded"))
     assert [k for k in range(8) if k in wanted] == [0, 3, 6]
     assert wanted.messages(Path("a.mp4")) == []
-    (message,) = Wanted(chosen=frozenset((0, 2)), total=5).messages(Path("a.mp4"))
+    (message,) = FrameSelection(chosen=frozenset((0, 2)), total=5).messages(Path("a.mp4"))
     assert "2 of 5 frames" in str(message)
     assert message.severity == "note"
-    assert Wanted(chosen=frozenset((0, 1)), total=2).messages(Path("a.mp4")) == []
+    assert FrameSelection(chosen=frozenset((0, 1)), total=2).messages(Path("a.mp4")) == []
+
+
+def test_a_frame_that_cannot_be_decoded_is_not_taken_and_changes_nothing_else() -> None:
+    frames = _film(8.0 * k for k in range(60))
+    whole = wanted_frames(None, lambda: frames[:-1])
+    assert wanted_frames(None, lambda: [*frames[:-1], None]) == whole
+    damaged = wanted_frames(None, lambda: [*frames[:20], None, *frames[20:]])
+    assert damaged.chosen is not None
+    assert 20 not in damaged.chosen
+    assert len(damaged.chosen) <= len(whole.chosen or ()) + 2
 
 
 def test_of_a_video_these_frames_are_written_unless_the_user_says_which(tmp_path: Path) -> None:

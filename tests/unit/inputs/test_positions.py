@@ -99,6 +99,15 @@ def test_projected_coordinates(tmp_path: Path, head: str) -> None:
     np.testing.assert_allclose(Crs(32734).project([two.latitude], [two.longitude])[0, 0], 268932.2996, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("latitude", "longitude"),
+    [("S33.85", "W 122.5"), ("S 33 51", "122°30'0″W"), ("33d 51m 0s S", "W122d30m0s"), ("\u221233.85", "-122.5")],
+)
+def test_the_side_may_stand_before_or_after(tmp_path: Path, latitude: str, longitude: str) -> None:
+    place = _read(tmp_path, f"name;lat;lon\na.jpg;{latitude};{longitude}\n")[0]
+    assert (place.latitude, place.longitude) == pytest.approx((-33.85, -122.5))
+
+
 GPX = """<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>
 <trkpt lat="10.0" lon="179.999"><ele>100</ele><time>2023-11-14T22:13:10Z</time></trkpt>
 <trkpt lat="10.002" lon="-179.999"><ele>120</ele><time>2023-11-14T23:13:30+01:00</time></trkpt>
@@ -136,6 +145,11 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
             'name,GPSLatitude,GPSLongitude\na.jpg,"48 deg 51\' 29.60""","2 deg 17\' 40.20"" W"\n',
             "does not say whether north or south, east or west",
         ),
+        (
+            "name,lat,lon\na.jpg,33.85 E,5 N\n",
+            "line 2: expected a latitude like 33.85, -33.85 or 33 51 S",
+        ),
+        ("name,lat,lon\na.jpg,33.85 S,5 O\n", "line 2: expected a longitude like"),
         ("name,lat,lon\na.jpg,48,8582,2,2945\n", "line 2: has 5 fields"),
     ],
 )

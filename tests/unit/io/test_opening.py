@@ -193,8 +193,23 @@ def test_damaged_files_are_named(tmp_path: Path, name: str) -> None:
 
 def test_of_an_image_in_two_formats_the_usual_one_is_taken(tmp_path: Path) -> None:
     _smooth().save(tmp_path / "a.jpg")
-    (tmp_path / "a.heic").write_bytes(b"the same")
-    assert [frame.path.name for frame in find_images([tmp_path]).frames] == ["a.jpg"]
+    (tmp_path / "A.CR2").write_bytes(b"the same")
+    (tmp_path / "notes.txt").touch()
+    found = find_images([tmp_path])
+    assert [frame.path.name for frame in found.frames] == ["a.jpg"]
+    versions, others = (message.text for message in found.messages)
+    assert versions.endswith("are raw or HEIC versions of images that are taken: A.CR2")
+    assert others.endswith("not taken for images: notes.txt")
+
+
+def test_the_limit_of_memory_knows_channels_and_depth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.png").write_bytes(cv2.imencode(".png", np.zeros((100, 100, 4), np.uint16))[1].tobytes())
+    monkeypatch.setenv("RDSTITCH_MAX_IMAGE_GB", "7e-5")
+    for read in (read_metadata, read_image):
+        with pytest.raises(InputError, match="100 x 100 pixels take"):
+            read(tmp_path / "a.png")
+    monkeypatch.setenv("RDSTITCH_MAX_IMAGE_GB", "9e-5")
+    assert read_image(tmp_path / "a.png").pixels.dtype == np.uint16
 
 
 def _dng(file: Path) -> Path:
@@ -251,7 +266,7 @@ def test_what_a_decoder_warns_of_reaches_the_host(tmp_path: Path, monkeypatch: p
         return 8
 
     Image.new("L", (8, 8)).save(tmp_path / "a.png")
-    monkeypatch.setattr("rdstitch.io.metadata._bit_depth", bit_depth)
+    monkeypatch.setattr("rdstitch.io.metadata.stored_bits", bit_depth)
     with pytest.warns(UserWarning, match="an odd file"):
         read_metadata(tmp_path / "a.png")
     with warnings.catch_warnings():

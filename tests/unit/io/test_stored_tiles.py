@@ -23,11 +23,13 @@ def _planes(*counts: int) -> NDArray[np.uint16]:
     return np.broadcast_to(numbers, (*counts, *SHAPE)).copy()
 
 
-def test_planes_of_a_hyperstack_are_found_by_channel_z_and_time(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unit", [b"um", b"\xb5m", b"\\u00B5m"])
+def test_planes_of_a_hyperstack_are_found_by_channel_z_and_time(tmp_path: Path, unit: bytes) -> None:
     file = tmp_path / "a.tif"
     tifffile.imwrite(
-        file, _planes(2, 3, 4), imagej=True, metadata={"axes": "TZCYX", "unit": "um"}, resolution=(2.0, 2.0)
+        file, _planes(2, 3, 4), imagej=True, metadata={"axes": "TZCYX", "unit": "X" * len(unit)}, resolution=(2.0, 2.0)
     )
+    file.write_bytes(file.read_bytes().replace(b"unit=" + b"X" * len(unit), b"unit=" + unit))
     (tile,) = stored_tiles([file])
     assert (tile.counts, tile.pixel_size) == ((4, 3, 2), 0.5)
     np.testing.assert_array_equal(tile.read(1, 1)[0][0, 0], [16, 17, 18, 19])

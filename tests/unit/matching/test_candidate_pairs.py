@@ -225,7 +225,7 @@ def test_chosen_features_keep_their_order_and_the_strongest_come_first(tmp_path:
     assert chosen.strongest(5).counts.tolist() == [3]
     assert store.strongest(4)[0].scale.tolist() == [0, 1, 2, 3]
     # What is chosen is part of the key.
-    item, cache = store.items[0], Cache(tmp_path)
+    item, cache = store.items[0], Cache.at(tmp_path)
     others = [item.take(np.arange(5)), item.take(np.arange(6))]
     assert len({entry.key(cache) for entry in (item, *others)}) == 3
     assert item.key(cache) == FeatureStore.of([_some_features(30, (640, 480))]).items[0].key(cache)

@@ -144,6 +144,9 @@ def test_written_images_are_the_frames(tmp_path: Path) -> None:
         np.testing.assert_array_equal(bgr[:, :, ::-1], frame)
     with pytest.raises(OutputError, match="cannot be written"):
         sequence.write(tmp_path / "missing")
+    for name in ("{}.jpg", "{}.unknown"):
+        with pytest.raises(OutputError, match="cannot hold images of 16 bits"):
+            sequence.write(tmp_path, name)
 
 
 LENS = Camera((320, 240), -0.25, focal=260.0)

@@ -45,7 +45,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def _recall(folder: Path, value: int) -> int:
     cache.software.cache_clear()
-    return Cache(folder).recall("stage", ("input",), lambda: value)
+    return Cache.at(folder).recall("stage", ("input",), lambda: value)
 
 
 def test_a_change_of_the_sources_makes_entries_void(tmp_path: Path, package: Path) -> None:
@@ -75,9 +75,9 @@ def test_of_several_results_only_those_that_are_missing_are_computed(tmp_path: P
 
         return cache.recall_many("stage", [(name,) for name in names], compute)
 
-    assert recalled(Cache(tmp_path), "ac") == ["A", "C"]
-    assert recalled(Cache(tmp_path), "abcd") == ["A", "B", "C", "D"]
-    assert recalled(Cache(tmp_path), "abcd") == ["A", "B", "C", "D"]
+    assert recalled(Cache.at(tmp_path), "ac") == ["A", "C"]
+    assert recalled(Cache.at(tmp_path), "abcd") == ["A", "B", "C", "D"]
+    assert recalled(Cache.at(tmp_path), "abcd") == ["A", "B", "C", "D"]
     assert recalled(Cache(), "ab") == ["A", "B"]
     assert asked == [[0, 1], [1, 3], [0, 1]]
 
@@ -102,7 +102,7 @@ def test_an_entry_that_is_a_pipe_is_computed_again(tmp_path: Path, package: Path
 
 @pytest.mark.skipif(sys.platform == "win32", reason="nothing proves a process dead there")
 def test_abandoned_unfinished_files_are_removed(tmp_path: Path) -> None:
-    cache = Cache(tmp_path)
+    cache = Cache.at(tmp_path)
     cache.recall("stage", (1,), lambda: 1)
     (entry,) = (file for file in tmp_path.rglob("*") if file.is_file())
     abandoned, fresh = (entry.with_name(f".{name}.part") for name in ("abandoned", "fresh"))
@@ -139,7 +139,7 @@ def _nothing_recent(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _kept(folder: Path, name: str, value: float) -> Stored[tuple[float]]:
-    return Cache(folder).stored("stage", (name,), lambda: (value,))
+    return Cache.at(folder).stored("stage", (name,), lambda: (value,))
 
 
 def test_what_was_kept_is_read_again(tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_an_entry_that_is_gone_is_named(tmp_path: Path, damage: str) -> None:
 
 
 def test_what_was_used_recently_stays_in_memory_within_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    entries = [Cache(tmp_path).stored("stage", (k,), lambda k=k: np.full(1000, k)) for k in range(4)]  # type: ignore[misc]
+    entries = [Cache.at(tmp_path).stored("stage", (k,), lambda k=k: np.full(1000, k)) for k in range(4)]  # type: ignore[misc]
     monkeypatch.setattr(cache, "_recent", cache._RecentlyUsed(20_000))
     loaded = [entry.load() for entry in entries[:2]]
     assert all(entry.load() is value for entry, value in zip(entries[:2], loaded, strict=True))
@@ -280,6 +280,21 @@ class _Runs:
 
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         return os.system, ("true",)
+
+
+class _MakesAFolder:
+    """Would build a cache in a folder when it is read."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __reduce__(self) -> tuple[type[Cache], tuple[Path]]:
+        return Cache, (self._folder,)
+
+
+def test_what_is_read_makes_no_folder(tmp_path: Path) -> None:
+    assert unpack(pack(_MakesAFolder(tmp_path / "made"))) == Cache(tmp_path / "made")
+    assert not (tmp_path / "made").exists()
 
 
 @pytest.mark.parametrize("value", [_Runs(), open, Camera.distort, StitchOptions, np.load, [print], Cache])

@@ -15,7 +15,9 @@ import pytest
 
 from rdstitch.errors import InputError, OutputError
 from rdstitch.inputs.find import find_images
+from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.inputs.times import time_of
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
@@ -270,6 +272,22 @@ def test_what_a_caught_error_cut_short_is_not_published(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["b.txt"]
 
 
+def test_several_folders_are_outputs_of_one_folder_also_after_one_that_was_dropped(tmp_path: Path) -> None:
+    def write(outputs: Outputs, name: str, failing: bool = False) -> None:
+        with outputs.writing(tmp_path / name, is_folder=True) as folder:
+            (folder / name).write_text(name)
+            if failing:
+                raise ValueError
+
+    names = ("a.zarr", "b.zarr", "c_files", "c.zarr")
+    with Outputs(overwrite=False) as outputs:
+        for name in names:
+            with pytest.raises(ValueError):  # noqa: PT011
+                write(outputs, name, failing=True)
+            write(outputs, name)
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} == {*names, *(f"{n}/{n}" for n in names)}
+
+
 def test_of_two_outputs_in_one_place_neither_is_published(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path)
 
@@ -353,6 +371,13 @@ def test_an_image_is_fetched_once_each_time_it_is_read(flight: str, monkeypatch:
     monkeypatch.setattr(system, "open", counted)
     source.read()
     assert len(opened) == 1
+
+
+def test_times_at_a_url_are_read_again_when_they_have_changed(flight: str) -> None:
+    system = fsspec.filesystem("memory")
+    for time in (5.0, 60.0):
+        system.pipe("/flight/times.csv", f"name,timestamp\nf9.jpg,{time}\n".encode())
+        assert time_of(Frame(Path("f9.jpg")), f"{flight}/times.csv") == time
 
 
 def test_content_that_changes_during_the_run_is_noticed(flight: str) -> None:

@@ -24,13 +24,13 @@ from rdstitch.verification.self_similarity import Ambiguity
 from rdstitch.verification.verdict import _limit_warnings, _outvoted, failures_of_matches
 from tests.registrations import CAMERA, evidence, registration, source
 
-FLAT = evidence(registration(), alike=0.8)
+FLAT = evidence(registration(), alike_fraction=0.8)
 
 
 def _depth(alike: float, purpose: Purpose = Purpose.TRAJECTORY, size: float = 0.0, **alignment: Any) -> ResultEvidence:
     """Of images whose errors neighbours share."""
     relief = replace(registration().alignment.relief, found=True, size=size)
-    return evidence(registration(relief=relief, **alignment), purpose, alike=alike, checked=[])
+    return evidence(registration(relief=relief, **alignment), purpose, alike_fraction=alike, checked=[])
 
 
 @pytest.mark.parametrize(
@@ -103,9 +103,9 @@ def test_every_kind_has_a_sentence_that_its_rules_find_all_words_for() -> None:
         evidence(
             registration(links=_fitting(0.55), keypoints=(9, 9, 9)), checked=checked, ambiguous={(0, 1): checked[0]}
         ),
-        evidence(registration(rms=4.0), alike=0.1, checked=[ahead]),
-        evidence(registration(rms=4.0, relief=rough, parameters=()), alike=0.9, checked=sampled),
-        evidence(registration(model="rotation", relief=rough), alike=0.1, checked=[]),
+        evidence(registration(rms=4.0), alike_fraction=0.1, checked=[ahead]),
+        evidence(registration(rms=4.0, relief=rough, parameters=()), alike_fraction=0.9, checked=sampled),
+        evidence(registration(model="rotation", relief=rough), alike_fraction=0.1, checked=[]),
         evidence(registration(mixed=TwoLenses(lenses, (-0.1, -0.4), certain=True), used=~lenses), checked=[]),
         evidence(registration(cameras), checked=[]),
         evidence(registration(zoomed), checked=[]),
@@ -238,7 +238,7 @@ LARGEST = 0.02 * 500.0  # pixels that relief explains, of images with a diagonal
 def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kind: Kind | None) -> None:
     ground = replace(registration().alignment.relief, found=relief is not None, size=relief or 0.0)
     cameras = (CAMERA, Camera((40, 30)), CAMERA)
-    found = evidence(registration(rms=rms, relief=ground, cameras=cameras), alike=alike)
+    found = evidence(registration(rms=rms, relief=ground, cameras=cameras), alike_fraction=alike)
     findings = list(rules._errors(found))
     assert [finding.kind for finding in findings] == ([] if kind is None else [kind])
     for finding in findings:

@@ -146,7 +146,7 @@ def test_stains_say_by_how_many_periods_an_image_is_off(periods: tuple[int, int]
     found = unique_shifts(placed, [(0, 4)])[0, 4]
     assert found.shift * LENS.scale == pytest.approx([-put[0], -put[1]], abs=1.0)
     assert found.share > 0.9
-    assert found.rival < found.matched / 3.0
+    assert found.matched_elsewhere < found.matched / 3.0
 
 
 def test_one_stain_is_enough_none_or_one_in_one_image_is_not_and_dust_on_the_lens_is_no_evidence() -> None:

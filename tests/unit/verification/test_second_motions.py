@@ -17,10 +17,10 @@ from rdstitch.io import DecodedImage, Metadata
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic.textures import ground
-from rdstitch.verification import rival_planes
+from rdstitch.verification import second_motions
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey, overlap_agreement
-from rdstitch.verification.rival_planes import _least_needed, fills_at_most, planes_of_pairs
+from rdstitch.verification.second_motions import _least_needed, fills_at_most, planes_of_pairs
 from tests.registrations import registration, source
 
 SIZE = (400, 300)
@@ -101,7 +101,7 @@ def test_pairs_are_compared_by_threads_and_each_image_is_read_once(monkeypatch: 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda k: images.placed(k % 2, LENS, np.eye(3)), range(16)))
     assert sorted(reads) == ["a.png", "b.png"]
-    monkeypatch.setattr(rival_planes, "overlap_agreement", compared)
+    monkeypatch.setattr(second_motions, "overlap_agreement", compared)
     pairs = (_pair(0, 1, 40, 60), _pair(1, 2, 40, 25))
     assert planes_of_pairs(_registered(monkeypatch, _images(0.35, 3), [0, 0, 0], pairs), 3.0, threads=2) is not None
 

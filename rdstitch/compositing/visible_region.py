@@ -26,7 +26,7 @@ _ROWS = 64  # rows of a mask that are computed at a time, so that they stay in t
 
 
 @dataclass(frozen=True, eq=False)
-class NearPart:
+class VisibleRegion:
     """The part of an image that is drawn."""
 
     camera: Camera
@@ -89,15 +89,15 @@ class NearPart:
         return crossing
 
 
-def near_parts(
+def visible_regions(
     cameras: Sequence[Camera], homographies: Sequence[FloatArray], resolution: float, max_stretch: float
-) -> list[NearPart | None]:
+) -> list[VisibleRegion | None]:
     """What of each image is drawn; None for all of it.
 
     ``homographies`` lead to the plane, with positive third coordinates in front of the camera; at ``resolution`` canvas
     pixels per unit of it the reference image keeps its size.
     """
-    parts: list[NearPart | None] = []
+    parts: list[VisibleRegion | None] = []
     if max_stretch == np.inf:
         return [None] * len(cameras)
     for camera, matrix in zip(cameras, homographies, strict=True):
@@ -107,7 +107,7 @@ def near_parts(
         if not len(beyond):
             parts.append(None)
             continue
-        parts.append(NearPart(camera, matrix[2] - np.array([0.0, 0.0, max(float(beyond.max()), 0.0)])))
+        parts.append(VisibleRegion(camera, matrix[2] - np.array([0.0, 0.0, max(float(beyond.max()), 0.0)])))
     return parts
 
 

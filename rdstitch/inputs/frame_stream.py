@@ -20,11 +20,12 @@ from rdstitch.inputs.rosbag import images_in_bag, is_bag
 from rdstitch.io.video import VIDEO_SUFFIXES, opened_capture, write_frame
 
 _POLL_SECONDS = 0.2
+_REOPEN_SECONDS = 5.0  # without a frame, after which a camera or stream is opened again
 _MAX_PENDING = 256  # names that are read ahead
 
 
 @dataclass(frozen=True)
-class Arrivals:
+class FrameStream:
     """Iterates over the frames of one source, each once it is complete."""
 
     frames: Iterator[Frame]
@@ -36,7 +37,7 @@ class Arrivals:
         return self.frames
 
 
-def open_arrivals(
+def open_frame_stream(
     source: str | Path,
     *,
     frames_folder: Callable[[], Path],
@@ -44,7 +45,7 @@ def open_arrivals(
     every: int = 1,
     idle: float | None = None,
     topic: str | None = None,
-) -> Arrivals:
+) -> FrameStream:
     """The frames of a folder, a video, a bag, a camera by its index, a stream, or of ``names``, one a line, for "-".
 
     They end with a video or bag, with the list of names, and after ``idle`` seconds without a new one; those of a
@@ -55,16 +56,16 @@ def open_arrivals(
     if name == "-":
         if names is None:
             raise ArgumentError("there is no list of names to follow")
-        return Arrivals(_of_names(names, idle, kept), kept)
+        return FrameStream(_of_names(names, idle, kept), kept)
     if is_bag(path):
-        return Arrivals(images_in_bag(path, frames_folder(), every, topic), [name])
+        return FrameStream(images_in_bag(path, frames_folder(), every, topic), [name])
     if path.is_dir():
         folder = GrowingFolder(path, idle)
-        return Arrivals(folder.frames(), [name], folder.comes_again)
+        return FrameStream(folder.frames(), [name], folder.comes_again)
     if path.suffix.lower() in VIDEO_SUFFIXES and path.exists():
-        return Arrivals(_of_video(path, every), [name])
+        return FrameStream(_of_video(path, every), [name])
     if name.isdecimal() or "://" in name or path.is_char_device():
-        return Arrivals(_of_stream(name, every, idle, frames_folder, kept), kept)
+        return FrameStream(_of_stream(name, every, idle, frames_folder, kept), kept)
     raise InputError(
         f"{name}: cannot be followed; name a folder, a video, the index of a camera or a stream, or - "
         "for names on standard input"
@@ -119,13 +120,19 @@ def _of_stream(
     stream: str, every: int, idle: float | None, folder: Callable[[], Path], kept: list[Named]
 ) -> Iterator[Frame]:
     """Every n-th frame of a camera or stream; kept as files too, since they come only once."""
-    with _capture(int(stream) if stream.isdecimal() else stream) as capture:
+    source = int(stream) if stream.isdecimal() else stream
+    with _capture(source) as capture:
         number, last = 0, time.monotonic()
+        opened, has_end = last, capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0  # a video behind a URL
         while True:
             if not capture.grab():
-                if idle is None or time.monotonic() - last >= idle:
+                now = time.monotonic()
+                if has_end if idle is None else now - last >= idle:
                     return
                 time.sleep(_POLL_SECONDS)
+                if not has_end and now - max(last, opened) >= _REOPEN_SECONDS:
+                    capture.open(source)
+                    opened = time.monotonic()
                 continue
             last, stamp = time.monotonic(), time.time()
             decoded, pixels = capture.retrieve() if number % every == 0 else (False, None)

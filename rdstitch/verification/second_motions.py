@@ -101,7 +101,7 @@ def second_motions(
 def fills_at_most(compared: Iterable[Agreement]) -> float:
     """Share of the images of some pairs that is not seen to contradict a motion, in [0, 1]."""
     agreements = list(compared)
-    return 1.0 - sum(each.unlike for each in agreements) / max(sum(each.in_all for each in agreements), 1)
+    return 1.0 - sum(each.unlike_cells for each in agreements) / max(sum(each.in_all for each in agreements), 1)
 
 
 def _no_plane(pair: PairRegistration) -> RadialHomography:

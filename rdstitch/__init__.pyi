@@ -1,0 +1,41 @@
+from rdstitch import errors as errors
+from rdstitch import solvers as solvers
+from rdstitch import synthetic as synthetic
+from rdstitch.alignment import Alignment as Alignment
+from rdstitch.alignment.trajectory import Trajectory as Trajectory
+from rdstitch.camera_files import load_camera as load_camera
+from rdstitch.camera_files import save_camera as save_camera
+from rdstitch.errors import RdstitchError as RdstitchError
+from rdstitch.export.layers import write_layers as write_layers
+from rdstitch.geometry.camera import Camera as Camera
+from rdstitch.geometry.radial_homography import RadialHomography as RadialHomography
+from rdstitch.options.apply_options import ApplyOptions as ApplyOptions
+from rdstitch.options.composite_options import CompositeOptions as CompositeOptions
+from rdstitch.options.feature_options import FeatureOptions as FeatureOptions
+from rdstitch.options.files_beside import FilesBeside as FilesBeside
+from rdstitch.options.stitch_options import StitchOptions as StitchOptions
+from rdstitch.options.tile_options import TileOptions as TileOptions
+from rdstitch.pipeline.apply_sidecar import apply as apply
+from rdstitch.pipeline.blocks import mosaic_blocks as mosaic_blocks
+from rdstitch.pipeline.composer import Composer as Composer
+from rdstitch.pipeline.doctor import Examination as Examination
+from rdstitch.pipeline.doctor import examine as examine
+from rdstitch.pipeline.follow import Tracker as Tracker
+from rdstitch.pipeline.recipes import calibrate as calibrate
+from rdstitch.pipeline.recipes import mosaic as mosaic
+from rdstitch.pipeline.recipes import pano as pano
+from rdstitch.pipeline.recipes import trajectory as trajectory
+from rdstitch.pipeline.stage_tiles import place_tiles as place_tiles
+from rdstitch.pipeline.stage_tiles import tiles as tiles
+from rdstitch.pipeline.undistort_images import undistort as undistort
+from rdstitch.report import write_report as write_report
+from rdstitch.results.messages import Message as Message
+from rdstitch.results.pose import FollowedPoses as FollowedPoses
+from rdstitch.results.pose import Pose as Pose
+from rdstitch.results.registration import Registration as Registration
+from rdstitch.results.stitch_result import StitchResult as StitchResult
+from rdstitch.robust import estimate_radial_homography as estimate_radial_homography
+from rdstitch.sidecar.recomposition import Recomposition as Recomposition
+
+__version__: str
+__all__: list[str]
