@@ -26,7 +26,6 @@ LARGE_RELIEF = 0.00075
 """Of an image's diagonal: lenses that one λ describes roughly leave less, flights over trees and houses more."""
 
 _MAX_SAMPLES = 200_000  # correspondences of which the agreement is measured
-_PARTNERS = 6  # of each inlier, at any distance
 
 _MIN_DISTANCE, _MAX_DISTANCE = 0.005, 0.25
 """Half diagonals between neighbours; nearer points are the same feature found twice."""
@@ -81,16 +80,6 @@ def neighbours(observations: Observations, inliers: BoolArray) -> tuple[IntArray
     has_neighbour = pairs.any(axis=1)
     nearest = neighbour[np.arange(len(spaced)), np.argmax(pairs, axis=1) + 1]
     return chosen[has_neighbour], chosen[nearest[has_neighbour]]
-
-
-def distant_pairs(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:
-    """Pairs of inliers of a link, of very many links of every n-th, at all distances, by the first of each."""
-    chosen = _sample(observations, inliers)
-    link = observations.link[chosen]
-    pairs = [(chosen[:-k], chosen[k:], link[:-k] == link[k:]) for k in range(1, _PARTNERS + 1)]
-    first, second = (np.concatenate([each[side][each[2]] for each in pairs]) for side in (0, 1))
-    order = np.argsort(first, kind="stable")
-    return first[order], second[order]
 
 
 def _sample(observations: Observations, inliers: BoolArray) -> IntArray:

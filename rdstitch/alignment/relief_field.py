@@ -1,16 +1,14 @@
 """What relief does to a lens: hills are laid under the images, and the adjustment answers them.
 
 Relief moves all points of a place together, in every image that shows it, and a part of that the parameters absorb:
-hills as wide as an overlap are fitted by its homography and by λ. What is left over shows how high and how wide the
-hills are, and by how much they can have moved λ: errors agree from one neighbour to the next, and over some distance.
-The answers to waves of all widths give both, the agreement that they leave at every distance, and how far they move λ.
-Hills of the widths that leave little are taken to be as steep as the others, as most ground roughly is (a power law;
-Mandelbrot 1975).
+hills as wide as an overlap are fitted by its homography and by λ. What is left over shows how steep the hills are, and
+by how much they can have moved λ: errors agree from one neighbour to the next. The answers to waves of all widths give
+both, the agreement that they leave, and how far they move λ. All widths are taken to be equally steep, as most ground
+roughly is (a power law; Mandelbrot 1975).
 """
 
 import math
 from functools import cached_property
-from itertools import pairwise, product
 
 import numpy as np
 
@@ -18,7 +16,7 @@ from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, B
 from rdstitch.alignment.least_squares.linear_response import Fields, LinearResponse
 from rdstitch.alignment.least_squares.link_equations import LinearizedErrors, split_lens
 from rdstitch.alignment.motion_models import LOG_HEIGHT, X, Y
-from rdstitch.alignment.noise import distant_pairs, neighbours
+from rdstitch.alignment.noise import neighbours
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.division_model import distort, undistort
 from rdstitch.geometry.radial_homography import inverses, project
@@ -128,12 +126,7 @@ _SHORTEST, _LONGEST = 0.5, 6.0
 """Wavelengths, in half diagonals of an image on the ground: what neighbours show, and what poses absorb whole."""
 
 _WAVES = 32  # waves, each as a sine and a cosine
-_BANDS = 4  # of wavelengths, about an octave each, whose waves are answered together
-
-_DISTANCES = (0.25, 0.5, 1.0, 2.0)
-"""Half diagonals: beyond those of neighbours, between which the agreement of errors is measured, too."""
-
-_FEWEST = 20  # pairs that say anything of a distance
+_BANDS = 4  # of waves that are answered together
 
 _NOISE_FIELDS = 16
 """Fields of independent errors that show what their absorption leaves of agreement between neighbours."""
@@ -154,20 +147,19 @@ class ReliefField:
         """Steps of the poses (N, D, K) and the shared parameters (S, K) by relief; ``x x'`` is its covariance."""
         normal = self.response.normal
         steps = [(np.zeros((*normal.gradient_poses.shape, 0)), np.zeros((len(normal.gradient_shared), 0)))]
-        agreement, std = self._agreement()
-        if len(agreement) and agreement[0] > 0.0:
-            steps.append(self._steps_by_waves(agreement, std))
+        if (agreement := self._agreement()) > 0.0:
+            steps.append(self._steps_by_waves(agreement))
         if not self._parallax.is_turn and len(self.response.adjuster.observations) > 1:
             steps.append(self._steps_by_curvature())
         poses, shared = zip(*steps, strict=True)
         return np.concatenate(poses, axis=-1), np.concatenate(shared, axis=-1)
 
-    def _steps_by_waves(self, agreement: FloatArray, std: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """By relief of the heights at which it leaves the agreement of errors that was found, at every distance."""
+    def _steps_by_waves(self, agreement: float) -> tuple[FloatArray, FloatArray]:
+        """By relief as steep as leaves the agreement of errors that was found, px²."""
         step = _WAVES // _BANDS
         answers = [self._answers(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
-        power = _spectrum(np.stack([left for left, *_ in answers], axis=1), agreement, std)
-        scale = np.repeat(np.sqrt(power / (2 * step)), 2 * step)
+        left = float(np.mean([left for left, *_ in answers]))
+        scale = math.sqrt(agreement / left / (2 * _WAVES)) if left > 0.0 else 0.0
         poses, shared = (np.concatenate([answer[k] for answer in answers], axis=-1) for k in (1, 2))
         return poses * scale, shared * scale
 
@@ -194,25 +186,21 @@ class ReliefField:
         field: FloatArray = parallax[:, :, None] * heights[:, None, :]
         return field
 
-    def _agreement(self) -> tuple[FloatArray, FloatArray]:
-        """Mean products (D,) of the errors at each distance, px², beyond what the absorption of independent errors
-        leaves (less than none, since the parameters absorb what they have in common), and their standard deviations.
+    def _agreement(self) -> float:
+        """Mean product of the errors of neighbours, px², beyond what the absorption of independent errors leaves: less
+        than none, since the parameters absorb what they have in common. 0 where there is none.
         """
-        pairs = self._pairs
-        if not pairs:
-            return np.zeros(0), np.zeros(0)
+        first, second = self._pairs
+        if not len(first):
+            return 0.0
         o, errors = self.response.adjuster.observations, self._errors
-        power = float((errors[np.unique(np.concatenate(pairs[0]))] ** 2).mean())
-        independent = power * self._answers(_independent, _NOISE_FIELDS)[0]
-        agreement, std = np.empty(len(pairs)), np.empty(len(pairs))
-        for k, (first, second) in enumerate(pairs):
-            products = np.einsum("mi,mi->m", errors[first], errors[second])
-            mean = float(products.mean())
-            # Errors of a link depend on each other; of one link alone that does not show.
-            by_link = np.bincount(o.link[first], products - mean, len(o))
-            scatter = max((by_link**2).sum(), ((products - mean) ** 2).sum())
-            agreement[k], std[k] = mean - independent[k], np.sqrt(scatter) / len(first)
-        return agreement, std
+        products = np.einsum("mi,mi->m", errors[first], errors[second])
+        off, power = products - products.mean(), float((errors[np.unique(self._pairs)] ** 2).mean())
+        found = float(products.mean()) - power * self._answers(_independent, _NOISE_FIELDS)[0]
+        # Errors of a link depend on each other; of one link alone that does not show.
+        variance = max((np.bincount(o.link[first], off, len(o)) ** 2).sum(), (off**2).sum()) / len(first) ** 2
+        # Less what chance makes of it: the positive part of James and Stein's estimate.
+        return max(found - float(variance) / found, 0.0) if found > 0.0 else 0.0
 
     @cached_property
     def _errors(self) -> FloatArray:
@@ -225,18 +213,17 @@ class ReliefField:
             [part.errors + self.response.changes(part, *step)[..., 0] for part in self.response.parts()]
         )
 
-    def _answers(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Agreement (D,) at each distance, px², that fields leave in the mean, and the steps that answer each,
-        (N, D, C) and (S, C).
+    def _answers(self, fields: Fields, columns: int) -> tuple[float, FloatArray, FloatArray]:
+        """Agreement of neighbours, px², that fields leave in the mean, and the steps that answer each, (N, D, C) and
+        (S, C).
         """
         poses, shared = self.response.steps_of(fields, columns)
-        agreement = np.zeros(len(self._pairs))
+        (first, second), agreement = self._pairs, 0.0
         for part in self.response.parts():
             left = fields(part) + self.response.changes(part, poses, shared)
-            for k, (first, second) in enumerate(self._pairs):
-                chosen = slice(*np.searchsorted(first, [part.rows.start, part.rows.stop]).tolist())
-                a, b = (left[rows[chosen] - part.rows.start] for rows in (first, second))
-                agreement[k] += float(np.einsum("mic,mic->", a, b)) / (len(first) * columns)
+            chosen = slice(*np.searchsorted(first, [part.rows.start, part.rows.stop]).tolist())
+            a, b = (left[rows[chosen] - part.rows.start] for rows in (first, second))
+            agreement += float(np.einsum("mic,mic->", a, b)) / (len(first) * columns)
         return agreement, poses, shared
 
     def _waves(self, start: int, count: int) -> Fields:
@@ -260,39 +247,11 @@ class ReliefField:
         return Parallax(self.response.adjuster, self.response.adjusted)
 
     @cached_property
-    def _pairs(self) -> list[tuple[IntArray, IntArray]]:
-        """Pairs of inliers of a link, by the first of each: neighbours, and those at each of the greater distances."""
-        adjusted, o = self.response.adjusted, self.response.adjuster.observations
-        inliers = adjusted.inliers
-        nearest = np.unique(np.sort(np.stack(neighbours(o, inliers)), axis=0), axis=1)
-        if not nearest.size:
-            return []
-        first, second = distant_pairs(o, inliers)
-        distance = np.linalg.norm(o.points1[first] - o.points1[second], axis=1)
-        result = [(nearest[0], nearest[1])]
-        for low, high in pairwise(_DISTANCES):
-            chosen = (low <= distance) & (distance < high)
-            if chosen.sum() >= _FEWEST:
-                result.append((first[chosen], second[chosen]))
-        return result
-
-
-def _spectrum(left: FloatArray, agreement: FloatArray, std: FloatArray) -> FloatArray:
-    """Mean squares (B,) of the heights of the bands of waves, in those of waves that are equally steep.
-
-    By the agreement at each distance that each band leaves (D, B), what was found (D,), and its standard deviation.
-    """
-    bands = left.shape[1]
-    if agreement[0] <= std[0] or left[0].mean() <= 0.0:
-        return np.zeros(bands)
-    # Less what chance makes of it: the positive part of James and Stein's estimate.
-    steep = float((agreement[0] - std[0] ** 2 / agreement[0]) / left[0].mean())
-    weight = 1.0 / np.maximum(std, 1e-12)
-    # What the errors do not show is as of equally steep waves: an octave may have next to nothing or twice as much.
-    equations = np.concatenate([left * (steep / bands) * weight[:, None], np.eye(bands)])
-    power = _nonnegative_solution(equations, np.concatenate([agreement * weight, np.ones(bands)]))
-    scaled: FloatArray = power * (steep / bands)
-    return scaled
+    def _pairs(self) -> IntArray:
+        """Inliers and neighbours of theirs in the same link, (2, P), by the first of each pair."""
+        pairs = neighbours(self.response.adjuster.observations, self.response.adjusted.inliers)
+        nearest: IntArray = np.unique(np.sort(np.stack(pairs), axis=0), axis=1)
+        return nearest
 
 
 def _variance_between(information: FloatArray, score: FloatArray) -> float:
@@ -313,21 +272,6 @@ def _variance_between(information: FloatArray, score: FloatArray) -> float:
             break
         variance += excess / float((squared * precision / grown**2).sum())
     return variance
-
-
-def _nonnegative_solution(equations: FloatArray, right: FloatArray) -> FloatArray:
-    """Least-squares solution (B,) of equations (M, B) with nothing below 0: the best of those with some of it 0.
-
-    To try them all is quick for the few bands; SciPy's optimizers would take longer to import than a pair to align.
-    """
-    best, min_cost = np.zeros(equations.shape[1]), np.inf
-    for chosen in product((False, True), repeat=len(best)):
-        solution = np.zeros(len(best))
-        solution[list(chosen)] = np.linalg.lstsq(equations[:, list(chosen)], right)[0]
-        cost = float(np.linalg.norm(equations @ solution - right))
-        if cost < min_cost and (solution >= 0.0).all():
-            best, min_cost = solution, cost
-    return best
 
 
 def _independent(part: LinearizedErrors) -> FloatArray:

@@ -34,8 +34,7 @@ __all__ = [
 
 Value = TypeVar("Value")
 
-CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt", ".xml")
-"""How names of camera files end, lower case."""
+CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt", ".xml")  # how names of camera files end, lower case
 
 
 def load_camera(path: str | Path, image_size: tuple[int, int] | None = None) -> Camera:

@@ -26,8 +26,7 @@ _MAX_ERROR = 0.1  # half diagonals: then the file is no lens of these images
 _RAYS, _SAMPLES, _REACH = 64, 1200, 8.0  # where other models are looked at: directions, steps, half diagonals
 _RESOLVED = 1.0 / 32.0  # pixels: what OpenCV resamples images to
 
-CLOSE = 0.1
-"""Pixels: a model that is nowhere farther from a lens needs no better one in its place."""
+CLOSE = 0.1  # pixels: a model that is nowhere farther from a lens needs no better one in its place
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,8 @@ from rdstitch.compositing.overlap_cells import Cells
 from rdstitch.geometry.conjugate_gradients import conjugate_gradients
 from rdstitch.system.late_imports import sparse
 
-VISIBLE = 0.004
-"""Log units, a grey level of a light sample: differences below are as good as none."""
-
-DECIMALS = 5
-"""Of solutions, that are kept: far below a grey level."""
-
+VISIBLE = 0.004  # log units, a grey level of a light sample: differences below are as good as none
+DECIMALS = 5  # of solutions, that are kept: far below a grey level
 _TUKEY = 3.0  # standard deviations from which on an error counts for nothing
 # The mode of an overlap is sought with this share of its cells: the rest may be other content. Of normal errors, this
 # share lies within so many standard deviations.

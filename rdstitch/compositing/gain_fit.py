@@ -13,8 +13,7 @@ from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.late_imports import sparse
 
-MIN_RELATIVE_GAIN = 0.05
-"""A model with more freedom must explain the data better by this share to be taken."""
+MIN_RELATIVE_GAIN = 0.05  # a model with more freedom must explain the data better by this share to be taken
 
 # How well the gains of two images can explain their overlap, and how far gains stray (log units): keeps long chains
 # from drifting. The last where the camera has written its exposure down: tone curves and apertures are not exact.

@@ -9,9 +9,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.system.dataclasses import dataclass
 
-LATTICE_STEPS = (32, 16, 8, 4, 2, 1)
-"""Spacings of lattices, canvas pixels; all have the nodes of the first."""
-
+LATTICE_STEPS = (32, 16, 8, 4, 2, 1)  # spacings of lattices, canvas pixels; all have the nodes of the first
 _NOWHERE = np.float32(-1e6)
 
 

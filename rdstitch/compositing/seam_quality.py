@@ -19,9 +19,7 @@ from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.system.late_imports import csgraph, sparse, spatial
 
-DIAGONAL = 1000.0
-"""Pixels of an image's diagonal at which seams are looked at: about what a screen shows of it."""
-
+DIAGONAL = 1000.0  # pixels of an image's diagonal at which seams are looked at: about what a screen shows of it
 _HALF, _REACH, _STEP = 12, 16, 8  # half a window, how far it is searched for, and how far windows are apart
 _BORDER = 2  # pixels on either side of a seam at which a difference shows
 # Of the range of grey levels: standard deviation in a window that has texture, and of a difference that is seen.

@@ -16,9 +16,7 @@ from rdstitch.arrays import BoolArray
 from rdstitch.compositing.boxes import Float32Array
 from rdstitch.io.reduction import mean_of_channels
 
-MIN_IMAGES = 4
-"""Fewer may show the same by chance."""
-
+MIN_IMAGES = 4  # fewer may show the same by chance
 _SAME = 0.02  # of the images' contrast, up to which levels are the same
 _CONTRAST = (0.1, 99.9)  # percentiles
 _MIN_AREA = 0.005  # of the image, for a region to count

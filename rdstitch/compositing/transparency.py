@@ -12,12 +12,8 @@ from numpy.typing import NDArray
 
 BoolImage = NDArray[np.bool_]
 
-OPAQUE = 65535
-"""Opacity of what is far from all transparent pixels."""
-
-OPACITY_BYTES = 2
-"""Bytes of a pixel's opacity."""
-
+OPAQUE = 65535  # opacity of what is far from all transparent pixels
+OPACITY_BYTES = 2  # bytes of a pixel's opacity
 _ROWS = 256
 # How far, pixels, samples are certainly those of the nearest opaque pixel: blending reaches so far at an image's own
 # scale. Where it reaches farther, these weigh next to nothing, and are of an opaque pixel all the same.

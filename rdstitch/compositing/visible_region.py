@@ -16,9 +16,7 @@ from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.io.read import DecodedImage
 from rdstitch.system.dataclasses import dataclass, replace
 
-PROBES = 33
-"""Points of a grid over the image, and along its outline, a side, at which the stretch is measured."""
-
+PROBES = 33  # points of a grid over the image, and along its outline, a side, at which the stretch is measured
 POINTS_PER_SIDE = 64
 """Of an outline: straight sides are curved after undistortion; so the extremes are within 0.02 pixels on 4000."""
 

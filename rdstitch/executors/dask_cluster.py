@@ -15,9 +15,7 @@ from rdstitch.system.cache import Cache, software
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
-LOCAL = "local"
-"""Address that stands for a cluster on this machine, started for one run."""
-
+LOCAL = "local"  # address that stands for a cluster on this machine, started for one run
 _PATIENCE, _START = 5, 60  # s, for the scheduler to answer, and for a first worker
 
 

@@ -5,9 +5,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.system.dataclasses import dataclass, field
 
-DELAYS = np.linspace(-0.3, 0.3, 61)
-"""Seconds by which a sensor's times may be later than those of the images."""
-
+DELAYS = np.linspace(-0.3, 0.3, 61)  # seconds by which a sensor's times may be later than those of the images
 DELAY_STD = 0.05
 """Seconds: what is to be expected of that; buses and drivers of IMUs take milliseconds, queues tenths of a second."""
 

@@ -3,11 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-OPAQUE = 255
-"""Alpha of what is there."""
-
-ROWS_AT_A_TIME = 128
-"""Rows that are converted at once, so that no second image is in memory."""
+OPAQUE = 255  # alpha of what is there
+ROWS_AT_A_TIME = 128  # rows that are converted at once, so that no second image is in memory
 
 
 def as_alpha(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -23,9 +23,7 @@ from rdstitch.io.tiff_order import put_in_order
 from rdstitch.io.tiff_tiles import BUFFER, TILE, deflated, encoded_tile, has_predictor, tiles_of
 from rdstitch.system.late_imports import tifffile
 
-MIN_OVERVIEW = 256
-"""Pixels along the longer side: smaller images need no overview."""
-
+MIN_OVERVIEW = 256  # pixels along the longer side: smaller images need no overview
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
 _BIGTIFF_FROM = 2**32 - 2**27
 _XMP, _GDAL_METADATA = 700, 42112

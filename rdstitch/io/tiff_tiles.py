@@ -8,12 +8,8 @@ from numpy.typing import NDArray
 
 from rdstitch.system.late_imports import imagecodecs
 
-TILE = 256
-"""Side, pixels."""
-
-BUFFER = 2**24
-"""Bytes of tiles that tifffile holds before it writes them; 256 MB by default."""
-
+TILE = 256  # side, pixels
+BUFFER = 2**24  # bytes of tiles that tifffile holds before it writes them; 256 MB by default
 _LEVEL = 1  # of 1 to 12: 2 takes 1.7 times as long and makes files 2 % smaller
 
 

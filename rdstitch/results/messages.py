@@ -7,8 +7,7 @@ from typing import Literal
 
 Severity = Literal["detail", "note", "warning", "left out", "failure"]
 
-MAX_NAMED = 3
-"""Images or pairs that one message names."""
+MAX_NAMED = 3  # images or pairs that one message names
 
 
 @dataclass(frozen=True)

@@ -179,8 +179,7 @@ class Cache:
         return "" if self.folder is None else digest(value)
 
 
-NO_CACHE = Cache()
-"""Keeps nothing."""
+NO_CACHE = Cache()  # keeps nothing
 
 
 @cache

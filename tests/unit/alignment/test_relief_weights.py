@@ -8,7 +8,6 @@ import pytest
 from examples.worlds.alignment_scenes import Scene, aligned, fitted, grid, scene
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.recipe import from_another_start
-from rdstitch.alignment.relief_field import _spectrum
 from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.choices import Purpose
@@ -105,24 +104,3 @@ def test_what_did_not_converge_is_tried_from_another_start() -> None:
     assert found.adjusted.converged
     assert found.adjusted.sigma == pytest.approx(fit.adjusted.sigma, rel=0.01)
     assert from_another_start(problem, fit) is fit
-
-
-LEFT = np.array([[1.0, 1.0, 1.0, 1.0], [0.2, 0.6, 0.9, 1.0], [-0.2, 0.1, 0.5, 0.9]])
-"""Agreement at three distances that four bands of waves leave, from short to long ones."""
-
-
-@pytest.mark.parametrize("band", range(4))
-def test_the_band_that_errors_agree_like_is_found(band: int) -> None:
-    power = _spectrum(LEFT, 0.5 * LEFT[:, band], np.full(3, 1e-4))
-    assert power[band] > 0.3
-    np.testing.assert_allclose(LEFT @ power, 0.5 * LEFT[:, band], atol=0.03)
-
-
-def test_where_errors_do_not_tell_waves_are_equally_steep() -> None:
-    power = _spectrum(LEFT, np.array([0.5, 0.3, 0.3]), np.array([1e-3, 1e3, 1e3]))
-    np.testing.assert_allclose(power, 0.125, rtol=1e-3)
-
-
-@pytest.mark.parametrize("nearest", [-0.1, -0.05, 0.05, 0.09])
-def test_what_chance_explains_is_no_hills(nearest: float) -> None:
-    np.testing.assert_array_equal(_spectrum(LEFT, np.array([nearest, 0.0, 0.0]), np.full(3, 0.1)), 0.0)
