@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
+from rdstitch.local_alignment.ground import fit_ground
 from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
 from rdstitch.system.dataclasses import dataclass
 
@@ -70,6 +72,7 @@ def align_locally(
     *,
     pairs: int | None = None,
     on_sphere: bool = False,
+    centers: FloatArray | None = None,
     edges: Callable[[list[int]], Iterable[FloatArray]] = lambda images: [np.empty((0, 2, 2)) for _ in images],
 ) -> LocalAlignment:
     """Smooth displacement fields that bring putative matches of all overlapping images together.
@@ -78,7 +81,9 @@ def align_locally(
     straight, and by 15 % of their distance or more; a number: always, with so many cells along the longer side of an
     image. ``homographies`` (N, 3, 3) are of undistorted coordinates, in half diagonals, to the plane, or to directions;
     ``pairs``: how many ``matches`` there are, where these come one by one; ``edges`` gives the ends (K, 2, 2) of
-    straight edges in each of some images, measured pixels.
+    straight edges in each of some images, measured pixels. ``centers`` (N, 3) are where cameras are known to be: below
+    each on the plane, and how high above it, in its unit. What heights of the ground explain is not left to fields of
+    single images then.
     """
     if choice != "auto" and choice < 1:
         raise ArgumentError(f"local alignment takes at least one cell, not {choice}")
@@ -95,19 +100,30 @@ def align_locally(
     coarse, fine = (max(2, min(cells, math.isqrt(nodes // len(cameras)))) for cells, nodes in (_COARSE, _FINE))
     cells = max(coarse, fine) if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
-    tested = placed.take(held_out)
-    candidates = list(_candidates(placed.take(~held_out), tested, images, min(coarse, cells), cells))
+    fitted, tested = placed.take(~held_out), placed.take(held_out)
+    worthwhile = (1.0 - _WORTHWHILE) * _seam_residual(tested.residual)
+    limit = worthwhile if choice == "auto" else math.inf
+
+    straight = cache(lambda: _long_edges(edges, cameras))
+    base = None
+    if centers is not None:
+        stiffness = Stiffness(cells, _SLOPES[0])
+        ground = fit_ground(fitted, images, images.scale * centers, stiffness).fields(images, stiffness)
+        seams = _seam_residual(tested.residual_with(ground.delivered, images))
+        if seams <= worthwhile and seams + _bend(ground.delivered, straight()) <= worthwhile:
+            base = ground
+    candidates = list(_candidates(fitted, tested, images, min(coarse, cells), cells, base))
     costs = [_seam_residual(candidate.residual) for candidate in candidates]
-    limit = (1.0 - _WORTHWHILE) * _seam_residual(tested.residual) if choice == "auto" else math.inf
     if min(costs) <= limit:
-        straight = _long_edges(edges, cameras)
-        costs = [cost + _bend(one.fields, straight) for cost, one in zip(costs, candidates, strict=True)]
+        costs = [cost + _bend(one.fields, straight()) for cost, one in zip(costs, candidates, strict=True)]
     best = candidates[int(np.argmin(costs))]
     before, after = HeldOut.of(tested.residual), HeldOut.of(best.residual)
     text = f"matches held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} pixels with it"
     if min(costs) > limit:
         return LocalAlignment((), f"not worth while; {text}", 0, before, after)
-    final = fit_fields(placed, images, best.fit.stiffness, best.fit)
+    if base is not None:
+        text += ", mostly by the height of the ground"
+    final = fit_fields(placed, images, best.fit.stiffness, best.fit, base)
     return LocalAlignment(final.delivered, text, cells, before, after)
 
 
@@ -118,13 +134,18 @@ class _Candidate(NamedTuple):
 
 
 def _candidates(
-    fitted: PlacedMatches, tested: PlacedMatches, images: ImagesOnSurface, coarse: int, cells: int
+    fitted: PlacedMatches,
+    tested: PlacedMatches,
+    images: ImagesOnSurface,
+    coarse: int,
+    cells: int,
+    base: PlacedFields | None = None,
 ) -> Iterator[_Candidate]:
-    """Fields of each slope; the freest on a coarse grid finds what is far off the plane, the others start there."""
-    fit = fit_fields(fitted, images, Stiffness(coarse, _SLOPES[0]))
+    """Fields of each slope on top of others; without, the freest on a coarse grid finds what is far off the plane."""
+    fit = base or fit_fields(fitted, images, Stiffness(coarse, _SLOPES[0]))
     for slope in _SLOPES:
-        if fit.stiffness != Stiffness(cells, slope):
-            fit = fit_fields(fitted, images, Stiffness(cells, slope), fit)
+        if base or fit.stiffness != Stiffness(cells, slope):
+            fit = fit_fields(fitted, images, Stiffness(cells, slope), fit, base)
         yield _Candidate(fit, fit.delivered, tested.residual_with(fit.delivered, images))
 
 

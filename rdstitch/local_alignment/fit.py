@@ -79,36 +79,54 @@ class PlacedFields:
         return DisplacementField.of(size, DisplacementField(size, displaced).levelled(_MAX_GRADIENT).values)
 
 
+class Reweighting:
+    """Weights of residuals from round to round of reweighted least squares.
+
+    The first rounds trust all that may be right, so that fits reach what is far from the plane: graduated
+    non-convexity (Blake and Zisserman, 1987). They are not needed where the fit is nearly known.
+    """
+
+    def __init__(self, matches: PlacedMatches, *, known: bool = False) -> None:
+        self._noise, self._sharp = matches.noise, int(known)
+        self._scale = 0.0 if known else float(np.percentile(np.linalg.norm(matches.residual, axis=1), _WIDEST))
+
+    def weights(self, left: FloatArray) -> FloatArray | None:
+        """Of matches (M,) by what is left of them (M, D); None after the last round."""
+        if self._sharp == _SHARP_ROUNDS:
+            return None
+        length = np.linalg.norm(left, axis=1)
+        sharpest = max(_MIN_SCALE, _ROBUST * min(float(np.median(length)), self._noise))
+        self._sharp += self._scale <= sharpest
+        scale = max(self._scale, sharpest)
+        self._scale = scale * _SHARPENED
+        weight: FloatArray = (1.0 / (1.0 + (length / scale) ** 2)) ** 2 / sharpest**2
+        return weight
+
+
 def fit_fields(
-    matches: PlacedMatches, images: ImagesOnSurface, stiffness: Stiffness, start: PlacedFields | None = None
+    matches: PlacedMatches,
+    images: ImagesOnSurface,
+    stiffness: Stiffness,
+    start: PlacedFields | None = None,
+    base: PlacedFields | None = None,
 ) -> PlacedFields:
     """Fields of all images, by reweighted least squares.
 
-    They start from fields that were fitted to much the same matches, or, without these, by graduated non-convexity
-    (Blake and Zisserman, 1987): the first rounds trust all that may be right, so that the fields reach what is far from
-    the plane.
+    They start from fields that were fitted to much the same matches, and it is their difference from ``base``, of as
+    many cells, that is stiff.
     """
     cameras = images.cameras
     shapes = tuple(grid_shape(camera.image_size, stiffness.cells) for camera in cameras)
     priors = [_smoothness(shape, camera.image_size, stiffness) for shape, camera in zip(shapes, cameras, strict=True)]
     prior, coarser = sparse.block_diag(priors, format="csr"), _coarser(shapes, cameras, stiffness.cells)
-    if start is None:
-        left, expected = matches.residual, matches.points.reshape(-1, 2)
-        scale = float(np.percentile(np.linalg.norm(left, axis=1), _WIDEST))
-    else:
-        left, expected, scale = *start.unexplained(matches), 0.0
-    sharp = 0 if start is None else 1
-    while sharp < _SHARP_ROUNDS:
-        length = np.linalg.norm(left, axis=1)
-        sharpest = max(_MIN_SCALE, _ROBUST * min(float(np.median(length)), matches.noise))
-        sharp += scale <= sharpest
-        scale = max(scale, sharpest)
-        weight = (1.0 / (1.0 + (length / scale) ** 2)) ** 2 / sharpest**2
+    known = np.zeros((prior.shape[0], matches.places.shape[-1])) if base is None else np.concatenate(base.values)
+    left, expected = (matches.residual, matches.points.reshape(-1, 2)) if start is None else start.unexplained(matches)
+    reweighting, solution = Reweighting(matches, known=start is not None), known
+    while (weight := reweighting.weights(left)) is not None:
         design = _design(matches, expected, cameras, shapes)
-        solution = _solve(design, weight, prior, matches.residual, coarser)
+        solution = known + _solve(design, weight, prior, matches.residual - design @ known, coarser)
         left = matches.residual - design @ solution
         expected = _expected(matches, images, design, solution)
-        scale *= _SHARPENED
     return PlacedFields(images, stiffness, shapes, tuple(np.split(solution, _first_nodes(shapes)[1:-1])))
 
 
@@ -127,8 +145,8 @@ def _solve(
     weighted = sparse.csr_array(design.T * weight)
     matrix, right = sparse.csr_array(weighted @ design + prior), weighted @ residual
     if coarser is None:
-        return np.asarray(_factorized(matrix).solve(right), dtype=np.float64)
-    factor, finest = _factorized(coarser.T @ matrix @ coarser), 1.0 / matrix.diagonal()[:, None]
+        return np.asarray(factorized(matrix).solve(right), dtype=np.float64)
+    factor, finest = factorized(coarser.T @ matrix @ coarser), 1.0 / matrix.diagonal()[:, None]
 
     def smooth(left: FloatArray) -> FloatArray:
         return np.asarray(coarser @ factor.solve(coarser.T @ left), dtype=np.float64)
@@ -136,7 +154,8 @@ def _solve(
     return conjugate_gradients(matrix, right, smooth(right), lambda left: finest * left + smooth(left), _TOLERANCE)
 
 
-def _factorized(matrix: Any) -> Any:
+def factorized(matrix: Any) -> Any:
+    """A sparse symmetric positive definite matrix, factorized."""
     symmetric: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     return sparse_linalg.splu(sparse.csc_array(matrix), **symmetric)
 
@@ -192,15 +211,19 @@ def _first_nodes(shapes: Shapes) -> NDArray[np.intp]:
 
 @lru_cache(maxsize=8)
 def _smoothness(shape: tuple[int, int], image_size: tuple[int, int], stiffness: Stiffness) -> "sparse.csr_array":
-    """Precision of one image's nodes, for residuals in units of their robust scale: a membrane and a thin plate."""
+    """Precision of one image's nodes."""
+    return smoothness(shape, max(image_size) / stiffness.cells, stiffness.slope, max(image_size))
+
+
+def smoothness(shape: tuple[int, ...], spacing: float, slope: float, image_side: float) -> "sparse.csr_array":
+    """Precision of the nodes of a grid, for residuals in units of their robust scale: a membrane and a thin plate."""
     rows, columns = shape
-    spacing, fade = max(image_size) / stiffness.cells, _FADE * max(image_size)
-    total: Any = sparse.eye_array(rows * columns) * (spacing / fade) ** 2
+    total: Any = sparse.eye_array(rows * columns) * (spacing / (_FADE * image_side)) ** 2
     for order in (1, 2):
         steps = [_differences(n, order) for n in (rows, columns)]
         for both in (sparse.kron(steps[0], sparse.eye_array(columns)), sparse.kron(sparse.eye_array(rows), steps[1])):
             total = total + both.T @ both
-    return sparse.csr_array(total / (stiffness.slope * spacing) ** 2)
+    return sparse.csr_array(total / (slope * spacing) ** 2)
 
 
 def _differences(count: int, order: int) -> Any:

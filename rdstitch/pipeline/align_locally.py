@@ -33,7 +33,7 @@ def align_registration_locally(
     if choice == "off":
         return no_local_alignment("switched off")
     alignment = registration.alignment
-    used = np.flatnonzero(alignment.used)
+    used, poses = np.flatnonzero(alignment.used), alignment.poses
     position = np.cumsum(alignment.used) - 1
     pairs = [
         pair
@@ -56,5 +56,6 @@ def align_registration_locally(
         choice,
         pairs=len(pairs),
         on_sphere=alignment.on_sphere,
+        centers=None if poses is None or alignment.on_sphere else np.column_stack([poses.position, poses.height])[used],
         edges=edges_of,
     )

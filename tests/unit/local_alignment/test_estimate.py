@@ -88,8 +88,10 @@ CAMERAS = [LENS] * 6
 
 
 @lru_cache
-def scene(kind: str | None, height: float = 0.05, seed: int = 1) -> Sequence:
-    poses = grid_poses(LENS, 3, 2, overlap=0.5, yaw=0.1, shift=0.05, seed=seed)
+def scene(
+    kind: str | None, height: float = 0.05, seed: int = 1, overlap: float = 0.5, tilt: tuple[float, float] = (0.0, 0.0)
+) -> Sequence:
+    poses = grid_poses(LENS, 3, 2, overlap=overlap, yaw=0.1, shift=0.05, tilt=tilt, seed=seed)
     relief = None if kind is None else lambda size: RELIEFS[kind](size, seed, height=height * 520.0)
     return sequence_over(lambda size: blank(size), LENS, poses, relief=relief)
 
@@ -105,6 +107,12 @@ def homographies(sequence: Sequence, level: float | None = None) -> FloatArray:
                         for s, (x, y) in zip(share, poses.position, strict=True)])  # fmt: skip
     scale = np.diag([LENS.scale / 520.0] * 2 + [1.0])
     return np.stack([lowered[k] @ np.linalg.inv(sequence.from_plane(k)) @ scale for k in range(len(poses))])
+
+
+def centers(sequence: Sequence) -> FloatArray:
+    """Where the cameras are above the plane at the mean height of the ground, texels."""
+    level = 0.0 if sequence.relief is None else float(sequence.relief.height.mean())
+    return np.column_stack([sequence.poses.position, sequence.poses.height - level])
 
 
 def matches(sequence: Sequence, noise: float = 0.2, wrong: float = 0.0, count: int = 400) -> list[Match]:
@@ -155,6 +163,26 @@ def test_what_relief_moves_apart_comes_together(kind: str, height: float, wrong:
     assert max(field.steepest for field in local.fields) <= 0.5
 
 
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.08, -0.05)])
+@pytest.mark.parametrize("height", [0.03, 0.1])
+def test_of_cameras_whose_places_are_known_images_show_the_ground_from_above(
+    tilt: tuple[float, float], height: float
+) -> None:
+    sequence = scene("slopes", height, overlap=0.6, tilt=tilt)
+    matrices, found = homographies(sequence), matches(sequence, wrong=0.1)
+    rng, errors = np.random.default_rng(6), {}
+    for name, known in (("plane", None), ("ground", centers(sequence))):
+        local = align_locally(found, CAMERAS, matrices, centers=known)
+        assert ("height of the ground" in local.reason) == (name == "ground")
+        off = []
+        for k in range(len(sequence)):
+            ground = sequence.to_ground(k, rng.uniform((40, 40), (599, 439), (300, 2)))
+            expected = from_plane(LENS, matrices[k], ground)
+            off.append(expected + local.fields[k](expected) - sequence.ground_to_image(k, ground))
+        errors[name] = np.linalg.norm(np.concatenate(off), axis=1)
+    assert np.nanmedian(errors["ground"]) < 0.15 * np.nanmedian(errors["plane"])
+
+
 @pytest.mark.parametrize("level", [0.0, -20.0])
 def test_what_lies_far_off_the_plane_is_reached(level: float) -> None:
     # The alignment is that of the valleys, or lower: most residuals are many times their noise.
@@ -177,7 +205,7 @@ def test_where_matches_are_dense_fields_are_as_fine_as_the_ground() -> None:
 @pytest.mark.parametrize("noise", [0.1, 1.0])
 def test_on_a_plane_nothing_is_moved(noise: float) -> None:
     sequence = scene(None)
-    local = align_locally(matches(sequence, noise), CAMERAS, homographies(sequence))
+    local = align_locally(matches(sequence, noise), CAMERAS, homographies(sequence), centers=centers(sequence))
     assert local.fields == ()
     assert "not worth while" in local.reason
     assert local.before is None  # what neighbours have nothing of in common needs no fit
