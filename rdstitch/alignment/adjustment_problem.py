@@ -27,11 +27,8 @@ POSE_TILT_SPREAD = math.radians(35.0)
 
 _TILT_SPREAD_START = math.radians(3.0)
 _MIN_TILT_SPREAD = math.radians(0.05)
-_ROUNDS, _SETTLED = 3, 0.1
-"""Of estimating scales of priors, and by how much they still change at the end."""
-
-_MISFIT = 1.5
-"""Times the errors of links on their own from which on those of a model are its own."""
+_ROUNDS, _SETTLED = 3, 0.1  # of estimating scales of priors, and by how much they still change at the end
+_MISFIT = 1.5  # times the errors of links on their own from which on those of a model are its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +97,6 @@ class Problem:
             camera_priors=self.camera_priors.of(images),
         )
         return part, images
-
-    def squared(self, model: MotionModel, parameters: Parameters) -> FloatArray:
-        """``|r|²`` of each correspondence (M,) at some parameters, px², whitened."""
-        return self.adjuster(model).squared(parameters)
 
     def refine(self, model: MotionModel, start: Parameters, tilt_spread: float | None = None) -> Fit:
         """Adjust a model from a given start, with the scales of its priors: the tilts' spread, the errors' dependence.

@@ -26,20 +26,11 @@ from rdstitch.robust.loss import ALIGNMENT_WIDTH
 from rdstitch.robust.posterior import MODEL_ERROR
 from rdstitch.system.dataclasses import dataclass, replace
 
-_STEP = 1e-5
-"""Of differences of λ, μ and ν."""
-
-_RADII = np.linspace(0.05, 1.0, 20)
-"""Half diagonals: where the lens is looked at, out to the corner."""
-
-_OVERRULED = 1.5
-"""Ratio from which on EXIF was wrong, not rounded or of another focus."""
-
-_WORTH_SAYING = 1.0
-"""Pixels that the corners of too few images may lie elsewhere, from which on that is said."""
-
-_CONFIDENT = 2.0
-"""Standard deviations within which the lens is taken to be known: 95 %."""
+_STEP = 1e-5  # of differences of λ, μ and ν
+_RADII = np.linspace(0.05, 1.0, 20)  # half diagonals: where the lens is looked at, out to the corner
+_OVERRULED = 1.5  # ratio from which on EXIF was wrong, not rounded or of another focus
+_WORTH_SAYING = 1.0  # pixels that the corners of too few images may lie elsewhere, from which on that is said
+_CONFIDENT = 2.0  # standard deviations within which the lens is taken to be known: 95 %
 
 
 def build_alignment(adjustment: AdjustedImages) -> Alignment:

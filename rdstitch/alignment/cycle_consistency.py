@@ -14,22 +14,19 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import are_homographies, inverses, transfer_jacobian
 from rdstitch.matching.links import spread_choice
 
-_PROBES = 6
-"""Points of a link that are transferred round each triangle."""
+_PROBES = 6  # points of a link that are transferred round each triangle
 
 _MAX_TRIANGLES, _TRIANGLES_PER_LINK = 20_000, 2
 """Of all links together that are looked at: six of each link, in the mean, where there are many."""
 
 _TRIANGLES_AT_ONCE = 4096
 
-_OUTLYING = 8.0
-"""Times what is usual from which on a triangle does not close, and a link does not fit."""
+_OUTLYING = 8.0  # times what is usual from which on a triangle does not close, and a link does not fit
 
 _VISIBLE, _MIN_VISIBLE = 1.5, 2
 """Half diagonals from the middle up to which a transferred probe counts, and so many probes at least of a triangle."""
 
-_MIN_ERROR = 0.02
-"""Half diagonals: a link that is off by less is no wrong pair."""
+_MIN_ERROR = 0.02  # half diagonals: a link that is off by less is no wrong pair
 
 
 def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:

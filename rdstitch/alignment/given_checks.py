@@ -24,28 +24,18 @@ from rdstitch.results.messages import Message
 from rdstitch.robust.posterior import WRONG_GIVEN_FOCAL
 from rdstitch.system.dataclasses import dataclass, replace
 
-_MAX_IMAGES = 60
-"""That are compared: evenly chosen ones of more say as well which signs are right."""
-
-_LOG_ODDS = math.log(1000.0)
-"""By how much the images must contradict what the user says."""
-
-_SCATTERS = np.append(0.0, np.radians(np.geomspace(0.01, 45.0, 60)))
-"""Standard deviations that are tried."""
-
-_EXACT = math.radians(0.01)
-"""Nothing is mounted more exactly."""
-
-_STRAINED = 2.0
-"""Standard deviations of a given focal length by which it must have given way to be looked at again."""
+_MAX_IMAGES = 60  # that are compared: evenly chosen ones of more say as well which signs are right
+_LOG_ODDS = math.log(1000.0)  # by how much the images must contradict what the user says
+_SCATTERS = np.append(0.0, np.radians(np.geomspace(0.01, 45.0, 60)))  # standard deviations that are tried
+_EXACT = math.radians(0.01)  # nothing is mounted more exactly
+_STRAINED = 2.0  # standard deviations of a given focal length by which it must have given way to be looked at again
 
 _WITH_TILTS = ["tilting"]
 
 LATE = 3.0
 """Standard deviations from which on a delay is one."""
 
-_FREE_MOUNT = 1.0
-"""Standard deviation, radians, of a tilt of the mount of which nothing is known."""
+_FREE_MOUNT = 1.0  # standard deviation, radians, of a tilt of the mount of which nothing is known
 
 _SIGNED_ORDERS = tuple(
     np.diag(signs)[:, list(order)] for order in ((0, 1), (1, 0)) for signs in product((1.0, -1.0), repeat=2)

@@ -34,9 +34,7 @@ _CLICK = 0.5  # pixels: of a coordinate of where an image shows a control point
 _ROUNDS, _SETTLED = 8, 0.1
 """Of fitting the similarity and adjusting again; standard deviations by which what is known still moves at the end."""
 
-_MAX_GROWTH = 1.1
-"""Times by which the errors of the images may grow."""
-
+_MAX_GROWTH = 1.1  # times by which the errors of the images may grow
 _SURE = 1.0 - 1e-6  # leverage beyond which rounding counts
 _MANY = 50  # positions whose leverage is computed; that of others is taken to be the median
 

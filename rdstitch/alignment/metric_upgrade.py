@@ -17,17 +17,13 @@ from rdstitch.geometry.radial_homography import inverses
 from rdstitch.system.dataclasses import dataclass
 
 _MAX_TILT = math.radians(75.0)
-_TILT_STEPS = 31
-"""Five degrees a step, less than the adjustment bridges."""
-
-_FOCAL_RANGE = np.linspace(-1.5, 1.5, 7)
-"""Standard deviations of the prior on log f."""
+_TILT_STEPS = 31  # five degrees a step, less than the adjustment bridges
+_FOCAL_RANGE = np.linspace(-1.5, 1.5, 7)  # standard deviations of the prior on log f
 
 _AT_ONCE = 2**15
 """Images times tilts whose conditions are looked at together: more of them take memory, and no less time."""
 
-_OUTLYING = 0.3
-"""Error of the two conditions, relative, beyond which all errors count alike."""
+_OUTLYING = 0.3  # error of the two conditions, relative, beyond which all errors count alike
 
 
 @dataclass(frozen=True, eq=False)

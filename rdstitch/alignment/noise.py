@@ -17,8 +17,7 @@ from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.robust.posterior import Evidence, overlap_cells
 from rdstitch.system.dataclasses import dataclass
 
-_CELLS = (2, 3, 4)
-"""Cells per side of a link's overlap within which errors are added up; the worst counts."""
+_CELLS = (2, 3, 4)  # cells per side of a link's overlap within which errors are added up; the worst counts
 
 COHERENT_CORRELATION = 0.5
 """Correlation of neighbours from which on a scene does not count as flat, if what they have in common is large."""
@@ -26,8 +25,7 @@ COHERENT_CORRELATION = 0.5
 LARGE_RELIEF = 0.00075
 """Of an image's diagonal: lenses that one λ describes roughly leave less, flights over trees and houses more."""
 
-_MAX_SAMPLES = 200_000
-"""Correspondences of which the agreement is measured."""
+_MAX_SAMPLES = 200_000  # correspondences of which the agreement is measured
 
 _MIN_DISTANCE, _MAX_DISTANCE = 0.005, 0.25
 """Half diagonals between neighbours; nearer points are the same feature found twice."""

@@ -24,9 +24,7 @@ from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost, sigma_of
 from rdstitch.solvers.homography import direct_linear
 
 _MAX_ITERATIONS = 24  # a start need not be the minimum
-
-_TRIAL_LINKS, _TRIAL_MATCHES = 30, 40
-"""What the shared parameters to start from are tried on."""
+_TRIAL_LINKS, _TRIAL_MATCHES = 30, 40  # what the shared parameters to start from are tried on
 
 
 def relations_at(observations: Observations, relations: Sequence[RadialHomography], lens: FloatArray) -> FloatArray:

@@ -42,8 +42,8 @@ _MATCHES_OF_A_TURN = 5000
 _MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 500_000, 40
 """Correspondences of all links together that are enough, and of a link that are used nevertheless."""
 
-_ROUNDS = 3
-"""Rounds of rejecting wrong pairs and adjusting again."""
+_MATCHES_FOR_SELECTION = 5_000  # correspondences of all links together that a model is chosen by
+_ROUNDS = 3  # rounds of rejecting wrong pairs and adjusting again
 
 _REFERENCE_LEFT_OUT = Message("the reference image that was named is not among those aligned; another one is taken")
 
@@ -94,7 +94,7 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
     options, messages = given.options, list[Message]()
     known = options.camera_priors(given.cameras)
     all_matches, relations = _observations(given.links, given.cameras, _matches_of_a_link(len(given.links), options))
-    sample = all_matches.thinned(_matches_for_selection(len(given.links)))
+    sample = all_matches.thinned(int(np.clip(_MATCHES_FOR_SELECTION // len(given.links), 40, 150)))
     lens = choose_observable_lens(given, sample, relations, known)
     wrong, confirmed = cycle_consistency(lens.pairwise, sample, len(given.cameras))
     all_links = _problem_of_all_links(given, sample, lens, _tree_ranks(sample, confirmed), known, wrong)
@@ -216,11 +216,6 @@ def _matches_of_a_link(links: int, options: AlignmentOptions) -> int:
     return min(options.max_matches_per_link, max(_MATCHES_OF_ALL // max(links, 1), _MATCHES_OF_A_LINK))
 
 
-def _matches_for_selection(links: int) -> int:
-    """Correspondences of a link that suffice to choose a model: fewer where there are many links."""
-    return int(np.clip(5_000 // max(links, 1), 40, 150))
-
-
 def _observations(
     links: Sequence[Link], cameras: Sequence[Camera], max_matches: int
 ) -> tuple[Observations, list[RadialHomography]]:
@@ -261,10 +256,9 @@ def _drop_wrong_pairs(
         adjusted, model = choice.fit.adjusted, choice.fit.model
         between_images, _ = all_links.part(np.ones_like(wrong), images)
         inside = np.isin(o.image1, images) & np.isin(o.image2, images)
+        squared = between_images.adjuster(model).squared(adjusted.parameters)
         judged = wrong.copy()
-        judged[inside] = misfitting_links(
-            between_images.squared(model, adjusted.parameters), between_images.observations
-        )
+        judged[inside] = misfitting_links(squared, between_images.observations)
         if judged[inside].all():
             raise RegistrationError("the pairs do not agree on where the images lie; add images with more overlap")
         if (judged == wrong).all():

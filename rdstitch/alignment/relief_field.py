@@ -22,11 +22,8 @@ from rdstitch.geometry.division_model import distort, undistort
 from rdstitch.geometry.radial_homography import inverses, project
 from rdstitch.system.dataclasses import dataclass
 
-_STEP = 1e-4
-"""Heights, of differences."""
-
-_ASIDE = 0.3
-"""Half diagonals from the middle of an image, where its size on the ground is measured."""
+_STEP = 1e-4  # heights, of differences
+_ASIDE = 0.3  # half diagonals from the middle of an image, where its size on the ground is measured
 
 
 @dataclass(frozen=True)
@@ -128,17 +125,13 @@ class Parallax:
 _SHORTEST, _LONGEST = 0.5, 6.0
 """Wavelengths, in half diagonals of an image on the ground: what neighbours show, and what poses absorb whole."""
 
-_WAVES = 32
-"""Waves, each as a sine and a cosine."""
-
-_BANDS = 4
-"""Of waves that are answered together."""
+_WAVES = 32  # waves, each as a sine and a cosine
+_BANDS = 4  # of waves that are answered together
 
 _NOISE_FIELDS = 16
 """Fields of independent errors that show what their absorption leaves of agreement between neighbours."""
 
-_CURVATURES = 3
-"""Of a plane: along x, aslant, and along y."""
+_CURVATURES = 3  # of a plane: along x, aslant, and along y
 
 _UNSEEN, _NEWTON_STEPS = 1e-9, 50
 """Share of the largest information that none is; steps to the variance of curvatures at most."""

@@ -23,8 +23,7 @@ from rdstitch.alignment.starts import fit_model, start_from
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 
-_MIN_IMAGES = 3
-"""Images: of two, tilts do what heights do, and the errors do not show which."""
+_MIN_IMAGES = 3  # images: of two, tilts do what heights do, and the errors do not show which
 
 _ROUNDS, _SETTLED = 4, 0.02
 """Of finding the scatter of the heights and adjusting again, and by how much it still changes at the end: at first the

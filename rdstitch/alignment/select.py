@@ -16,7 +16,6 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.frames.reference_frame import MAX_STRETCH
-from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.least_squares.link_equations import split_lens, whitened_errors
 from rdstitch.alignment.lens.lens_selection import NO_COHERENCE, residual_coherence
 from rdstitch.alignment.motion_models import MODELS, MotionModel
@@ -33,8 +32,7 @@ from rdstitch.system.dataclasses import dataclass, replace
 _GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
 """Half diagonals: points of an image of usual proportions, out to the corners."""
 
-_FRAMES = 12
-"""Images that are tried as the frame of a plane without a metric."""
+_FRAMES = 12  # images that are tried as the frame of a plane without a metric
 
 
 def stretch(fit: Fit) -> float:
@@ -128,13 +126,9 @@ class Posterior:
         """What the errors of links on their own say, which those of no model undercut by much."""
         return self.evidence.cost(self.link_errors)
 
-    def cost(self, adjusted: BundleAdjustmentResult) -> ErrorCost:
-        """What the errors say that an adjustment leaves."""
-        return self.evidence.cost(adjusted.errors)
-
     def scored(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
-        errors = self.cost(fit.adjusted)
+        errors = self.evidence.cost(fit.adjusted.errors)
         layout = stretch(fit) if self.purpose.picture else 1.0
         spread = (fit.tilt_spread or 0.0) / _TYPICAL_TILT_SPREAD
         wide = 4.0 * self.problem.count * math.log(max(spread, 1.0))
@@ -194,7 +188,7 @@ class _TurnTrial:
         if len(problem.observations) == 1:  # a trial is the whole
             return cls(model, -math.inf, None)
         trial = fit_trial(problem, model)
-        bound = posterior.lower_bound(model, posterior.cost(fit_pairwise(problem, model, trial)))
+        bound = posterior.lower_bound(model, posterior.evidence.cost(fit_pairwise(problem, model, trial).errors))
         return cls(model, bound, trial.parameters.shared)
 
     def scored(self, posterior: Posterior) -> Hypothesis:

@@ -15,8 +15,7 @@ from rdstitch.geometry.radial_homography import inverses
 from rdstitch.matching.match_graph import SpanningTree, spanning_tree
 from rdstitch.robust.loss import robust_cost
 
-_LONG_CHAIN = 60
-"""Images over which chained homographies drift so far that a planar model is the better start."""
+_LONG_CHAIN = 60  # images over which chained homographies drift so far that a planar model is the better start
 
 
 def fit_model(

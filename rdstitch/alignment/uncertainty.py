@@ -39,8 +39,7 @@ _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
 _UNLIKELY_FOCAL = 4.0
 """Standard deviations of what is known of a focal length beyond which it may stand for something else."""
 
-_SINGULAR = 1e-12
-"""Least eigenvalue of a correlation matrix of parameters."""
+_SINGULAR = 1e-12  # least eigenvalue of a correlation matrix of parameters
 
 
 def covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray]:
@@ -93,7 +92,7 @@ def sandwich_covariances(
 def _relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> ReliefField:
     """What relief does, by as many matches of each link as show its waves."""
     observations = adjuster.observations
-    few = observations.thinned_to(_ENOUGH, _MIN_MATCHES_PER_LINK)
+    few = observations.thinned(max(_ENOUGH // max(len(observations), 1), _MIN_MATCHES_PER_LINK))
     fraction = len(few.points1) / max(len(observations.points1), 1)
     if fraction < 1.0:  # each counts for several beside the priors
         adjuster = replace(adjuster, observations=few, overdispersion=adjuster.overdispersion * fraction)

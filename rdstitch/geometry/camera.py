@@ -43,11 +43,8 @@ FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "
 """Standard deviation of the logarithm of a focal length, by where it comes from."""
 
 _LEAST_LOG_STD = 1e-6  # of a focal length: what is exact has no inverse variance
-
 _GRID = 33  # points along each side of the image at which lenses are compared
-
 _FOCAL_LIMITS = 0.05, 1e3  # half diagonals; the widest fisheyes have 0.3
-
 _NEAREST_HORIZON = 0.2  # half diagonals: a circle of 180 degrees that is smaller is a wrong camera file
 
 _MAX_STRETCH = 20.0

@@ -14,8 +14,7 @@ from rdstitch.matching.two_view import Pair, PairRegistration
 _SAME_PX = 0.5
 """Pixels that matches of a copy move by at most: saving again moves them by less, and no place is off by more."""
 
-_MIN_SAME = 0.9
-"""Share of the matches that do: of an image that shows something else beside what is static, more move."""
+_MIN_SAME = 0.9  # share of the matches that do: of an image that shows something else beside what is static, more move
 
 
 def copies_of(pairs: Sequence[PairRegistration]) -> dict[int, int]:

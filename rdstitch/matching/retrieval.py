@@ -32,7 +32,6 @@ _SEQUENCE_RANK = (
 _MIN_SEQUENTIAL_FRACTION = 0.5  # fraction of the images of which that is true of the next one; a quarter by chance
 _BLOCK = 8192  # descriptors assigned at a time
 _ROWS = 256  # images compared with all others at a time
-
 _LARGEST = 65504.0  # in half precision
 
 Array32 = NDArray[np.float32]

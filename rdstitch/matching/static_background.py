@@ -28,8 +28,7 @@ _MAX_STATIC_MOTION = 1.0 / 3.0
 _MIN_STATIC_MATCHES = 8
 """Of a pair that moves. Wrong matches lie anywhere: of 1,000, less than one ends within a pixel of where it began."""
 
-_MIN_CONFIRMATIONS = 3
-"""Static matches at one place, from which on every feature there counts as static."""
+_MIN_CONFIRMATIONS = 3  # static matches at one place, from which on every feature there counts as static
 
 _MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE = 2, 0.2
 """Pairs with such matches, in number and as a fraction of the pairs that move; by one pair alone nothing is decided."""

@@ -6,14 +6,12 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 
-_FULL_CIRCLE = np.pi / 2
-"""Images whose centres leave no wider gap than this, radians, count as all the way round."""
+_FULL_CIRCLE = np.pi / 2  # images whose centres leave no wider gap than this, radians, count as all the way round
 
 _MAX_GRAVITY_SPREAD = np.radians(5.0)
 """Median angle between measured directions of gravity and their mean, up to which they are believed."""
 
-_ROLL = np.radians(3.0)
-"""Standard deviation of the roll of a camera that is held by hand: chosen."""
+_ROLL = np.radians(3.0)  # standard deviation of the roll of a camera that is held by hand: chosen
 
 _STEEP = np.cos(np.radians(30.0))
 """Images that look within 30 degrees of straight up or down do not show how the camera was held."""

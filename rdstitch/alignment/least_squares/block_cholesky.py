@@ -20,17 +20,10 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import csgraph, sparse
 
-_UNDIVIDED = 20
-"""Images that are eliminated at once: what dense matrices do in less time than further division."""
-
-_FRACTIONS = (0.4, 0.5, 0.6)
-"""Of the images of a part on one side, where it may be divided."""
-
-_HALVED = 16
-"""Rows from which on half a triangular matrix is inverted by itself."""
-
-_WORTHWHILE = 3
-"""Times as many images a part must have as divide it; otherwise it is eliminated as one."""
+_UNDIVIDED = 20  # images that are eliminated at once: what dense matrices do in less time than further division
+_FRACTIONS = (0.4, 0.5, 0.6)  # of the images of a part on one side, where it may be divided
+_HALVED = 16  # rows from which on half a triangular matrix is inverted by itself
+_WORTHWHILE = 3  # times as many images a part must have as divide it; otherwise it is eliminated as one
 
 
 @dataclass(frozen=True, eq=False)

@@ -140,14 +140,12 @@ class _Descent:
     converged: bool
 
 
-_STEPS, _LAST_STEPS = 4, 12
-"""Linearizations at one width of the loss, and at the last one."""
+_STEPS, _LAST_STEPS = 4, 12  # linearizations at one width of the loss, and at the last one
 
 _NARROWING, _NARROW = 3.0, 1.05
 """By how much the loss narrows from one width to the next; widths of the last one up to which it is that."""
 
-_SETTLED = 0.02
-"""Relative change of the errors' standard deviation that is none."""
+_SETTLED = 0.02  # relative change of the errors' standard deviation that is none
 
 _FIRST_DAMPING = 1e-6
 """Of the diagonal of the normal matrix. Focal length and tilts of many images are so weak together that a hundred times

@@ -91,18 +91,14 @@ class SparseNormalEquations:
                 return information
         return np.zeros_like(self.shared)
 
-    def pose_response(self) -> FloatArray:
-        """How the poses follow a unit step of each shared parameter, shape (N, D, S): ``-A⁻¹ B``."""
-        response: FloatArray = -self._least_damped.solve(self.coupling)
-        return response
-
     def pose_covariances(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of the inverse of the whole matrix each image's block with itself, (N, D, D), those with the shared
         parameters (N, D, S), and the one of these (S, S).
         """
         by_shared, of_shared = self.responses(np.zeros_like(self.coupling), -np.eye(len(self.shared)))
         own = np.where(self.free[:, :, None] & self.free[:, None], self._least_damped.inverse_diagonal(), 0.0)
-        return own + by_shared @ self.pose_response().swapaxes(1, 2), by_shared, of_shared
+        moved = -self._least_damped.solve(self.coupling)  # how poses follow a unit step of each shared parameter
+        return own + by_shared @ moved.swapaxes(1, 2), by_shared, of_shared
 
     def _coupled(self, poses: FloatArray) -> FloatArray:
         """``B' x`` (S, C) of some (N, D, C)."""

@@ -13,11 +13,8 @@ from rdstitch.matching.links import Link, spread_choice
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, sigma_of
 from rdstitch.system.dataclasses import dataclass, replace
 
-_CHUNK = 4096
-"""Correspondences linearized at a time: what stays in cache."""
-
-_STATIC = 1.0
-"""Pixels that the displacements of most correspondences of a link stay below where the camera stood still."""
+_CHUNK = 4096  # correspondences linearized at a time: what stays in cache
+_STATIC = 1.0  # pixels that the displacements of most correspondences of a link stay below where the camera stood still
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +136,3 @@ class Observations:
         """Of each link at most about ``most`` correspondences, well spread over its overlap."""
         kept = [spread_choice(self.points1[a:b], most) + a for a, b in itertools.pairwise(self.start)]
         return self.rows(np.concatenate([np.empty(0, dtype=np.intp), *kept]), np.array([len(k) for k in kept]))
-
-    def thinned_to(self, total: int, per_link: int) -> Self:
-        """About so many correspondences in all, and of each link at least so many, if there are."""
-        return self.thinned(max(total // max(len(self), 1), per_link))
