@@ -81,7 +81,9 @@ def align_locally(
 
     By ``choice`` "auto" only where matches that are held out of the fit come nearer by more than fields bend what is
     straight, and by 15 % of their distance or more; a number: always, with so many cells along the longer side of an
-    image, fewer where the images have too many nodes together. ``homographies`` (N, 3, 3) are of undistorted coordinates, in half diagonals, to the plane, or to directions;
+    image, or fewer where all have too many nodes together.
+
+    ``homographies`` (N, 3, 3) are of undistorted coordinates, in half diagonals, to the plane, or to directions;
     ``pairs``: how many ``matches`` there are, where these come one by one; ``edges`` gives the ends (K, 2, 2) of
     straight edges in each of some images, measured pixels. ``centers`` (N, 3) are where cameras are known to be: below
     each on the plane, and how high above it, in its unit. What heights of the ground explain is not left to fields of
