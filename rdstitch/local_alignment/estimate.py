@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Literal, NamedTuple
 
@@ -14,7 +15,6 @@ from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
 from rdstitch.local_alignment.ground import fit_ground
 from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
-from rdstitch.system.dataclasses import dataclass
 
 # Cells of a grid that finds what is far from the plane, and of the one that is used; nodes of all images together, by
 # which the finer one is coarser for more than some 70 images, and both for more than 800.
@@ -57,6 +57,7 @@ class LocalAlignment:
     fields: tuple[DisplacementField, ...]  # one an image; empty where images are not aligned locally
     reason: str  # why they are, or are not
     cells: int = 0  # of the grid along the longer side of an image; 0 without fields
+    by_heights: bool = False  # whether it is the ground that is rough, seen from where the cameras are
     before: HeldOut | None = None  # residuals of held-out matches without fields; None where nothing was tried
     after: HeldOut | None = None  # the same with fields
 
@@ -125,13 +126,13 @@ def align_locally(
     before, after = HeldOut.of(tested.residual), HeldOut.of(best.residual)
     text = f"matches held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} pixels with it"
     if min(costs) > limit:
-        return LocalAlignment((), f"not worth while; {text}", 0, before, after)
+        return LocalAlignment((), f"not worth while; {text}", before=before, after=after)
     if base is not None:
         text += ", mostly by the height of the ground"
     if choice not in ("auto", cells):
         text += f"; a grid of {cells} instead of {choice} cells, the finest that so many images may have"
     final = fit_fields(placed, images, best.fit.stiffness, best.fit, base)
-    return LocalAlignment(final.delivered, text, cells, before, after)
+    return LocalAlignment(final.delivered, text, cells, base is not None, before, after)
 
 
 class _Candidate(NamedTuple):

@@ -7,7 +7,7 @@ large is imported here or by the modules of the options, so that ``--help`` is q
 
 import math
 from collections.abc import Sequence
-from dataclasses import is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from inspect import isclass
 from numbers import Integral, Real
 from os import PathLike
@@ -16,7 +16,6 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
 
 from rdstitch.errors import ArgumentError
-from rdstitch.system.dataclasses import dataclass, field, fields
 
 Class = TypeVar("Class", bound=type)
 

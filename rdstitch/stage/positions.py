@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.tables import by_image, csv_rows, image_name
 from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.stage.grid import TileGrid
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.file_access import read_text
 
 Positions = str | Path | ArrayLike | Mapping[str, ArrayLike]

@@ -5,13 +5,13 @@ import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
+from dataclasses import dataclass, replace
 from importlib import import_module
 
 import numpy as np
 
 from rdstitch.alignment import Alignment, align
 from rdstitch.results.messages import Message
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.placement import Placement, PlaneSimilarity
 from rdstitch.tracking.tracked_frame import TrackedFrame

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain
 from threading import Lock
@@ -16,7 +17,6 @@ from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import NO_CACHE, Cache
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.photometric_agreement import (
     COMPARED_SIDE,

@@ -7,6 +7,7 @@ fits. At the right one, those in the overlap are at the same places in both; at 
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,7 +15,6 @@ import numpy as np
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.parabola import parabola_peak
 from rdstitch.geometry.radial_homography import from_plane, to_plane
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE, ComparedImage, Grey
 from rdstitch.verification.self_similarity import Drawing, Overlaps, draw, drawing_scale
