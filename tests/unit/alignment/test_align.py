@@ -74,8 +74,8 @@ _OPTIONS: list[dict[str, object]] = [
     {"lens_known": True},
     {"reference": 3},
     {"pose_covariance": True},
-    *({"lens": lens} for lens in get_args(LensName)),
-    *({"purpose": purpose} for purpose in Purpose),
+    *[dict[str, object](lens=lens) for lens in get_args(LensName)],
+    *[dict[str, object](purpose=purpose) for purpose in Purpose],
 ]
 
 
