@@ -132,8 +132,10 @@ class Reporter:
         self.finish()
 
     def _line(self, text: str) -> None:
-        if self._bar is not None:
-            self._bar.clear()
-        print(one_line(text), file=sys.stderr)
-        if self._bar is not None:
-            self._bar.refresh()
+        """Print a line; where nobody reads standard error any more, the work goes on without."""
+        with suppress(OSError):
+            if self._bar is not None:
+                self._bar.clear()
+            print(one_line(text), file=sys.stderr)
+            if self._bar is not None:
+                self._bar.refresh()

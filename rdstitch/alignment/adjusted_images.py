@@ -1,6 +1,7 @@
 """What travels through the recipe of the alignment: images as they are given, and as they are adjusted."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
@@ -10,7 +11,6 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
-from rdstitch.system.dataclasses import dataclass, field
 
 
 @dataclass(frozen=True, eq=False)

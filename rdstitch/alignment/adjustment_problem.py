@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +21,6 @@ from rdstitch.alignment.motion_models import PSI, THETA, MotionModel
 from rdstitch.alignment.noise import shared_variance
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.matching.match_graph import connected_components, spanning_tree
-from rdstitch.system.dataclasses import dataclass, replace
 
 POSE_TILT_SPREAD = math.radians(35.0)
 """Of images of which nothing is known: half of the tilts lie below 40 degrees."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
@@ -15,7 +16,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
-from rdstitch.system.dataclasses import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -24,7 +25,6 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.results.messages import Message, Severity
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 from rdstitch.robust.posterior import MODEL_ERROR
-from rdstitch.system.dataclasses import dataclass, replace
 
 _STEP = 1e-5  # of differences of λ, μ and ν
 _RADII = np.linspace(0.05, 1.0, 20)  # half diagonals: where the lens is looked at, out to the corner

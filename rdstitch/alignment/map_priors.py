@@ -9,6 +9,7 @@ stay away, the map does not count.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,6 @@ from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.posterior import MODEL_ERROR
 from rdstitch.robust.similarity_fit import OUTLYING, SimilarityFit, fit_similarity
-from rdstitch.system.dataclasses import dataclass, field, replace
 
 POSITION_STD = 3.0
 """Metres: of one coordinate of a position by a receiver without corrections, within one flight."""

@@ -7,6 +7,7 @@ unknowns, so all of them are tried on a grid, from which the adjustment finds th
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.planar_motion import rotation_from_tilt, tilt_from_normal
 from rdstitch.geometry.radial_homography import inverses
-from rdstitch.system.dataclasses import dataclass
 
 _MAX_TILT = math.radians(75.0)
 _TILT_STEPS = 31  # five degrees a step, less than the adjustment bridges

@@ -6,6 +6,7 @@ correlation gives the number of independent observations, which is smaller than 
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.robust.posterior import Evidence, overlap_cells
-from rdstitch.system.dataclasses import dataclass
 
 _CELLS = (2, 3, 4)  # cells per side of a link's overlap within which errors are added up; the worst counts
 

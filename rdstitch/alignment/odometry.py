@@ -8,6 +8,7 @@ modulus of the complex scale is the height of the camera, its angle how the came
 import cmath
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,7 +17,6 @@ import numpy as np
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.inputs.odometry import BodyPose, motion_between
-from rdstitch.system.dataclasses import dataclass, replace
 
 _WHEELS = 0.01  # relative standard deviation of what all distances share: the size of the wheels
 _LEVER = 0.5  # units of the odometry: how far from the body's origin cameras are

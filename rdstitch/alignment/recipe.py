@@ -1,6 +1,7 @@
 """The recipe of the global adjustment: consensus, match graph, choice of the model, adjustment."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,7 +30,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link, in_alternate_directions
 from rdstitch.results.messages import Message
-from rdstitch.system.dataclasses import dataclass, replace
 
 # Side of an image, beside that of the largest, below which it was reduced, and must not set the scale of the output.
 _REDUCED = 0.8

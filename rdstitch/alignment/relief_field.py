@@ -8,6 +8,7 @@ roughly is (a power law; Mandelbrot 1975).
 """
 
 import math
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +21,6 @@ from rdstitch.alignment.noise import neighbours
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.division_model import distort, undistort
 from rdstitch.geometry.radial_homography import inverses, project
-from rdstitch.system.dataclasses import dataclass
 
 _STEP = 1e-4  # heights, of differences
 _ASIDE = 0.3  # half diagonals from the middle of an image, where its size on the ground is measured

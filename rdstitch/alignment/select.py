@@ -9,6 +9,7 @@ translation. Of the planar models the least free one is taken that the images al
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -27,7 +28,6 @@ from rdstitch.choices import Purpose
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.posterior import TWENTY_TO_ONE, ErrorCost, Evidence, freedom_cost
-from rdstitch.system.dataclasses import dataclass, replace
 
 _GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
 """Half diagonals: points of an image of usual proportions, out to the corners."""

@@ -6,6 +6,7 @@ the camera, whose images are resampled by it.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -14,7 +15,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.geometry.lens_model import LensKind, LensModel
-from rdstitch.system.dataclasses import dataclass, replace
 
 _GRID = 65  # points along each side of the image that models are fitted at
 _RATIONAL_STEPS = 12

@@ -12,6 +12,7 @@ film.
 import math
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -22,7 +23,6 @@ from rdstitch.camera_files.lens_models import CLOSE, CameraFile, LensFit, LensSa
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.records import Side, convert, parse_xml
 
 _RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE = 0, 2, 3

@@ -6,11 +6,12 @@ pyramid's kernels (1, 4, 6, 4, 1) / 16, and are rounded to such multiples after 
 their order, nor on where a tile begins.
 """
 
+from dataclasses import dataclass, field
+
 import cv2
 import numpy as np
 
 from rdstitch.compositing.boxes import Box, Float32Array
-from rdstitch.system.dataclasses import dataclass, field
 
 _WEIGHT_STEPS = np.float32(4096.0)
 

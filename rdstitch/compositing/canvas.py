@@ -9,6 +9,7 @@ Of an oblique image the near part is drawn (:mod:`rdstitch.compositing.visible_r
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +21,6 @@ from rdstitch.compositing.visible_region import POINTS_PER_SIDE, PROBES, Visible
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.geometry.radial_homography import to_directions, to_plane
-from rdstitch.system.dataclasses import dataclass, replace
 
 _MAX_GROWTH = 100.0
 _MAX_ENLARGEMENT = 400.0  # pixels of the canvas for each of the images, where --scale requests it

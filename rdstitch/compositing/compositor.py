@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import write_strips
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.results.messages import Message
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.outputs import Fingerprint, Outputs
 from rdstitch.system.progress import ShareProgress, unheard
 

@@ -1,6 +1,7 @@
 """Gain and vignetting of each image that explain what overlaps show, in the logarithm of the samples."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -10,7 +11,6 @@ from rdstitch.compositing.cell_least_squares import VISIBLE, Prior, fit_robustly
 from rdstitch.compositing.overlap_cells import Cells
 from rdstitch.compositing.photometric import Exposure, squared_radius
 from rdstitch.compositing.source_images import PlacedImage
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.late_imports import sparse
 
 MIN_RELATIVE_GAIN = 0.05  # a model with more freedom must explain the data better by this share to be taken

@@ -1,13 +1,13 @@
 """Coordinates and corrections on a lattice of the canvas, interpolated linearly between its nodes."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box, Float32Array
-from rdstitch.system.dataclasses import dataclass
 
 LATTICE_STEPS = (32, 16, 8, 4, 2, 1)  # spacings of lattices, canvas pixels; all have the nodes of the first
 _NOWHERE = np.float32(-1e6)

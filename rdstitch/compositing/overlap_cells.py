@@ -1,6 +1,7 @@
 """What two images show of the same ground, as means of small cells: the measurements of gain compensation."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import reduce
 from typing import Any, NamedTuple, Self
 
@@ -12,7 +13,6 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.compositing.boxes import Box, Float32Array, cut
 from rdstitch.compositing.photometric import full_scale
 from rdstitch.compositing.survey import Survey, SurveyTile
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import sparse
 
 # Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.

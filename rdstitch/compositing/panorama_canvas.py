@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from rdstitch.compositing.projection import PLANE, PROJECTIONS, TURN, Projection
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.geometry.radial_homography import from_directions, to_directions
-from rdstitch.system.dataclasses import dataclass, replace
 
 _POINTS_PER_SIDE = 64
 _GRID = 33  # points along each side of an image, over all of it

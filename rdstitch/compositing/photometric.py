@@ -10,6 +10,7 @@ the distortion centre, and a smooth field ``f_i`` per image.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -22,7 +23,6 @@ from rdstitch.compositing.lattice import LATTICE_STEPS, interpolated
 from rdstitch.compositing.warp import Geometry
 from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import nodes_around
-from rdstitch.system.dataclasses import dataclass, field, replace
 
 # The correction is smooth: it is computed at this spacing, canvas pixels, and interpolated.
 _LATTICE = LATTICE_STEPS[0]

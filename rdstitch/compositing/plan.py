@@ -1,6 +1,7 @@
 """What a composite will take: memory and time, found before the work, and the sizes that follow from a memory limit."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +11,6 @@ from rdstitch.compositing.transparency import OPACITY_BYTES
 from rdstitch.errors import LimitError
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.machine import available_memory, processor_count
 
 _SHARE, _LEAST = 0.25, 400 * 2**20  # of the memory that is available, and bytes that are taken in any case

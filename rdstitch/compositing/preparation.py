@@ -2,6 +2,7 @@
 
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Self
 
@@ -25,7 +26,6 @@ from rdstitch.compositing.warp import plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.results.messages import Message
-from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.system.progress import ShareProgress, unheard
 

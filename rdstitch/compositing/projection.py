@@ -6,13 +6,13 @@ Directions have x to the right, y down, z ahead. Longitude ``atan2(x, z)`` grows
 
 import math
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import ProjectionName
-from rdstitch.system.dataclasses import dataclass
 
 TURN = 2.0 * np.pi
 _MAX_STRETCH = 16.0  # of any projection, whatever is requested

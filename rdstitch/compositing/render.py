@@ -1,6 +1,7 @@
 """One tile of the output: which images contribute where, and their samples blended."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
@@ -16,7 +17,6 @@ from rdstitch.compositing.resample import border_weight, sample, sample_opacity
 from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
 from rdstitch.compositing.warp import Geometry, Warp, locate
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.system.dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ other, so that memory is that of one label per pixel of the reduced canvas.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -19,7 +20,6 @@ from rdstitch.compositing.resample import border_weight
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean
-from rdstitch.system.dataclasses import dataclass, replace
 
 NO_OWNER = -1
 

@@ -8,6 +8,7 @@ surroundings: gravel and leaves hide it.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Self
 
 import cv2
@@ -16,7 +17,6 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.compositing.boxes import Box, Float32Array
-from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.system.late_imports import csgraph, sparse, spatial
 
 DIAGONAL = 1000.0  # pixels of an image's diagonal at which seams are looked at: about what a screen shows of it

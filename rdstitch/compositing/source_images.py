@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,7 +18,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import block_mean, fitting_reduction, reduced_size
-from rdstitch.system.dataclasses import dataclass, replace
 
 _OPAQUE_FROM = 128  # alpha
 _NEGLIGIBLE_SHRINK = 1.05  # an image that gets smaller by less than this keeps its pixels as they are

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,7 +19,6 @@ from rdstitch.compositing.seam_quality import DIAGONAL, SeamQuality, SeamTile, m
 from rdstitch.compositing.source_images import ImageReader, LoadedImage, PlacedImage
 from rdstitch.compositing.warp import Warp, locate, plan_warps
 from rdstitch.io.reduction import mean_of_channels
-from rdstitch.system.dataclasses import dataclass, replace
 
 _MAX_IMAGE = 200_000
 _MAX_TOTAL = 16_000_000  # pixels of one image and of all on the reduced canvas; OpenCV finds seams at 100,000

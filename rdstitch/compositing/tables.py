@@ -5,6 +5,7 @@ image, one product and one sum.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import cv2
@@ -20,7 +21,6 @@ from rdstitch.compositing.resample import INTERPOLATION, remap, sample_places
 from rdstitch.compositing.source_images import PlacedImage, block_side, smoothed
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.system.dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

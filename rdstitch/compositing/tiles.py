@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from typing import Any
@@ -20,7 +21,6 @@ from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.render import Renderer
 from rdstitch.io.strips import STRIP_ROWS
 from rdstitch.system.cache import Cache, Stored
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.progress import ShareProgress, unheard
 
 OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]

@@ -7,6 +7,7 @@ towards the corners of a wide-angle image, does not count.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.io.read import DecodedImage
-from rdstitch.system.dataclasses import dataclass, replace
 
 PROBES = 33  # points of a grid over the image, and along its outline, a side, at which the stretch is measured
 POINTS_PER_SIDE = 64

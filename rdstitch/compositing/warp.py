@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -16,7 +17,6 @@ from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.compositing.source_images import Displacement, PlacedImage
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.system.dataclasses import dataclass, replace
 
 # Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many pixels of the image or,
 # where that gets smaller, of the canvas. OpenCV rounds them to as many afterwards.

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -10,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.system.dataclasses import dataclass, replace
 
 ComplexArray = NDArray[np.complex128]
 

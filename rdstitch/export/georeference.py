@@ -5,6 +5,7 @@ The output is a plane seen straight from above, so that a similarity takes its p
 """
 
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +16,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.export.camera_views import as_complex
 from rdstitch.geometry.crs import Crs, middle
 from rdstitch.io.tiff import ExtraTag
-from rdstitch.system.dataclasses import dataclass, replace
 
 PositionKind = Literal["GPS positions", "ground control points"]
 GPS: PositionKind = "GPS positions"

@@ -11,6 +11,7 @@ All is linear in small quantities, and solved by weighted least squares with pri
 """
 
 import math
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -19,7 +20,6 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.export.camera_views import ComplexArray, Views
 from rdstitch.robust.similarity_fit import OUTLYING, fit_similarity
-from rdstitch.system.dataclasses import dataclass
 
 SLOPE_STD = math.radians(1.0)  # of the ground: level to gently sloping in the classes of the FAO (up to 5 %)
 POSITION_STD = 3.0  # metres: of one coordinate of a position by a receiver without corrections, within one flight

@@ -1,6 +1,7 @@
 """The grid of a map that an output is made on: that of another file, or of an extent."""
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,6 @@ from rdstitch.errors import InputError
 from rdstitch.export.georeference import GEO_KEYS, MODEL_SCALE, MODEL_TIEPOINT, MODEL_TRANSFORMATION, Georeference
 from rdstitch.geometry.crs import Crs, NotMetricError
 from rdstitch.io.opening import check_readable, decoding
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
 

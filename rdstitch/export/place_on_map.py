@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import WGS84, Crs, middle
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.system.dataclasses import dataclass, field, replace
 
 MIN_POSITIONS = 3
 

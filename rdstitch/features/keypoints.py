@@ -1,6 +1,7 @@
 """Results of detection and matching: keypoints and descriptors of an image, and corresponding points of two."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -8,7 +9,6 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, Rows
 from rdstitch.errors import ArgumentError
-from rdstitch.system.dataclasses import dataclass, replace
 
 Descriptors = NDArray[np.float32] | NDArray[np.uint8]
 

@@ -7,6 +7,7 @@ OpenCV's own tests use: ALIKED takes ``image`` and gives ``keypoints``, ``descri
 
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Self
@@ -19,7 +20,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.opencv_state import silent_opencv
 
 

@@ -6,6 +6,7 @@ to be exact, so there is nothing to depend on.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Descriptors, Features
-from rdstitch.system.dataclasses import dataclass
 
 # |a|² + |b|² and 2 a·b then stay below 2²³, where float32 still knows halves.
 _MAX_NORM = 1024.0

@@ -1,6 +1,7 @@
 """The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any, Self, cast
 
@@ -12,7 +13,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Descriptors, Features
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.process_memory import scratch_memory
 
 Grey = NDArray[np.uint8]

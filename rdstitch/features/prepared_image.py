@@ -1,6 +1,7 @@
 """An image as detectors want it: grey, 8 bits, of working size, with the distance to what is masked."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -9,7 +10,6 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.system.dataclasses import dataclass
 
 PixelArray = NDArray[Any]
 """Pixels of uint8, uint16 or float."""

@@ -6,6 +6,7 @@ ones are those of the image at half its size, and so on.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Self
 
@@ -17,7 +18,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Features
 from rdstitch.features.opencv import Grey, OpenCVDetection
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.system.dataclasses import dataclass, replace
 
 LARGE = 1_250_000
 """Pixels from which on an image is taken in tiles: a whole one takes 230 bytes a pixel."""

@@ -1,6 +1,7 @@
 """Coordinate reference systems: UTM and UPS on WGS 84, and through pyproj (PROJ) every other projected one."""
 
 import math
+from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
 
@@ -25,7 +26,6 @@ from rdstitch.geometry.utm import (
     zone_at,
     zone_of_epsg,
 )
-from rdstitch.system.dataclasses import dataclass
 
 
 class NotMetricError(ArgumentError):

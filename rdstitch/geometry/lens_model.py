@@ -5,12 +5,12 @@ Each is a *forward* map: pixels of a lens without distortion and with square pix
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.system.dataclasses import dataclass, replace
 
 _NEWTON_STEPS, _NEWTON_TOLERANCE = 20, 1e-10
 

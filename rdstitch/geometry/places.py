@@ -1,6 +1,6 @@
 """Places on the Earth, of cameras and of points that images show."""
 
-from rdstitch.system.dataclasses import dataclass
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,13 @@ eq. 1), in focal-normalized coordinates. When the second image is taken from ``h
 first, it is ``H ~ R Rz(φ) diag(1, 1, height) T R'``.
 """
 
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.system.dataclasses import dataclass
 
 ABOUT_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 ABOUT_Y = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])

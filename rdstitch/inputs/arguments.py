@@ -5,6 +5,7 @@ import hashlib
 import os
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +17,6 @@ from rdstitch.inputs.rosbag import extract_images, is_bag
 from rdstitch.io.opening import HEIF_SUFFIXES
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.results.messages import Message, shortened
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.file_access import is_url, read_text, remote_names
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,6 @@ from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, by_image, csv_rows
 from rdstitch.inputs.times import timestamps_of
 from rdstitch.results.messages import shortened
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.file_access import cached_by_file_state, read_text
 
 XMP = "xmp"

@@ -1,9 +1,10 @@
 """The clock of a sensor may be late against the camera's: its values are kept for a range of delays."""
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.system.dataclasses import dataclass, field
 
 DELAYS = np.linspace(-0.3, 0.3, 61)  # seconds by which a sensor's times may be later than those of the images
 DELAY_STD = 0.05

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -11,7 +12,6 @@ from rdstitch.inputs.arguments import NamedImage, expanded
 from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.image_folders import is_rdstitch_output, place_of
 from rdstitch.results.messages import Message, names_of, shortened
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.file_access import canonical_name, is_url
 from rdstitch.system.temporary_folder import TemporaryFolder
 

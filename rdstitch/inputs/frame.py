@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -14,7 +15,6 @@ from rdstitch.choices import ChannelOrder
 from rdstitch.errors import ArgumentError
 from rdstitch.io.metadata import Metadata, metadata_of
 from rdstitch.io.read import DecodedImage, as_image, from_pillow
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.file_access import canonical_name
 
 

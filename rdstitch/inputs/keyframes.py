@@ -7,6 +7,7 @@ and an affine motion that is fitted to them.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,6 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features.corner_flow import CornerFlow, corners_of, fitted_affine
 from rdstitch.features.prepared_image import PreparedImage
 from rdstitch.results.messages import Message
-from rdstitch.system.dataclasses import dataclass
 
 _SHARED = (0.65, 0.8, 0.9)  # of two frames in a row, in the smaller direction; more where few frames would be left
 _ENOUGH = 12  # frames, from which on fewer shared matches do no harm to λ

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +11,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.crs import WGS84, Crs, load_pyproj, transformed
 from rdstitch.geometry.utm import epsg_of
-from rdstitch.system.dataclasses import dataclass
 
 _PLAIN_TERMS = {"datum": ("WGS84",), "ellps": ("WGS84",), "units": ("m",), "no_defs": ("",), "type": ("crs",)}
 """Terms of PROJ that leave a system one on WGS 84 in metres."""

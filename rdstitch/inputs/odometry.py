@@ -3,6 +3,7 @@
 import cmath
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +12,6 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.inputs.tables import TIME_NAMES, csv_rows, is_number
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.file_access import cached_by_file_state, read_text
 
 _COLUMNS = {"timestamp": TIME_NAMES} | {

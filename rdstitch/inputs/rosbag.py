@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -17,7 +18,6 @@ from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.keyframes import FrameSelection, wanted_frames
 from rdstitch.inputs.odometry import Odometry, odometry_of, yaw_of
 from rdstitch.io.video import write_frame
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.file_access import read_beginning
 
 if TYPE_CHECKING:

@@ -1,6 +1,7 @@
 """The input images: which files, what their headers say, and the camera each was taken with."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -28,7 +29,6 @@ from rdstitch.io.samples import as_alpha
 from rdstitch.options.feature_options import WORK_MEGAPIXELS
 from rdstitch.results.messages import Message, left_out
 from rdstitch.system.cache import Cache
-from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.system.file_access import held_in_memory, is_url
 
 _HELD_UPRIGHT = 6  # EXIF orientation

@@ -19,12 +19,12 @@ import csv
 import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import takewhile
 from math import isfinite
 from typing import Any
 
 from rdstitch.errors import InputError
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.file_access import canonical_text
 from rdstitch.system.records import parse_json
 

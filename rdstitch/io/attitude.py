@@ -18,9 +18,8 @@ of a light sensor on it (``FlightPitchDegree``, ``DLS:Pitch``), is not the camer
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
-
-from rdstitch.system.dataclasses import dataclass
 
 _MAX_LENGTH = 2**20  # characters; drones write 2,000 to 20,000
 _MAX_NUMBER_LENGTH = 64  # characters of a number, and of the space around it

@@ -1,5 +1,6 @@
 """What every image of a camera gets of the light, pixel by pixel, and taking it out of samples."""
 
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,6 @@ from rdstitch.errors import InputError
 from rdstitch.io.opening import check_readable, decoding
 from rdstitch.io.reduction import block_mean
 from rdstitch.io.tiff_pages import image_pages
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import tifffile
 
 

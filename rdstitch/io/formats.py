@@ -1,5 +1,6 @@
 """What the formats of outputs can hold, by the suffix, and whether an image fits; found out before long work."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,6 @@ import numpy as np
 from rdstitch.errors import LimitError, OutputError
 from rdstitch.io.ome_zarr import check_zarr
 from rdstitch.io.strips import ImageSpec
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.outputs import check_suffix
 
 

@@ -1,5 +1,6 @@
 """Masks: images that say which part of another image counts."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ from rdstitch.geometry.exif_orientation import inverse, turned, turned_size
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.samples import OPAQUE, as_alpha
-from rdstitch.system.dataclasses import dataclass
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
@@ -37,7 +38,6 @@ from rdstitch.io.radiometric_tags import Radiometry, read_radiometry
 from rdstitch.io.raw import own_exif, raw_exif, raw_size
 from rdstitch.io.read_tiff import channel_count
 from rdstitch.io.tiff_pages import first_image_pages
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
 

@@ -1,13 +1,13 @@
 """OME-XML: what microscopes' files say of their planes and pixels."""
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
 from rdstitch.errors import InputError
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.records import parse_xml
 
 MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}

@@ -3,12 +3,12 @@
 import base64
 import re
 import struct
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from rdstitch.io.attitude import finite
-from rdstitch.system.dataclasses import dataclass
 
 _IRRADIANCE = ("HorizontalIrradiance", "Irradiance", "SpectralIrradiance")  # MicaSense, DJI: the best first
 _BAND = re.compile(r"[<:\s](?:BandName|CentralWavelength|IrradianceExposureTime)\b")

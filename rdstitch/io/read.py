@@ -1,6 +1,7 @@
 """Reading an image: any common file to an array in RGB order, upright, with its alpha and metadata."""
 
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from rdstitch.io.read_tiff import as_opacity, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME
 from rdstitch.io.tiff_pages import first_image_pages
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.file_access import open_regular, read_beginning
 from rdstitch.system.late_imports import imagecodecs, tifffile
 

@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,6 @@ from rdstitch.io.ome import MICROMETRES, Page, ome_pixel_size, ome_planes, ome_t
 from rdstitch.io.opening import TIFF_MAGIC, decoding
 from rdstitch.io.read_tiff import read_page
 from rdstitch.io.tiff_pages import image_pages
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.file_access import canonical_name, canonical_text, open_regular
 from rdstitch.system.late_imports import tifffile
 

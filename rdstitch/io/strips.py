@@ -1,6 +1,7 @@
 """What is written: an image in strips from top to bottom."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -9,7 +10,6 @@ from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError
 from rdstitch.io.metadata import Metadata
-from rdstitch.system.dataclasses import dataclass, field
 
 # Samples (h, W, C) and alpha (h, W), uint8, or None for opaque.
 Strip = tuple[NDArray[Any], NDArray[np.uint8] | None]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Literal, NamedTuple
 
@@ -14,11 +15,11 @@ from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
 from rdstitch.local_alignment.ground import fit_ground
 from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
-from rdstitch.system.dataclasses import dataclass
 
 # Cells of a grid that finds what is far from the plane, and of the one that is used; nodes of all images together, by
 # which the finer one is coarser for more than some 70 images, and both for more than 800.
 _COARSE, _FINE = (12, 120_000), (24, 40_000)
+_MOST_NODES = 120_000  # of all images together, where the user says how many cells
 _SLOPES = (0.2, 0.06, 0.02)
 _SLOPE_OF_GROUND = 0.5  # one surface for all images: many matches determine it, and it may be freer
 _HELD_OUT = 5  # every fifth match
@@ -56,6 +57,7 @@ class LocalAlignment:
     fields: tuple[DisplacementField, ...]  # one an image; empty where images are not aligned locally
     reason: str  # why they are, or are not
     cells: int = 0  # of the grid along the longer side of an image; 0 without fields
+    by_heights: bool = False  # whether it is the ground that is rough, seen from where the cameras are
     before: HeldOut | None = None  # residuals of held-out matches without fields; None where nothing was tried
     after: HeldOut | None = None  # the same with fields
 
@@ -80,7 +82,9 @@ def align_locally(
 
     By ``choice`` "auto" only where matches that are held out of the fit come nearer by more than fields bend what is
     straight, and by 15 % of their distance or more; a number: always, with so many cells along the longer side of an
-    image. ``homographies`` (N, 3, 3) are of undistorted coordinates, in half diagonals, to the plane, or to directions;
+    image, or fewer where all have too many nodes together.
+
+    ``homographies`` (N, 3, 3) are of undistorted coordinates, in half diagonals, to the plane, or to directions;
     ``pairs``: how many ``matches`` there are, where these come one by one; ``edges`` gives the ends (K, 2, 2) of
     straight edges in each of some images, measured pixels. ``centers`` (N, 3) are where cameras are known to be: below
     each on the plane, and how high above it, in its unit. What heights of the ground explain is not left to fields of
@@ -99,7 +103,8 @@ def align_locally(
     if choice == "auto" and (agreement := _agreement_of_neighbours(placed)) < _MIN_AGREEMENT:
         return no_local_alignment(f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only")
     coarse, fine = (max(2, min(cells, math.isqrt(nodes // len(cameras)))) for cells, nodes in (_COARSE, _FINE))
-    cells = max(coarse, fine) if choice == "auto" else choice
+    most = max(coarse, math.isqrt(_MOST_NODES // len(cameras)))
+    cells = max(coarse, fine) if choice == "auto" else min(choice, most)
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
     fitted, tested = placed.take(~held_out), placed.take(held_out)
     worthwhile = (1.0 - _WORTHWHILE) * _seam_residual(tested.residual)
@@ -121,11 +126,13 @@ def align_locally(
     before, after = HeldOut.of(tested.residual), HeldOut.of(best.residual)
     text = f"matches held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} pixels with it"
     if min(costs) > limit:
-        return LocalAlignment((), f"not worth while; {text}", 0, before, after)
+        return LocalAlignment((), f"not worth while; {text}", before=before, after=after)
     if base is not None:
         text += ", mostly by the height of the ground"
+    if choice not in ("auto", cells):
+        text += f"; a grid of {cells} instead of {choice} cells, the finest that so many images may have"
     final = fit_fields(placed, images, best.fit.stiffness, best.fit, base)
-    return LocalAlignment(final.delivered, text, cells, before, after)
+    return LocalAlignment(final.delivered, text, cells, base is not None, before, after)
 
 
 class _Candidate(NamedTuple):

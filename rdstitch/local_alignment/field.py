@@ -1,6 +1,7 @@
 """A smooth displacement field over one image: a bicubic spline through displacements on a coarse grid."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Self
 
@@ -9,7 +10,6 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, read_only
 from rdstitch.errors import ArgumentError
-from rdstitch.system.dataclasses import dataclass
 
 _DECIMALS = 3  # pixels; what a sidecar stores is what was used
 _APRON = 8  # nodes by which a field goes on as at the border: a spline is level at its end

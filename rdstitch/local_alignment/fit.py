@@ -9,6 +9,7 @@ keeps its equations sparse; the field that is delivered, and judged, is a spline
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -20,7 +21,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.conjugate_gradients import conjugate_gradients
 from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_shape, node_points
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import sparse, sparse_linalg
 
 # Residuals are trusted up to about this many times their median, or their noise where relief makes them larger, but at

@@ -1,6 +1,7 @@
 """Matches of overlapping images on their plane or sphere, and what the alignment leaves over at each of them."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Self
@@ -13,7 +14,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
 from rdstitch.local_alignment.field import DisplacementField
-from rdstitch.system.dataclasses import dataclass, replace
 
 # Share of the image's diagonal: matches farther off are taken to be wrong. Where the ground rises by a tenth of the
 # camera's height, and the alignment is that of the valleys, right ones are nearly as far off.

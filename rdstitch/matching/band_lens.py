@@ -7,6 +7,7 @@ may be reversed: what is compared is where it is strong.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -19,7 +20,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.inputs.source import Source
 from rdstitch.results.messages import Message
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.late_imports import optimize
 
 _MAX_IMAGES = 8  # that are compared

@@ -4,12 +4,13 @@ The paper takes the peak of a histogram of the pairs' λ. Here the votes are wei
 the scatter between pairs is added that the covariances do not explain.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.robust.loss import NORMAL_MEDIAN
-from rdstitch.system.dataclasses import dataclass
 
 _ROUNDS = 20  # of reweighting; three or four are needed
 

@@ -1,6 +1,7 @@
 """Features and matches of a whole set, on disk: between stages, processes and machines travel their names."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -10,7 +11,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features import Correspondences, Features, PackedFeatures
 from rdstitch.geometry.camera import Camera
 from rdstitch.system.cache import Cache, Stored
-from rdstitch.system.dataclasses import dataclass, replace
 
 Size = tuple[int, int]
 

@@ -1,6 +1,7 @@
 """What pairs of images see of λ, of each of their two images on its own."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -11,7 +12,6 @@ from rdstitch.matching.links import spread_choice
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.per_image_distortion import PerImageDistortion, estimate_per_image_distortion
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import sparse, sparse_linalg
 
 _MAX_DISTANCE = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two

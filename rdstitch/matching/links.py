@@ -1,6 +1,7 @@
 """What the adjustment is given: a link, the correspondences of two images that agree with one relation."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -8,7 +9,6 @@ import numpy as np
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.radial_homography import RadialHomography, inverses
-from rdstitch.system.dataclasses import dataclass, replace
 
 
 def spread_choice(points: FloatArray, most: int | None) -> IntArray:

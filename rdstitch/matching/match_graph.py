@@ -1,11 +1,12 @@
 """The match graph: images as nodes, links as edges; its connected parts, spanning tree and centre."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import csgraph, sparse
 
 

@@ -5,6 +5,7 @@ the images into two lenses predicts what every pair sees.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.lens_votes import LensVotes
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.system.dataclasses import dataclass
 
 _STARTS = 5  # divisions that are begun with
 _ROUNDS = 3

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +25,6 @@ from rdstitch.matching.two_view import (
 )
 from rdstitch.robust import EstimationOptions
 from rdstitch.system.cache import NO_CACHE, Cache
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.progress import Progress
 
 _PAIRS_MATCHED_AT_ONCE, _MIN_BATCHES = 32, 8  # pairs of a task at the most; tasks at the least

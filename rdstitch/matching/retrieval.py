@@ -6,6 +6,7 @@ a tree of two levels (Nistér and Stewénius 2006). Two images are alike as far 
 their square, of which 10,000 images take seconds.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.features import Features
 from rdstitch.matching.feature_store import FeatureStore
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import sparse
 
 _FEATURES_PER_IMAGE = 1000  # strongest features that describe an image

@@ -6,6 +6,7 @@ plane moved.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -16,7 +17,6 @@ from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import Pair, PairRegistration
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.late_imports import spatial
 
 _MIN_IMAGES, _MIN_SHARE = 3, 0.5

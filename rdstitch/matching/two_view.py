@@ -5,6 +5,7 @@ and matches, which lie in the cache of the run, and give names back.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from threading import Lock
 from typing import NamedTuple
@@ -19,7 +20,6 @@ from rdstitch.matching.feature_store import StoredFeatures, StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.system.cache import Cache
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.process_memory import return_freed_memory
 
 Pair = tuple[int, int]

@@ -1,6 +1,7 @@
 """Stage: check a registration; what fails a check is left out by name, and the rest is aligned anew."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Scope, messages_of
 from rdstitch.verification.limits import Limits

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -24,7 +25,6 @@ from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.robust.loss import sigma_of
 from rdstitch.system.cache import Cache
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.verification.limits import Limits
 

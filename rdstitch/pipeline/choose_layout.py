@@ -13,6 +13,7 @@ homographies, and, where something fills a good part of the images and moves of 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
@@ -34,7 +35,6 @@ from rdstitch.pipeline.whole_pixels import on_whole_pixels
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.verification.verdict import RefusedError
 
 _MODELS = ("rotation", "pose", "homography")
@@ -140,6 +140,8 @@ def _alternatives(
         return
     if first is not None and first.local.fields and trials.options.local_alignment == "auto":
         yield trials.lay_out(registration, no_local_alignment("seams hold better without it"))
+    if first is not None and first.local.by_heights:
+        return  # parallax that the places of the cameras explain is not that of another model
     if first is not None and (other_surface := _other_surface(registration, first, trials, aligner)) is not None:
         yield other_surface
     for other in _other_models(registration, first, trials.options, aligner):

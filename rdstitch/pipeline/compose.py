@@ -1,6 +1,7 @@
 """The last stage of every image: from registered images to pixels, in memory or in a file with a page beside it."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -33,7 +34,6 @@ from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.stitch_result import OutputImage
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.verification.output_messages import (

@@ -7,6 +7,7 @@ a stretch and with local contrast equalized. Where fewer do, or show few for the
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -22,7 +23,6 @@ from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
 from rdstitch.options.feature_options import CLOSER
 from rdstitch.pipeline.run_on_sources import run_on_sources
 from rdstitch.system.cache import Cache
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.process_memory import reuse_freed_memory
 from rdstitch.system.progress import Progress
 

@@ -1,5 +1,7 @@
 """Stage: images of a registration on the canvas of the output, and what speaks against what is seen there."""
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from rdstitch.compositing.projection import PLANE
@@ -11,7 +13,6 @@ from rdstitch.pipeline.straighten import oriented
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration
-from rdstitch.system.dataclasses import dataclass, replace
 
 _MAX_MAGNIFICATION, _MAX_ASPECT = 4.0, 2.0
 """Of a place over the median one, and of its two directions: those of a plane seen 60 degrees off its normal."""

@@ -1,6 +1,7 @@
 """Which of the given images take the places of registered ones: read, corrected, and with the cameras found then."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from rdstitch.errors import InputError, PartialResultError
 from rdstitch.geometry.camera import Camera
@@ -15,7 +16,6 @@ from rdstitch.sidecar.counterparts import counterparts
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import MatchedBy
 from rdstitch.stage.tile_inputs import tile_frames
-from rdstitch.system.dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
@@ -13,7 +14,6 @@ from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.given_camera import with_camera
 from rdstitch.results.messages import Message
-from rdstitch.system.dataclasses import dataclass, field
 from rdstitch.system.progress import Progress, StageTimer, silent
 
 

@@ -1,6 +1,7 @@
 """All files of a run: named and checked before its work, written with its result."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -17,7 +18,6 @@ from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.system.dataclasses import dataclass, field
 from rdstitch.system.outputs import Outputs, check_not_read, check_outputs, check_suffix, text_bytes
 from rdstitch.viewer.page import viewer_path
 

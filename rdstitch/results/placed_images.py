@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Self
 
@@ -23,7 +24,6 @@ from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.results.registration import Registration
-from rdstitch.system.dataclasses import dataclass, field, replace
 
 _STATIC_SAMPLE, _STATIC_SIDE = 8, 400
 """Images, and pixels of their longer side, that are compared to find what is static in them."""

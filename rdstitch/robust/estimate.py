@@ -1,6 +1,7 @@
 """Homography and distortion of pairs of images from their matches: the public functions."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +18,6 @@ from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
 from rdstitch.robust.pair_models import PlanarPairModel
 from rdstitch.robust.ransac import Hypotheses, ransac
-from rdstitch.system.dataclasses import dataclass, replace
 
 _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
 # matches, with padding, of the pairs in one batch: enough to hide Python's overhead, few enough for the caches

@@ -1,12 +1,12 @@
 """Levenberg-Marquardt for many small problems in lockstep."""
 
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
-from rdstitch.system.dataclasses import dataclass
 
 SHORT_STEP, LOOSE_STEP = 0.3, 1.0
 """Standard deviations of the parameters, all together, of a step that is not worth taking; and where another descent

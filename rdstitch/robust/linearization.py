@@ -6,6 +6,7 @@ With ``z = H p(λ)`` the derivative of the transferred point by H is ``(∂u/∂
 matrix of 3 x 3 times ``p p'``, and nothing of the size of a Jacobian is ever formed.
 """
 
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -15,7 +16,6 @@ from rdstitch.geometry.division_model import distorted_ratio
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
 from rdstitch.robust.loss import loss_ratio, robust_weight
 from rdstitch.robust.measurements import Measurements
-from rdstitch.system.dataclasses import dataclass
 
 _PAIRS = np.triu_indices(3)  # entries of a symmetric matrix of 3 x 3 that determine it
 _ENTRY = np.zeros((3, 3), dtype=np.intp)

@@ -1,6 +1,7 @@
 """The matches of many pairs of images, as robust estimation sees them: one array with the pairs first."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -10,7 +11,6 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
-from rdstitch.system.dataclasses import dataclass
 
 _STEPS_PER_OCTAVE = 4
 _MIN_WIDTH = 16

@@ -1,6 +1,7 @@
 """Minimal solvers as RANSAC sees them: a sample size and a function, all in the half-diagonal frame."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
@@ -10,7 +11,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.division_model import SEARCHED_DISTORTION
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.solvers.solutions import Solutions
-from rdstitch.system.dataclasses import dataclass
 
 # half-diagonal frame: so near to any lens up to a wide angle that some inliers agree
 _SAMPLED_DISTORTION = (0.0, -0.12, -0.3)

@@ -1,6 +1,7 @@
 """Which model of the family describes each of many pairs: the least free one that explains the data."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -12,7 +13,6 @@ from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.robust.posterior import LENS, Evidence, farthest_error, freedom_cost
 from rdstitch.robust.refinement import Fits, PairEquations, PairProblems, refine_pairs
-from rdstitch.system.dataclasses import dataclass, replace
 
 _STEPS = 20  # of refinement; halved or doubled, the median error of λ changes by a sixth at most
 

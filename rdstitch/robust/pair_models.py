@@ -8,6 +8,8 @@ The functions of a model take the states of B pairs at once. The state of the pl
 ``(ψ1, θ1, ψ2, θ2, φ, tx, ty, log height, log focal correction)``; of these the free ones are estimated.
 """
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from rdstitch.arrays import FloatArray
@@ -20,7 +22,6 @@ from rdstitch.geometry.planar_motion import (
     rigid_in_plane,
     rotation_from_tilt,
 )
-from rdstitch.system.dataclasses import dataclass, field
 
 _TILTS, _YAW, _TX, _TY, _HEIGHT, _FOCAL = slice(0, 4), 4, 5, 6, 7, 8
 _PSI, _THETA = (0, 2), (1, 3)

@@ -6,6 +6,7 @@ and the distortion centre, which both images share, are free too.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from rdstitch.robust.levenberg_marquardt import descend
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel
 from rdstitch.robust.refinement import PairProblems
-from rdstitch.system.dataclasses import dataclass
 
 _HOMOGRAPHY = HomographyPairModel()
 _LENS_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of image 1, λ of image 2, μ, and the distortion centre

@@ -39,6 +39,7 @@ tilt of a plane         0 ± 20°; 0 ± 45° (0.2)       what is laid flat is lo
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -46,7 +47,6 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import LENS_STD
-from rdstitch.system.dataclasses import dataclass
 
 TWENTY_TO_ONE = 6.0
 """What odds cost that are said beforehand: a richer lens is rarer, ``pano`` is for turns and ``mosaic`` for planes."""

@@ -3,6 +3,7 @@
 The pairs go on in lockstep, each until it is confident; no pair's result depends on the others.
 """
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,7 +18,6 @@ from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
-from rdstitch.system.dataclasses import dataclass
 
 # Halved or doubled, none of these changes what is found, only the time.
 _FIRST_BATCH, _MAX_BATCH = 48, 512  # samples a turn; every turn has twice as many as the one before

@@ -1,5 +1,6 @@
 """Refinement of homography and λ over all matches of many pairs at once."""
 
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -12,7 +13,6 @@ from rdstitch.robust.linearization import PairLenses, TransferDerivatives, diffe
 from rdstitch.robust.loss import loss_width, noise_of, robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
-from rdstitch.system.dataclasses import dataclass, replace
 
 _STATE = 9  # numbers of a state of any pair model; before these, parameters have those of the lens
 

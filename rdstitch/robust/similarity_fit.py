@@ -1,11 +1,12 @@
 """A similarity of the plane between two sets of points of which some, fewer than half, are wrong."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.robust.loss import robust_weight
-from rdstitch.system.dataclasses import dataclass
 
 OUTLYING = 3.0
 """Standard deviations from which on a point is an outlier."""

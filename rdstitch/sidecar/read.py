@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,6 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.georeference import Georeference, Residual
 from rdstitch.geometry.crs import Crs
 from rdstitch.sidecar.records import VERSION, ImageRecord, OutputRecord, ResidualRecord, SidecarRecord
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.file_access import read_text
 from rdstitch.system.outputs import Fingerprint, fingerprint, tiles_folder
 from rdstitch.system.records import convert, parse_json

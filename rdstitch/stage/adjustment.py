@@ -7,13 +7,13 @@ the model of the stage gives it.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.stage.equations import LinkedPoints, StageEquations, Variances
 from rdstitch.stage.grid import TileGrid
-from rdstitch.system.dataclasses import dataclass
 
 _ROUNDS = 12
 _GENEROUS = 20.0  # widths of the robust loss in the first round; it is halved until it is 1

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -10,7 +11,6 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.stage.coarse_tile import CoarseTile
 from rdstitch.stage.evidence import HUNDRED_TO_ONE, MIN_AXES_EVIDENCE, wide_peaks
 from rdstitch.stage.grid import TileGrid
-from rdstitch.system.dataclasses import dataclass, replace
 
 _TRIED, _ENOUGH = 48, 8  # pairs of an axis that are compared at most, and those with evidence that are enough
 _MIN_RATIO = 1.2  # of evidence for other axes to that as told: where one is right its pairs agree in both

@@ -1,6 +1,7 @@
 """A tile made small, as overlaps are looked for: its content, and how much of that is noise."""
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -9,7 +10,6 @@ from numpy.typing import NDArray
 
 from rdstitch.io.reduction import block_mean
 from rdstitch.robust.loss import normal_std
-from rdstitch.system.dataclasses import dataclass
 
 Image = NDArray[np.float32]
 

@@ -7,6 +7,7 @@ kinds: what blocks show, places against the model of the stage, and what is know
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -15,7 +16,6 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.refinement import BlockMatches
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import sparse, sparse_linalg
 
 _MIN_STD = 0.05  # standard deviation of a block, pixels, below which resampling and the camera do not let it come

@@ -11,6 +11,7 @@ is taken for 0, and the error of the flat field is what D may be instead.
 
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.io.flat_field import FlatField
 from rdstitch.io.reduction import block_mean
 from rdstitch.robust.loss import NORMAL_MEDIAN, normal_std
-from rdstitch.system.dataclasses import dataclass
 
 MIN_TILES = 20  # fewer show one flat field as well as another
 LARGEST_ERROR = 0.01  # root mean square, by which two halves of the tiles may differ from their mean

@@ -1,11 +1,12 @@
 """Nominal places of the tiles, their rows and columns."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import ArgumentError
-from rdstitch.system.dataclasses import dataclass
 
 _SAME_LINE = 0.25  # share of a tile within which places belong to one row or column
 # share of a tile's shorter side along which an overlap is worth comparing: corners of diagonal neighbours are not

@@ -1,9 +1,10 @@
 """What two tiles should have in common, cut into blocks."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.system.dataclasses import dataclass
 
 _BLOCKS = 8  # blocks along a side of a tile: a lens that bends the overlap hardly bends one of them
 _MIN_BLOCK_SIDE = 40  # pixels, from which on a block has enough independent ones for its displacement to be sure

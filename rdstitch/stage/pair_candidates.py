@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,7 +17,6 @@ from rdstitch.stage.evidence import HUNDRED_TO_ONE, WRONG_PEAK, log_evidence, wi
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.overlap import Overlap
 from rdstitch.stage.phase_correlation import Surfaces, correlate, peak_threshold, peaks
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.progress import Progress
 
 Reader = Callable[[int], NDArray[Any]]

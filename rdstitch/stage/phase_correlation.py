@@ -1,6 +1,7 @@
 """Phase correlation of the blocks of an expected overlap, whitened as far as they are more than noise."""
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.stage.coarse_tile import Image, noise_variance
 from rdstitch.stage.overlap import Overlap
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import fft
 
 _TAPER = 0.15  # share of a window on each side over which it falls to 0

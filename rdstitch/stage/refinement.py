@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.stage.coarse_tile import CORRELATED, Image
-from rdstitch.system.dataclasses import dataclass
 
 _SMOOTHING = 1.2  # standard deviation of the filter before derivatives are taken, pixels
 _MARGIN = 5  # pixels of the second tile about a block that are looked at

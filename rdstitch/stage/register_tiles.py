@@ -1,6 +1,7 @@
 """From nominal places and tiles to all places: correlate, learn the stage, refine, adjust."""
 
 import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,7 +16,6 @@ from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.overlap import Overlap
 from rdstitch.stage.pair_candidates import PairFinder, Reader, SearchPlan, in_pairs
 from rdstitch.stage.refinement import BlockMatches, PointMap, refine
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.late_imports import csgraph, sparse
 from rdstitch.system.progress import Progress, silent
 

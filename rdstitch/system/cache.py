@@ -15,6 +15,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import cache
 from pathlib import Path
@@ -24,7 +25,6 @@ from typing import Any, Generic, Self, TypeVar, cast
 import numpy as np
 
 from rdstitch.errors import ArgumentError, InputError, OutputError
-from rdstitch.system.dataclasses import dataclass, field
 from rdstitch.system.file_access import is_url, open_regular, read_limited, remote_status
 from rdstitch.system.temporary_folder import TemporaryFolder
 

@@ -12,13 +12,13 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from rdstitch.errors import OutputError, RdstitchError
 from rdstitch.results.messages import Message
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.file_access import local_file
 from rdstitch.system.temporary_folder import TemporaryFolder
 

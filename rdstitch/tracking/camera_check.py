@@ -1,9 +1,9 @@
 """Whether keyframes agree with what is given of the camera: focal length, tilt, and the times of attitudes."""
 
 import math
+from dataclasses import replace
 
 from rdstitch.alignment.given_checks import LATE, attitudes_late, focal_contradicted, judged_focal
-from rdstitch.system.dataclasses import replace
 from rdstitch.tracking.camera_from_motion import CameraEstimate, SeenPairs, camera_from_motion
 from rdstitch.tracking.camera_knowledge import CameraKnowledge, CameraRevision
 from rdstitch.tracking.frame_links import MATCH_ERROR

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.inputs.delays import DELAY_STD, at_delay, smooth
-from rdstitch.system.dataclasses import dataclass, replace
 
 _POINTS = 32  # of a pair
 _OUTLIER = 3.0  # medians of the errors

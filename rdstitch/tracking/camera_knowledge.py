@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -16,7 +17,6 @@ from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.tracking.metric_plane import MetricPlane
 from rdstitch.tracking.placement import YAW, CameraPose, Placement
 from rdstitch.tracking.tracked_frame import Frame, TrackedFrame

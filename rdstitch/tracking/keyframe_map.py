@@ -2,13 +2,13 @@
 
 from collections import deque
 from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.features import Matcher
 from rdstitch.matching.links import Link
-from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.frame_links import MATCH_ERROR, fitted_homography, links_by_corners, links_by_features
 from rdstitch.tracking.metric_plane import chained

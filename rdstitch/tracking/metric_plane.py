@@ -1,6 +1,7 @@
 """Frames of a camera whose focal length and tilt are known: where they lie on a metric plane, and how surely."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +9,6 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.tracking.placement import HEIGHT, YAW, Placement, PlaneSimilarity, X, Y
 
 _CELLS = 8  # a side of an image: errors of one cell share a part that comes of the lens and the pixels of a place

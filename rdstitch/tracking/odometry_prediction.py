@@ -3,12 +3,12 @@
 import cmath
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.alignment.odometry import OdometryFit, motions_of
 from rdstitch.inputs.odometry import motion_between
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.metric_plane import chained
 from rdstitch.tracking.placement import PlaneSimilarity

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -11,7 +12,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.system.dataclasses import dataclass
 
 _SAMPLES = 5  # points of an image's outline, a side, by which two planes are brought together
 

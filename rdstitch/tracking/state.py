@@ -1,8 +1,7 @@
 """What a tracker is doing on a map, and what leads from one state to the next."""
 
+from dataclasses import dataclass, replace
 from typing import Self
-
-from rdstitch.system.dataclasses import dataclass, replace
 
 _MAX_LOST_FRAMES = 10  # frames in a row without a place, after which a new map begins, if all keyframes were searched
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +14,6 @@ from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane
 from rdstitch.inputs.odometry import BodyPose
-from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.tracking.placement import CameraPose, Placement
 
 MIN_INLIERS = 15

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -16,7 +17,6 @@ from rdstitch.inputs.odometry import BodyPose
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
-from rdstitch.system.dataclasses import dataclass, field, replace
 from rdstitch.tracking.camera_check import check_camera
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.frame_links import agree

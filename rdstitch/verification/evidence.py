@@ -1,6 +1,7 @@
 """What speaks for and against a registration: its matches, its pixels, and motions that it does not explain."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +11,6 @@ from rdstitch.choices import Purpose
 from rdstitch.matching.two_view import Pair
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import NO_CACHE, Cache
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps, share_alike
 

@@ -1,12 +1,12 @@
 """What the rules find: data that repairs are made from, and the one place where they become sentences."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, TypedDict
 
 from rdstitch.results.messages import MAX_NAMED, Message, Severity, names_of, shortened
 from rdstitch.results.registration import Registration
-from rdstitch.system.dataclasses import dataclass, field
 
 
 class Scope(Enum):

@@ -7,6 +7,7 @@ right nearly all cells find it there; elsewhere they find it anywhere.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Self
 
@@ -23,7 +24,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import mean_of_channels
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.verification.limits import Limits
 
 # Boxes, interpolated places and the likeness of two greys are shared with the compositor: none of them knows where a

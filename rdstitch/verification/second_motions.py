@@ -10,6 +10,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,7 +21,6 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import PAIRS_ESTIMATED_AT_ONCE, Pair, PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
-from rdstitch.system.dataclasses import replace
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, overlap_agreement

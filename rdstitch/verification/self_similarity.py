@@ -5,6 +5,7 @@ Padfield 2012). Where the plane is metric a shift by a period of the pattern is 
 """
 
 import math
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,7 +14,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.parabola import parabola_peak
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.photometric_agreement import ComparedImage, Grey
 

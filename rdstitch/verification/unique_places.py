@@ -7,6 +7,7 @@ fits. At the right one, those in the overlap are at the same places in both; at 
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,7 +15,6 @@ import numpy as np
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.parabola import parabola_peak
 from rdstitch.geometry.radial_homography import from_plane, to_plane
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE, ComparedImage, Grey
 from rdstitch.verification.self_similarity import Drawing, Overlaps, draw, drawing_scale
@@ -25,6 +25,8 @@ _MAX_PERIODS = 16  # shifts that an image is compared with itself at
 _MIN_COPIES = 3  # other copies of a place, of which the median is clean though one of them has dirt
 _MARGIN = 6  # pixels at the border of an image, where brightness cannot be removed well
 _MOST = 25.0  # spreads of the copies: a larger departure counts as this
+# Images whose drawings and departures fit into 128 MB at once.
+IMAGES_AT_ONCE = 2**27 // (2 * COMPARED_SIDE**2 * np.dtype(np.float32).itemsize)
 
 
 @dataclass(frozen=True, eq=False)

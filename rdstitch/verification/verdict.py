@@ -1,6 +1,7 @@
 """Every run judges itself: can the result be relied on? ResultEvidence, rules, findings."""
 
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 
 from rdstitch.alignment.result import LinkFit
 from rdstitch.errors import RegistrationError
@@ -8,7 +9,6 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import Pair
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
-from rdstitch.system.dataclasses import replace
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind

@@ -7,6 +7,7 @@ import base64
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -20,7 +21,6 @@ from PIL import Image
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.io.deepzoom import OVERLAP, TILE
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.outputs import tiles_folder
 
 _COLOUR = (0, 229, 255, 255)

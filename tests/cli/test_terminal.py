@@ -59,6 +59,11 @@ def test_the_bar_is_gone_before_lambda(monkeypatch: pytest.MonkeyPatch, capfd: p
         assert left.rstrip(" ").endswith("\r")  # wiped out
 
 
+def test_a_run_goes_on_where_nobody_reads_its_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stderr", Mock(write=Mock(side_effect=BrokenPipeError)))
+    Reporter(1).made("pano.jpg: 2 of 2 images")
+
+
 def test_preview_is_small_and_leaves_what_is_given(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     rdstitch("pano", *frames, "-o", tmp_path / "small.png", "--preview", "--max-size", "200", "-j", "1")
     assert 190 <= max(read_image(tmp_path / "small.png").pixels.shape[:2]) <= 200

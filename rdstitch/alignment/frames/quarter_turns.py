@@ -5,6 +5,7 @@ images among others the distortion centre is mirrored too, which one lens of all
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -19,7 +20,6 @@ from rdstitch.geometry.exif_orientation import inverse, quarter_turn, turning_ma
 from rdstitch.geometry.planar_motion import rigid_in_plane, rotation_from_tilt, tilt_from_normal
 from rdstitch.inputs.source import Source
 from rdstitch.matching.links import Link
-from rdstitch.system.dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)

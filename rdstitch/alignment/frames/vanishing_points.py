@@ -9,6 +9,7 @@ length in half diagonals, ``diag(1, 1, f) x`` is the direction in those axes. Li
 """
 
 import math
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -18,7 +19,6 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.planar_motion import nearest_rotation, rotation_about
 from rdstitch.robust.chance import binomial_tail
-from rdstitch.system.dataclasses import dataclass, replace
 
 _TOLERANCE = math.radians(1.0)  # between an edge and the line from its middle to its vanishing point
 _CROOKED = math.radians(0.2)  # standard deviation of edges that should be parallel, besides that of their ends

@@ -10,6 +10,7 @@ positive definite, nor give the inverse's blocks on the diagonal.
 """
 
 from collections import Counter
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from typing import Self
@@ -17,7 +18,6 @@ from typing import Self
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.system.dataclasses import dataclass
 from rdstitch.system.late_imports import csgraph, sparse
 
 _UNDIVIDED = 20  # images that are eliminated at once: what dense matrices do in less time than further division

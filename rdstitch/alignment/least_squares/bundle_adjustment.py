@@ -4,6 +4,7 @@ Levenberg-Marquardt on a robust loss of the transfer errors in measured pixels, 
 of the loss follows the scatter of the errors, from wide to narrow, so that good links are not lost to a poor start.
 """
 
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -26,7 +27,6 @@ from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 from rdstitch.robust.posterior import costs, curvatures, slopes
-from rdstitch.system.dataclasses import dataclass, replace
 
 MIN_GAIN = 1e-5
 """Expected relative fall of the loss that is worth another step: a hundredth of the noise."""

@@ -6,6 +6,7 @@ as good for finding the minimum; for how far the minimum moves, it is too large 
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -15,7 +16,6 @@ from rdstitch.alignment.least_squares.link_equations import LinearizedErrors, li
 from rdstitch.alignment.least_squares.normal_equations import SparseNormalEquations, link_derivatives
 from rdstitch.arrays import FloatArray
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_slope, robust_weight
-from rdstitch.system.dataclasses import dataclass, replace
 
 Fields = Callable[[LinearizedErrors], FloatArray]
 """Changes (m, 2, C) of the errors of some links, pixels."""

@@ -8,6 +8,7 @@ products of the coordinates of p, are all that is summed: no Jacobian is formed.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -26,7 +27,6 @@ from rdstitch.geometry.radial_homography import (
     whiten,
 )
 from rdstitch.robust.loss import robust_weight
-from rdstitch.system.dataclasses import dataclass
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ parameters. Which poses the links couple is the pattern of the matrix, the same 
 """
 
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -16,7 +17,6 @@ from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.motion_models import ModelMatrices
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
-from rdstitch.system.dataclasses import dataclass, replace
 from rdstitch.system.late_imports import sparse
 
 _LINKS_AT_ONCE = 4096

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -11,7 +12,6 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import Link, spread_choice
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, sigma_of
-from rdstitch.system.dataclasses import dataclass, replace
 
 _CHUNK = 4096  # correspondences linearized at a time: what stays in cache
 _STATIC = 1.0  # pixels that the displacements of most correspondences of a link stay below where the camera stood still

@@ -1,6 +1,7 @@
 """Marks on the plane, as ground control points are: where images show them, and where they are."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -12,7 +13,6 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import inverses
-from rdstitch.system.dataclasses import dataclass, replace
 
 _STEP = 1e-6  # of a lens parameter, for derivatives
 

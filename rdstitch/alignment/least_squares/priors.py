@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -13,7 +14,6 @@ from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.robust.posterior import LENS, TILT, Prior, exact, focal_prior
-from rdstitch.system.dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ What a richer lens gains there is no irregular motion that it takes the blame fo
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -19,7 +20,6 @@ from rdstitch.alignment.pairwise import pairwise_homographies
 from rdstitch.arrays import BoolArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD
 from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, costs
-from rdstitch.system.dataclasses import dataclass, replace
 
 LENSES: dict[str, tuple[str, ...]] = {
     "division": ("distortion",),

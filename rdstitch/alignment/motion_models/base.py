@@ -2,11 +2,11 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.system.dataclasses import dataclass
 
 
 @dataclass(frozen=True, eq=False)

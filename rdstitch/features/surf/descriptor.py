@@ -6,6 +6,7 @@ wavelets, which are not isotropic; and the window has a smooth edge, so that a g
 just in or out. The descriptor holds sums of Haar responses in 4 x 4 cells of a patch that is turned by it.
 """
 
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -16,7 +17,6 @@ from rdstitch.features.keypoints import Features
 from rdstitch.features.surf.hessian import Blobs, find_blobs
 from rdstitch.features.surf.patches import Grey, apply_kernels, integer_kernels, pyramid, sample_patches
 from rdstitch.features.surf.refinement import refine
-from rdstitch.system.dataclasses import dataclass
 
 _THRESHOLD = 100.0  # determinant of the Hessian from which on a blob counts, grey levels²
 _OCTAVES, _LAYERS = 4, 3  # of scale, and scales per octave

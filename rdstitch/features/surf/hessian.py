@@ -5,13 +5,14 @@ So an octave of SURF is the first octave on the next level of a pyramid, and nee
 its own.
 """
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, Rows
 from rdstitch.features.surf.patches import Grey, from_level, pyramid
-from rdstitch.system.dataclasses import dataclass
 
 # The box filter of 9 pixels stands for a Gaussian of σ = 1.2 pixels; larger ones in proportion (§3.3).
 SIGMA_PER_SIZE = 1.2 / 9
