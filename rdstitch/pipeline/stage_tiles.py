@@ -32,7 +32,7 @@ from rdstitch.pipeline.tiles_as_registration import tiles_as_registration
 from rdstitch.results.messages import Message, left_out
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.stage.axes import with_axes_shown
+from rdstitch.stage.axes import with_measured_axes
 from rdstitch.stage.coarse_tile import coarse_tile
 from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
@@ -209,7 +209,7 @@ def _placed(
     read = partial(_plane, sources, options.channel)
     plan = SearchPlan.of(nominal, options.search)
     factor = plan.factor
-    grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
+    grid, shown = with_measured_axes(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
     if shown:
         messages.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
     if grid.pixel_size is not None:
