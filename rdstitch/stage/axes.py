@@ -11,6 +11,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.stage.coarse_tile import CoarseTile
 from rdstitch.stage.evidence import HUNDRED_TO_ONE, MIN_AXES_EVIDENCE, wide_peaks
 from rdstitch.stage.grid import TileGrid
+from rdstitch.stage.pair_candidates import Candidates
 
 _TRIED, _ENOUGH = 48, 8  # pairs of an axis that are compared at most, and those with evidence that are enough
 _MIN_RATIO = 1.2  # of evidence for other axes to that for the nominal ones: where one is right its pairs agree in both
@@ -102,9 +103,9 @@ def _axis(grid: TileGrid, axis: int, read: Callable[[int], CoarseTile], factor: 
         places, nats = wide_peaks(tiles)
         if len(nats):
             best = int(nats.argmax())
-            elsewhere = nats[np.abs(places - places[best]).max(axis=1) > min(tile.grain for tile in tiles)]
+            found = Candidates(places, nats, min(tile.grain for tile in tiles))
             measured.append(places[best] * factor)
-            margins.append(max(0.0, float(nats[best] - elsewhere.max(initial=0.0))))
+            margins.append(max(0.0, float(nats[best]) - found.best_elsewhere(best)))
             if sum(margin > HUNDRED_TO_ONE for margin in margins) == _ENOUGH:
                 break
     return _Axis(np.asarray(step), np.array(measured).reshape(-1, 2), np.array(margins))
