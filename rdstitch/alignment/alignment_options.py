@@ -45,6 +45,8 @@ class AlignmentOptions:
         for name, choices in (("model", get_args(ModelName)), ("lens", get_args(LensName))):
             if getattr(self, name) not in choices:
                 raise ArgumentError(f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}")
+        if self.tilt is not None and np.shape(self.tilt) != (2,):
+            raise ArgumentError(f"tilt must be (psi, theta) in radians, not {self.tilt!r}")
         if not 0.0 <= self.attitudes_std < math.inf:
             raise ArgumentError(f"attitudes_std must be a standard deviation in radians, not {self.attitudes_std}")
         if self.max_matches_per_link < 1:

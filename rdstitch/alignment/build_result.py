@@ -19,6 +19,7 @@ from rdstitch.alignment.uncertainty import considered_covariance, lever_std, pos
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
+from rdstitch.geometry.division_model import nearest_one_parameter
 from rdstitch.geometry.planar_motion import rigid_in_plane
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.matching.match_graph import connected_components
@@ -196,9 +197,9 @@ def _with_lens(adjustment: AdjustedImages, camera: Camera, uncertainty: _Uncerta
 def _nearest_distortion_std(camera: Camera, covariance: FloatArray) -> float:
     """Standard deviation of the λ of the nearest one-parameter lens."""
     gradient = np.zeros(len(covariance))
-    for index, name in enumerate(LENS_PARAMETERS[:3]):
-        value = getattr(camera, name)
-        ends = [replace(camera, **{name: value + step}).nearest_distortion for step in (-_STEP, _STEP)]
+    for index, step in enumerate(_STEP * np.eye(3)):  # without cameras, which may fold at one end
+        lenses = camera.coefficients + np.stack([-step, step])
+        ends = [nearest_one_parameter(camera.squared_radii(), lens[0], lens[1:])[0] for lens in lenses]
         gradient[index] = (ends[1] - ends[0]) / (2.0 * _STEP)
     return math.sqrt(max(float(gradient @ covariance @ gradient), 0.0))
 

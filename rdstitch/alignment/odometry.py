@@ -18,6 +18,7 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.inputs.odometry import BodyPose, motion_between
 
+_EXACT = 1e-6  # of the longest step: no odometry is more exact, whatever it states
 _WHEELS = 0.01  # relative standard deviation of what all distances share: the size of the wheels
 _LEVER = 0.5  # units of the odometry: how far from the body's origin cameras are
 _ROUNDS, _HUBER = 5, 2.0  # wheels slip
@@ -52,7 +53,8 @@ class OdometryFit:
             return None
         design = np.stack([camera, 1.0 - np.exp(1j * turn)], axis=1).astype(np.complex128)
         # What images are off by does not become less where a body hardly moves.
-        weight, prior = 1.0 / np.maximum(variance, variance.mean()), np.diag([0.0, 1.0 / _LEVER**2])
+        least = max(variance.mean(), (_EXACT * np.abs(body).max()) ** 2)
+        weight, prior = 1.0 / np.maximum(variance, least), np.diag([0.0, 1.0 / _LEVER**2])
         rest = np.ones(len(body))
         for _ in range(_ROUNDS):
             by = design.conj().T * (weight * rest)

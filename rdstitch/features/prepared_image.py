@@ -85,8 +85,7 @@ def prepare(
     view: View, work_megapixels: float | None, *, stretch: Stretch | None = None, equalize: bool = False
 ) -> PreparedImage:
     """Make an image ready for detection; see :func:`rdstitch.features.detect.detect` for what it may be."""
-    image, mask = view.image, view.mask
-    _check(image)
+    image, mask = _checked(view.image), view.mask
     usable = _usable(image, mask)
     if image.ndim == 3 and image.shape[2] > 4:
         image = _grey(image)
@@ -108,11 +107,15 @@ def prepare(
     return PreparedImage(grey, clearance, shrink, view.full_size)
 
 
-def _check(image: PixelArray) -> None:
+def _checked(image: PixelArray) -> PixelArray:
+    """The image in the order of bytes of this machine, float32 where it is of any float."""
+    image = np.asarray(image, image.dtype.newbyteorder("="))
     if image.ndim not in (2, 3) or image.size == 0:
         raise ArgumentError(f"expected an image of shape (height, width[, bands]), not {image.shape}")
     if image.dtype.kind != "f" and image.dtype not in (np.uint8, np.uint16):
         raise ArgumentError(f"expected an image of uint8, uint16 or float, not {image.dtype}")
+    with np.errstate(over="ignore"):  # to inf, where nothing is detected
+        return np.asarray(image, np.float32) if image.dtype.kind == "f" else image
 
 
 def _usable(image: PixelArray, mask: Mask | None) -> NDArray[np.bool_] | None:
@@ -131,9 +134,7 @@ def _usable(image: PixelArray, mask: Mask | None) -> NDArray[np.bool_] | None:
 
 
 def _grey(image: PixelArray) -> PixelArray:
-    """Luminance of grey, grey with alpha, RGB and RGB with alpha; the mean of more bands. float64 counts as float32."""
-    if image.dtype.kind == "f":
-        image = image.astype(np.float32)
+    """Luminance of grey, grey with alpha, RGB and RGB with alpha; the mean of more bands."""
     if image.ndim == 2:
         return image
     if image.shape[2] < 3:
@@ -146,8 +147,8 @@ def _grey(image: PixelArray) -> PixelArray:
 
 def usual_stretch(view: View) -> Stretch | None:
     """The stretch that uses 8 bits best for one image; None where all of it is masked."""
-    _check(view.image)
-    return _stretch(_grey(view.image), _usable(view.image, view.mask))
+    image = _checked(view.image)
+    return _stretch(_grey(image), _usable(image, view.mask))
 
 
 def common_stretch(usual: Iterable[Stretch | None]) -> Stretch | None:

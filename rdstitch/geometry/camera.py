@@ -10,6 +10,7 @@ coefficients.
 """
 
 import math
+import operator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
@@ -141,11 +142,20 @@ class Camera:
 
     def __post_init__(self) -> None:
         """Fill in the image centre and check every value."""
-        width, height = self.image_size
+        try:
+            width, height = map(operator.index, self.image_size)
+        except (TypeError, ValueError):
+            raise ArgumentError(f"image size must be two whole numbers of pixels, not {self.image_size}") from None
         if width < 1 or height < 1:
             raise ArgumentError(f"image size must be at least 1 x 1 pixel, not {width} x {height}")
+        object.__setattr__(self, "image_size", (width, height))
         if self.center is _IMAGE_CENTER:
             object.__setattr__(self, "center", self.image_center)
+        for name in ("center", "tilt", "tilt_std"):  # tuples, whatever was given: cameras are compared and hashed
+            if (values := getattr(self, name)) is not None:
+                object.__setattr__(self, name, tuple(map(float, values)))
+        if (rows := self.lens_covariance) is not None:
+            object.__setattr__(self, "lens_covariance", tuple(tuple(map(float, row)) for row in rows))
         self._check_numbers()
         self._check_focal()
         self._check_lens()
@@ -212,7 +222,7 @@ class Camera:
         """
         if not self.higher:
             return self.distortion, 0.0, 0.0
-        radii = np.sqrt(self._radii2())
+        radii = np.sqrt(self.squared_radii())
         excess = self.excess_radius(radii)
         nearest, _ = nearest_one_parameter(radii**2, self.distortion, self.higher)
         return nearest, float(np.sqrt(np.mean(excess**2))), float(np.abs(excess).max())
@@ -225,7 +235,7 @@ class Camera:
         radii : ndarray of shape (N,)
             Where this lens measures them, half diagonals from the distortion centre.
         """
-        nearest, scale = nearest_one_parameter(self._radii2(), self.distortion, self.higher)
+        nearest, scale = nearest_one_parameter(self.squared_radii(), self.distortion, self.higher)
         straight = undistort(np.stack([radii, np.zeros_like(radii)], axis=-1), self.distortion, self.higher)
         other = distort(straight / scale, nearest)[..., 0]
         return np.asarray((radii - other) * self.scale)
@@ -241,7 +251,7 @@ class Camera:
         farthest = (max(c, n - 1 - c) + 0.5 for c, n in zip(self.center, self.image_size, strict=True))
         return min(math.hypot(*farthest), self.image_circle or math.inf) / self.scale
 
-    def _radii2(self) -> FloatArray:
+    def squared_radii(self) -> FloatArray:
         """Squared radii, half diagonals, of points evenly over the image, as far as it can be undistorted."""
         x, y = self.normalize(points_over(self.image_size, _GRID)).T
         squares: FloatArray = x**2 + y**2

@@ -23,15 +23,18 @@ def conjugate_gradients(
     """
     x, left, ones = start, right - matrix @ start, np.ones(len(right))
     enough = tolerance**2 * (right**2).sum(axis=0)
-    direction, previous = np.zeros_like(x), np.ones(x.shape[1])
+    direction, previous, definite = np.zeros_like(x), np.ones(x.shape[1]), np.ones(x.shape[1], dtype=np.bool_)
     for _ in range(_MAX_STEPS):
-        going = ones @ left**2 > enough
+        going = definite & (ones @ left**2 > enough)
         if not going.any():
             break
         better = precondition(left)
         now = ones @ (left * better)
-        direction = better + now / previous * direction
+        direction = np.where(going, better + now / previous * direction, 0.0)
         along = matrix @ direction
-        step = np.where(going, now, 0.0) / np.where(going, ones @ (direction * along), 1.0)
+        curvature = ones @ (direction * along)
+        definite &= ~going | (curvature > 0.0)  # else nothing better is known than what was reached
+        going &= definite
+        step = np.where(going, now, 0.0) / np.where(going, curvature, 1.0)
         x, left, previous = x + step * direction, left - step * along, np.where(going, now, 1.0)
     return x

@@ -242,7 +242,8 @@ class RadialHomography:
     motion : PlanarMotion or None
         The motion where the model is one of planar motion.
     rms : float
-        Root mean square error of the inliers, pixels of image 2.
+        Root mean square error of the inliers: of their transfer, pixels of image 2, over what one pixel in each image
+        does to it.
     solver : str
         Minimal solver that found the model.
     iterations : int

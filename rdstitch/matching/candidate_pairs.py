@@ -153,7 +153,8 @@ def _shares_seen(cameras: Sequence[Camera], homographies: FloatArray, pairs: Int
     fraction = (np.arange(_PLACES_PER_SIDE) + 0.5) / _PLACES_PER_SIDE
     grid = np.stack(np.meshgrid(fraction, fraction), axis=-1).reshape(-1, 2)
     different = list(dict.fromkeys(cameras))  # most images are of one
-    of_image = np.array([different.index(camera) for camera in cameras])
+    index = {camera: k for k, camera in enumerate(different)}
+    of_image = np.array([index[camera] for camera in cameras])
     result = np.empty(len(pairs))
     for kinds in np.unique(of_image[pairs], axis=0):
         chosen = np.flatnonzero((of_image[pairs] == kinds).all(axis=1))

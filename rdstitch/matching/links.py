@@ -49,6 +49,8 @@ class Link:
             raise ArgumentError(f"image {self.image1} cannot be linked with itself")
         if self.points1.shape != self.points2.shape or self.points1.ndim != 2 or self.points1.shape[1] != 2:
             raise ArgumentError(f"expected points (M, 2), not {self.points1.shape} and {self.points2.shape}")
+        if not (np.isfinite(self.points1).all() and np.isfinite(self.points2).all()):
+            raise ArgumentError(f"images {self.image1} and {self.image2} are linked by points that are not finite")
         if not self.relation:
             raise ArgumentError(f"images {self.image1} and {self.image2}: a failed fit makes no link")
 

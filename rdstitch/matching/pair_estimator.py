@@ -37,10 +37,11 @@ class FeatureMatching:
     matcher: Matcher
     ratio: float | None = None  # largest ratio of distances of a match; None: what suits the features
     network: str | Path | None = None  # ONNX file of the network that matches them instead
+    name: str | None = None  # of another matcher than that by ratios or a network
 
     def key(self, cache: Cache) -> tuple[float | str | None, ...]:
         """Stands for it in the inputs of results."""
-        return self.ratio, None if self.network is None else cache.file(self.network)
+        return self.ratio, self.name if self.network is None else cache.file(self.network)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ a board that is shifted by a square is as flat as before. It is not for the plac
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from rdstitch.features import Correspondences, Features, match_near
 from rdstitch.matching.feature_store import StoredMatches
-from rdstitch.matching.pair_estimator import PairEstimator
+from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
 from rdstitch.matching.two_view import PairRegistration, Transfer
 
 _MIN_REPETITION = 0.1
@@ -56,10 +57,10 @@ def match_repeated_patterns(estimator: PairEstimator, pairs: list[PairRegistrati
     if not shows_repeated_pattern(estimator):
         return pairs
     weak = [k for k, pair in enumerate(pairs) if not pair.relation or pair.relation.inliers.sum() < _FEW_INLIERS]
-    chosen, features = [pairs[k].images for k in weak], estimator.features
-    matched = [StoredMatches.of(match_pattern(features[i], features[j])) for i, j in chosen]
-    distortion = estimator.estimation.distortion
-    rematched = estimator.estimate_matched(chosen, matched, distortion, "matching a repeated pattern")
+    chosen, distortion = [pairs[k].images for k in weak], estimator.estimation.distortion
+    by_pattern = replace(estimator, matching=FeatureMatching(match_pattern, name="repeated pattern"))
+    matched = by_pattern.match(chosen, "matching a repeated pattern")
+    rematched = estimator.estimate_matched(chosen, matched, distortion, "registering pairs")
     result = list(pairs)
     for k, pair in zip(weak, rematched, strict=True):
         inliers = pair.relation.inliers.sum()

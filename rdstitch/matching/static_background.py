@@ -5,6 +5,7 @@ the camera stood still; images far apart, which share nothing else, always do. W
 plane moved.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
@@ -13,7 +14,7 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Correspondences
-from rdstitch.matching.feature_store import FeatureStore
+from rdstitch.matching.feature_store import FeatureStore, Size
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import Pair, PairRegistration
@@ -96,7 +97,9 @@ def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], t
     The latter were matched otherwise at first; once the others are gone, they would find what is static, too.
     """
     moving = [np.ones(count, dtype=np.bool_) for count in features.counts]
-    begun = [np.empty((0, 2))]
+    places = defaultdict[Size | None, list[FloatArray]](
+        list
+    )  # by the size of the images: pixels of others are elsewhere
     for pair in pairs:
         motion = _Motion.of(pair, threshold)
         # Of a static pair all that move little, of others those of an overlay.
@@ -104,15 +107,24 @@ def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], t
         matched = motion.matches.take(np.flatnonzero(static_matches))
         moving[pair.image1][matched.indices[:, 0]] = False
         moving[pair.image2][matched.indices[:, 1]] = False
-        begun.append(matched.points1)
-    places, radius = np.concatenate(begun), threshold * _MAX_STATIC_MOTION
-    confirmations = spatial.cKDTree(places).query_ball_point(places, radius, return_length=True)
-    static = spatial.cKDTree(places[confirmations >= _MIN_CONFIRMATIONS])
+        size1, size2 = pair.relation.camera.image_size, pair.relation.camera2.image_size
+        places[size1].append(matched.points1)
+        if size2 != size1:
+            places[size2].append(matched.points2)
+    radius = threshold * _MAX_STATIC_MOTION
+    static = {size: _confirmed(np.concatenate(of_size), radius) for size, of_size in places.items()}
     for loaded, kept in zip(features, moving, strict=True):
-        kept &= ~np.isfinite(static.query(loaded.points, distance_upper_bound=radius)[0])
+        if loaded.image_size in static:
+            kept &= ~np.isfinite(static[loaded.image_size].query(loaded.points, distance_upper_bound=radius)[0])
     return FeatureStore(
         tuple(stored.take(np.flatnonzero(kept)) for stored, kept in zip(features.items, moving, strict=True))
     )
+
+
+def _confirmed(places: FloatArray, radius: float) -> "spatial.cKDTree":
+    """Places (N, 2) that lie within the radius, pixels, of several."""
+    confirmations = spatial.cKDTree(places).query_ball_point(places, radius, return_length=True)
+    return spatial.cKDTree(places[confirmations >= _MIN_CONFIRMATIONS])
 
 
 def show_motion(pairs: Sequence[PairRegistration], count: int, threshold: float) -> bool:

@@ -35,6 +35,15 @@ class PairMatches:
     quality: FloatArray | None = None  # (N,): how much each match can be trusted, the higher the better
     tilts: FloatArray | None = None  # (2, 2): known (ψ, θ) of both images, radians
 
+    def __post_init__(self) -> None:
+        checked_matches(self.points1, self.points2)
+        if self.camera1.focal is None or self.camera2.focal is None:
+            raise ArgumentError("the cameras of a pair need focal lengths: see Camera.with_focal")
+        if self.quality is not None and self.quality.shape != (len(self),):
+            raise ArgumentError(f"quality must have shape ({len(self)},), not {self.quality.shape}")
+        if self.tilts is not None and self.tilts.shape != (2, 2):
+            raise ArgumentError(f"tilts must have shape (2, 2), not {self.tilts.shape}")
+
     def __len__(self) -> int:
         """Number of matches."""
         return len(self.points1)
@@ -105,7 +114,7 @@ def estimate_radial_homography(
     quality : array_like of shape (N,), optional
         How much each match can be trusted, the higher the better: better matches are sampled first (PROSAC).
     threshold : float
-        Largest transfer error of an inlier, pixels of image 2.
+        Largest error of an inlier: of its transfer, in pixels of image 2, over what one pixel in each image does to it.
     confidence : float
         Probability with which no better model was missed when sampling stops.
     max_iterations : int
@@ -132,14 +141,18 @@ def estimate_radial_homography(
     (True, 'rigid')
     """
     camera1 = Camera(image_size, focal=focal, focal_source=None if focal is None else focal_source or "option")
-    camera1 = (camera1 if center is None else replace(camera1, center=center)).with_focal()
+    size2 = image_size2 or image_size
+    if center is not None:
+        if (image_size[0] - image_size[1]) * (size2[0] - size2[1]) < 0:
+            raise ArgumentError(
+                "center goes with no image_size2 that is turned by a quarter: to which side is not known"
+            )
+        camera1 = replace(camera1, center=center)
     options = EstimationOptions(solver, threshold, confidence, max_iterations, seed, distortion)
-    tilts = _tilts(tilt)
     p1, p2 = checked_matches(points1, points2)
     weights = None if quality is None else np.asarray(quality, dtype=np.float64)
-    if weights is not None and weights.shape != (len(p1),):
-        raise ArgumentError(f"quality must have shape ({len(p1)},), not {weights.shape}")
-    pair = PairMatches(p1, p2, camera1, camera1.resized(image_size2 or image_size), weights, tilts)
+    camera1 = camera1.with_focal()
+    pair = PairMatches(p1, p2, camera1, camera1.resized(size2), weights, _tilts(tilt))
     return estimate_radial_homographies([pair], options)[0]
 
 
@@ -222,7 +235,10 @@ def _tilts(tilt: ArrayLike | None) -> FloatArray | None:
     """Of both images."""
     if tilt is None:
         return None
-    angles = np.asarray(tilt, dtype=np.float64)
+    try:
+        angles = np.asarray(tilt, dtype=np.float64)
+    except (TypeError, ValueError):
+        angles = np.empty(0)
     if angles.shape not in ((2,), (2, 2)) or not np.isfinite(angles).all():
         raise ArgumentError(f"tilt must be (psi, theta) or one such pair an image, finite, not {tilt!r}")
     return np.broadcast_to(angles, (2, 2))

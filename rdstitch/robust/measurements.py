@@ -14,6 +14,7 @@ from rdstitch.geometry.camera import Camera
 
 _STEPS_PER_OCTAVE = 4
 _MIN_WIDTH = 16
+_FARTHEST = 1e9  # pixels: squares of squares of them are still numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +88,8 @@ def checked_matches(points1: ArrayLike, points2: ArrayLike) -> tuple[FloatArray,
             raise ArgumentError(f"{name} must have shape (N, 2), not {points.shape}")
         if not np.isfinite(points).all():
             raise ArgumentError(f"{name} has values that are not finite")
+        if not (np.abs(points) < _FARTHEST).all():
+            raise ArgumentError(f"{name} has values that are no pixels: {np.abs(points).max():.3g}")
     if len(p1) != len(p2):
         raise ArgumentError(f"points1 and points2 differ in length: {len(p1)} and {len(p2)}")
     return p1, p2

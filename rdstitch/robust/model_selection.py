@@ -99,7 +99,7 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
     rms = np.stack([rms_of(each.equations.errors, pairs.threshold) for each in fitted], axis=1)
     result: dict[int, PairFit] = {}
 
-    def finished(index: int, rows: IntArray) -> dict[int, PairFit]:
+    def finished(index: int, rows: IntArray, why: str) -> dict[int, PairFit]:
         model, fits, equations = fitted[index]
         fits = fits.take(rows)
         selected = pairs.at(fitted[index].fits).take(rows)
@@ -107,18 +107,25 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
             equations = selected.problems(model).normal_equations(fits.parameters)
         else:
             equations = equations.take(rows)
-        reasons = [_explained(fitted, index, rms[k]) for k in rows]
+        reasons = [_explained(fitted, index, rms[k], why) for k in rows]
         return dict(zip(rows.tolist(), _finished(_Fitted(model, fits, equations), selected, reasons), strict=True))
 
     for index in range(len(fitted)):
         rows = np.flatnonzero(chosen == index)
         if len(rows):
-            result.update(finished(index, rows))
+            free = index == len(fitted) - 1
+            why = (
+                "no model with less freedom explains the data"
+                if free
+                else "the least free model that explains the data"
+            )
+            result.update(finished(index, rows, why))
     # A camera that turns on the spot moves like one beside a plane seen edge on, where tilt, focal length and λ cannot
     # be distinguished; as a free homography the same images may show λ well.
     unseen = [row for row, fit in result.items() if chosen[row] < len(planar) and np.isinf(fit.distortion_std)]
     if unseen:
-        free_fits = finished(len(planar), np.array(sorted(unseen), dtype=np.intp))
+        why = "models with less freedom explain the data, and do not show λ"
+        free_fits = finished(len(planar), np.array(sorted(unseen), dtype=np.intp), why)
         result.update({row: fit for row, fit in free_fits.items() if np.isfinite(fit.distortion_std)})
     return [result[row] for row in range(len(pairs.data))]
 
@@ -167,8 +174,7 @@ def rms_of(errors: FloatArray, threshold: float) -> FloatArray:
     return np.asarray(np.sqrt(np.where(count > 0, total, np.nan) / np.maximum(count, 1)))
 
 
-def _explained(fitted: list[_Fitted], chosen: int, rms: FloatArray) -> str:
-    """One clause on why this model and not another."""
+def _explained(fitted: list[_Fitted], chosen: int, rms: FloatArray, why: str) -> str:
+    """Which model was chosen and why, with the errors that each leaves."""
     listed = ", ".join(f"{one.model.name} {value:.2f} pixels" for one, value in zip(fitted, rms, strict=True))
-    why = "no model with less freedom" if chosen == len(fitted) - 1 else "the least free model that"
-    return f"{fitted[chosen].model.name}: {why} explains the data (rms {listed})"
+    return f"{fitted[chosen].model.name}: {why} (rms {listed})"

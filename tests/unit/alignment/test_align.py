@@ -12,7 +12,7 @@ from examples.judging.trajectories import compare_trajectories
 from examples.worlds.alignment_scenes import Scene, aligned, grid, jittered, robot_path, scene
 from rdstitch.alignment import AlignmentOptions, AlignmentTask, GivenImages, align, most_matches_read
 from rdstitch.alignment.adjusted_images import AdjustedImages
-from rdstitch.alignment.build_result import build_alignment
+from rdstitch.alignment.build_result import _nearest_distortion_std, build_alignment
 from rdstitch.alignment.frames.reference_frame import in_frame_of
 from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
@@ -334,6 +334,11 @@ def test_links_need_no_more_matches_than_are_read(most: int, read: int | None) -
     assert [most_matches_read(links, options) for links in (10, 100, 6000, 50_000)] == [None, 100, 83, 40]
 
 
+def test_a_lens_at_the_limit_of_folding_has_a_deviation() -> None:
+    found = _nearest_distortion_std(Camera((640, 480), 0.999995), np.diag([1e-4, 0.0, 0.0]))
+    assert found == pytest.approx(0.01, rel=1e-3)
+
+
 def test_mistakes_of_the_caller() -> None:
     rng = np.random.default_rng(15)
     given = scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng)
@@ -350,6 +355,8 @@ def test_mistakes_of_the_caller() -> None:
         AlignmentOptions(model="affine")
     with pytest.raises(ArgumentError, match="with itself"):
         replace(given.links[0], image2=0)
+    with pytest.raises(ArgumentError, match="not finite"):
+        replace(given.links[0], points1=given.links[0].points1 * np.nan)
     failed = RadialHomography.failed("none", Camera((4, 3)), Camera((4, 3)), 0)
     with pytest.raises(ArgumentError, match="failed fit"):
         replace(given.links[0], relation=failed)
@@ -359,6 +366,7 @@ def test_mistakes_of_the_caller() -> None:
     ("options", "named"),
     [
         ({"attitudes_std": math.nan}, "attitudes_std"),
+        ({"tilt": (0.1, 0.2, 0.3)}, "tilt must be"),
         ({"attitudes": np.full((2, 2), np.nan)}, "finite angles"),
         ({"positions": np.zeros((2, 2)), "positions_std": np.zeros(2)}, "must be positive"),
         ({"positions": np.zeros((2, 2)), "positions_std": np.ones(1)}, "positions_std must have the shape"),

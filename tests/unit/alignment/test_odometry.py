@@ -56,6 +56,15 @@ def test_the_scale_and_the_mount_are_found_as_well_as_it_says() -> None:
     assert OdometryFit.of([]) is None
 
 
+def test_odometry_that_states_no_error_has_one() -> None:
+    path = _path()
+    bodies = _bodies(replace(path, position=path.position * HEIGHT), 0.02)
+    exact = scaled_by_odometry(path, [body._replace(variance=0.0) for body in bodies], keep_unit=False)
+    assert exact is not None
+    assert exact[0].height[0] == pytest.approx(HEIGHT, rel=0.05)
+    assert 0.01 < exact[1].relative_std < 0.03
+
+
 def test_frames_without_texture_get_their_poses() -> None:
     whole = _path()
     metres = replace(whole, position=whole.position * HEIGHT, height=whole.height * HEIGHT)

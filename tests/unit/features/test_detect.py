@@ -139,6 +139,15 @@ def test_deeper_images_are_stretched(image: NDArray[np.uint8]) -> None:
         assert np.median(np.linalg.norm(found.points1 - found.points2, axis=1)) < 0.05
 
 
+def test_any_float_and_any_order_of_bytes_has_the_same_features(image: NDArray[np.uint8]) -> None:
+    grey, options = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8), FeatureOptions(work_megapixels=0.02)
+    for same in ((np.float32, ">f4", np.float16, np.float64, np.longdouble), (np.uint16, ">u2")):
+        points = [detect(grey.astype(kind), options).points for kind in same]
+        assert len(points[0]) > 20
+        for found in points[1:]:
+            np.testing.assert_array_equal(found, points[0])
+
+
 def test_grey_layouts_agree(image: NDArray[np.uint8]) -> None:
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     opaque = np.full_like(grey, 255)

@@ -9,6 +9,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry import division_model
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.conjugate_gradients import conjugate_gradients
 from rdstitch.geometry.division_model import distort, horizon_radius, nearest_one_parameter, undistort, valid_radius
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.planar_motion import PlanarMotion
@@ -81,6 +82,20 @@ def test_pixels_and_normalized_coordinates_agree() -> None:
     lifted = np.column_stack([camera.undistort(points), np.ones(2)]) @ relation.homography_px.T
     expected = relation.camera2.distort(lifted[:, :2] / lifted[:, 2:])
     np.testing.assert_allclose(relation.transfer(points), expected, atol=1e-9)
+
+
+def test_cameras_are_of_whole_pixels_and_can_be_compared() -> None:
+    listed = Camera([640, 480], center=[319.5, 239.5], tilt=np.zeros(2), tilt_std=[0.1, 0.1])  # type: ignore[arg-type]
+    assert {listed} == {Camera((640, 480), tilt=(0.0, 0.0), tilt_std=(0.1, 0.1))}
+    for size in ((640.5, 480), (640,), 640):
+        with pytest.raises(ArgumentError, match="whole numbers"):
+            Camera(size)  # type: ignore[arg-type]
+
+
+def test_conjugate_gradients_stop_where_a_matrix_is_not_positive() -> None:
+    right = np.ones((2, 1))
+    found = conjugate_gradients(np.diag([1.0, -1.0]), right, np.zeros((2, 1)), lambda left: left, 1e-9)
+    assert np.isfinite(found).all()
 
 
 def test_a_failed_fit_is_falsy_and_says_why() -> None:
@@ -175,7 +190,7 @@ def test_what_a_fisheye_sees_beyond_the_horizon_is_masked(coefficients: tuple[fl
 def test_nearest_lambda_is_what_a_fit_of_measured_points_gives() -> None:
     lens = Camera((640, 480), -0.45, -0.06, (330.0, 230.0), distortion3=-0.01)
     nearest, rms, largest = lens.one_parameter_fit()
-    radii = np.sqrt(lens._radii2())
+    radii = np.sqrt(lens.squared_radii())
     assert nearest_one_parameter(radii**2, nearest)[0] == pytest.approx(nearest, abs=1e-12)
 
     def misfit(distortion: float, scale: float) -> float:

@@ -196,6 +196,20 @@ def test_of_a_turn_neighbours_are_those_that_see_a_part_of_each_other(focal: flo
     assert (0, count - 1) in found
 
 
+def test_cameras_of_their_own_are_not_compared_with_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras, compared, equal = [Camera((640, 480), focal=500.0 + k) for k in range(60)], list[Camera](), Camera.__eq__
+
+    def counted(one: Camera, other: object) -> bool:
+        compared.append(one)
+        return equal(one, other)
+
+    monkeypatch.setattr(Camera, "__eq__", counted)
+    places = np.tile(np.eye(3), (60, 1, 1))
+    places[:, 0, 2] = np.arange(60.0)
+    loop_closures(cameras, places, set())
+    assert len(compared) < 200
+
+
 def _some_features(count: int, size: tuple[int, int]) -> Features:
     rng = np.random.default_rng(0)
     points = rng.uniform((-0.5, -0.5), np.array(size) - 0.5, (count, 2))

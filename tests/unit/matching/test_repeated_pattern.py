@@ -1,6 +1,8 @@
 """What misleads matching: rough ground, one that stays with the camera, repeated patterns, the same pixels twice."""
 
 import tracemalloc
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
@@ -11,14 +13,16 @@ import pytest
 import rdstitch
 from examples.worlds.correspondences import stored
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.features import Correspondences, FeatureOptions, Features, detect
+from rdstitch.features import Correspondences, FeatureOptions, Features, detect, match
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
-from rdstitch.matching.repeated_pattern import _MIN_REPETITION, match_pattern, repetition
+from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
+from rdstitch.matching.repeated_pattern import _MIN_REPETITION, match_pattern, match_repeated_patterns, repetition
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features, show_motion
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, sequence_over
 
 CAMERA = Camera((640, 480), -0.2)
@@ -174,8 +178,40 @@ def test_a_place_is_static_from_three_static_matches_on(pairs: int, left: int) -
     seen = [_with_overlay(8, 0, 1 + k, seed=k) for k in range(pairs)]
     one, points = np.ones(48), seen[0].correspondences.points1.copy()
     points[40:] += (0.6, 0.7)  # nearer than a static match moves
-    features = [Features(points, np.zeros((48, 8), np.float32), one, one, one, None, "made up")] * 6
+    features = [Features(points, np.zeros((48, 8), np.float32), one, one, one, None, "made up", LENS.image_size)] * 6
     assert len(moving_features(FeatureStore.of(features), seen, THRESHOLD)[5]) == left
+
+
+def test_a_place_is_static_in_images_of_the_same_size_only() -> None:
+    small = [_still(np.zeros(40), *images) for images in ((0, 1), (1, 2), (0, 2))]
+    large, seen = Camera((4000, 3000)), _still(np.full(40, 30.0), 3, 4)
+    pairs = [*small, replace(seen, relation=replace(seen.relation, camera=large, camera2=large))]
+    one, points = np.ones(40), seen.correspondences.points1
+    features = [
+        Features(points, np.zeros((40, 8), np.float32), one, one, one, None, "made up", lens.image_size)
+        for lens in (LENS, LENS, LENS, large, large)
+    ]
+    assert [len(left) for left in moving_features(FeatureStore.of(features), pairs, THRESHOLD)] == [0, 0, 0, 40, 40]
+
+
+def test_pairs_of_a_board_are_matched_where_others_are(board: Sequence) -> None:
+    said, tasks = list[str](), list[object]()
+
+    class Counting(ThreadPoolExecutor):
+        def submit(self, run: Callable[..., object], /, *arguments: object, **named: object) -> Future[object]:  # type: ignore[override]
+            tasks.append(run)
+            return super().submit(run, *arguments, **named)
+
+    features = FeatureStore.of([_features(board, k) for k in range(3)])
+    with Counting(1) as executor:
+        cameras, options = [_LENS.with_focal()] * 3, EstimationOptions()
+        matching = FeatureMatching(match)
+        estimator = PairEstimator(features, cameras, matching, options, lambda stage, *_: said.append(stage), executor)
+        failed = [replace(_failed(i, j)) for i, j in ((0, 1), (1, 2))]
+        found = match_repeated_patterns(estimator, failed)
+    assert all(pair.relation for pair in found)
+    assert said[:2] == ["matching a repeated pattern"] * 2
+    assert len(tasks) > 2
 
 
 _SIDE = 40

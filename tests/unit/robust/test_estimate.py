@@ -30,6 +30,8 @@ TRUE = MATCHES.truth.motion
         ({"tilt": (0.1, 0.2, 0.3)}, "tilt must be"),
         ({"tilt": (np.nan, 0.2)}, "tilt must be"),
         ({"tilt": np.zeros((3, 2))}, "tilt must be"),
+        ({"tilt": "a"}, "tilt must be"),
+        ({"center": (340.0, 240.0), "image_size2": (480, 640)}, "turned by a quarter"),
         ({"quality": np.ones(7)}, "quality must have shape"),
         ({"solver": "two_point"}, "needs the tilt"),
     ],
@@ -37,6 +39,19 @@ TRUE = MATCHES.truth.motion
 def test_wrong_arguments_are_refused(wrong: dict[str, object], says: str) -> None:
     with pytest.raises(ArgumentError, match=says):
         estimate_radial_homography(MATCHES.points1, MATCHES.points2, LENS.image_size, **wrong)  # type: ignore[arg-type]
+
+
+def test_a_pair_is_checked_where_it_is_made() -> None:
+    points, lens = MATCHES.points1, LENS.with_focal()
+    for wrong, says in (
+        ((points, points[1:], lens, lens), "differ in length"),
+        ((points, points * np.nan, lens, lens), "not finite"),
+        ((points, points, lens, Camera((640, 480))), "focal length"),
+        ((points, points, lens, lens, np.ones(3)), "quality must have shape"),
+        ((points, points, lens, lens, None, np.zeros(2)), "tilts must have shape"),
+    ):
+        with pytest.raises(ArgumentError, match=says):
+            PairMatches(*wrong)
 
 
 @pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "two_point"])

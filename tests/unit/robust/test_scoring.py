@@ -50,6 +50,7 @@ def test_matches_that_are_left_out_stay_out() -> None:
         (np.zeros((3, 3)), np.zeros((3, 2)), "points1 must have shape"),
         (np.zeros((3, 2)), np.zeros(6), "points2 must have shape"),
         (np.zeros((3, 2)), np.full((3, 2), np.nan), "points2 has values that are not finite"),
+        (np.zeros((3, 2)), np.full((3, 2), 1e200), "points2 has values that are no pixels: 1e"),
         (np.zeros((3, 2)), np.zeros((4, 2)), "differ in length: 3 and 4"),
     ],
 )
