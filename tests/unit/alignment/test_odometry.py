@@ -10,7 +10,7 @@ import pytest
 
 import rdstitch
 from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
-from rdstitch.alignment.odometry import OdometryFit, bridged, scaled_by_odometry
+from rdstitch.alignment.odometry import OdometryFit, bridged, motions_of, scaled_by_odometry
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
@@ -56,13 +56,15 @@ def test_the_scale_and_the_mount_are_found_as_well_as_it_says() -> None:
     assert OdometryFit.of([]) is None
 
 
-def test_odometry_that_states_no_error_has_one() -> None:
+def test_motions_without_a_variance_count_alike() -> None:
     path = _path()
     bodies = _bodies(replace(path, position=path.position * HEIGHT), 0.02)
-    exact = scaled_by_odometry(path, [body._replace(variance=0.0) for body in bodies], keep_unit=False)
-    assert exact is not None
-    assert exact[0].height[0] == pytest.approx(HEIGHT, rel=0.05)
-    assert 0.01 < exact[1].relative_std < 0.03
+    places = (path.position @ np.array([1.0, -1.0j])).tolist()
+    motions = motions_of(list(zip(places, path.yaw.tolist(), bodies, strict=True)))
+    fit = OdometryFit.of([motion._replace(variance=0.0) for motion in motions])
+    assert fit is not None
+    assert abs(fit.scale) == pytest.approx(HEIGHT, rel=0.05)
+    assert 0.01 < fit.relative_std < 0.03
 
 
 def test_frames_without_texture_get_their_poses() -> None:
