@@ -14,7 +14,7 @@ from rdstitch.errors import InputError
 from rdstitch.inputs.image_folders import place_of
 from rdstitch.inputs.tables import Row, name_parts
 from rdstitch.results.messages import shortened
-from rdstitch.system.file_access import canonical_name
+from rdstitch.system.file_access import canonical_name, without_query
 
 
 class NamedFile(Protocol):
@@ -47,7 +47,7 @@ class ImagesByName:
         # By the file's name in small letters, then by place, at which one file may be several times.
         self._alike: dict[str, dict[tuple[str, ...], list[int]]] = {}
         for index, image in enumerate(images):
-            *folders, _ = map(canonical_name, place_of(image.path).parts)
+            *folders, _ = map(canonical_name, place_of(without_query(image.path)).parts)
             place = (*folders, image.name.rpartition("/")[2])
             self._alike.setdefault(place[-1].casefold(), {}).setdefault(place, []).append(index)
 
