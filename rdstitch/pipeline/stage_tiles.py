@@ -15,12 +15,13 @@ from rdstitch.arrays import evenly_spaced
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.places_files import fiji_list, places_table
 from rdstitch.inputs.find import FoundImages, found_images
-from rdstitch.inputs.frame import Images
+from rdstitch.inputs.frame import Frame, Images
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.option import with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
 from rdstitch.pipeline.lay_out import lay_out
@@ -80,7 +81,7 @@ def tiles(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    options = replace(options or TileOptions(), **fields)
+    options = with_fields(options or TileOptions(), fields)
     run = _tile_run(options, output, beside, progress)
     with (
         found_images(as_tiles(inputs), outputs=[run.output], topic=options.topic) as listed,
@@ -125,7 +126,7 @@ def place_tiles(
     inputs, options, progress, **fields
         As for :func:`tiles`.
     """
-    options = replace(options or TileOptions(), **fields)
+    options = with_fields(options or TileOptions(), fields)
     run = _tile_run(options, None, NOTHING_BESIDE, progress)
     with (
         found_images(as_tiles(inputs), topic=options.topic) as listed,
@@ -152,7 +153,7 @@ def _registered(
     while True:
         if len(sources) < 2:
             raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
-        nominal = _grid(sources, stored, options)
+        nominal = _grid(sources, frames, stored, options)
         try:
             sources, tiled, messages = _placed(sources, nominal, options, run.progress)
             break
@@ -268,21 +269,24 @@ def _channels(count: int) -> str:
     return "1 channel" if count == 1 else f"{count} channels"
 
 
-def _grid(sources: Sequence[Source], stored: Mapping[Path, StoredTile], options: TileOptions) -> TileGrid:
-    """Where the tiles should be."""
+def _grid(
+    sources: Sequence[Source], listed: Sequence[Frame], stored: Mapping[Path, StoredTile], options: TileOptions
+) -> TileGrid:
+    """Where the tiles should be; those of all that were listed that are left, which moves none of them."""
     sizes = np.array([source.camera.image_size for source in sources], dtype=np.intp)
     width, height = sizes.max(axis=0).tolist()
     size, pixel_size = (width, height), options.pixel_size or sources[0].metadata.pixel_size
     names = [source.name for source in sources]
     if options.grid is not None:
         scan = Scan(options.columns, options.order, options.origin)
-        grid = grid_from_names(names, options.grid, options.overlap, size, scan)
+        listed_names = [frame.name for frame in listed]
+        grid = grid_from_names(names, options.grid, options.overlap, size, scan, listed_names)
         grid = replace(grid, pixel_size=pixel_size)
     elif isinstance(options.positions, str | os.PathLike):
         grid = grid_from_table(names, options.positions, size, pixel_size)
     elif options.positions is not None:
-        # Of tiles that are left out the lines are, too.
-        numbers = [source.number(k) for k, source in enumerate(sources)]
+        lines = {frame: k if frame.number is None else frame.number for k, frame in enumerate(listed)}
+        numbers = [lines[source.frame] for source in sources if source.frame is not None]
         grid = grid_from_arrays(options.positions, numbers, size, pixel_size)
     else:
         known = [stored.get(source.path) or StoredTile(source.path, {}) for source in sources]
