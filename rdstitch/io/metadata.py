@@ -165,7 +165,6 @@ def _metadata(
     photo = exif.get_ifd(ExifTags.IFD.Exif)
     xmp = xmp_text(info)
     gps, gps_problem = gps_position(exif.get_ifd(ExifTags.IFD.GPSInfo), xmp)
-    dpi = info.get("dpi")
     profile, profile_lost = _colour_profile(info.get("icc_profile"))
     serials = photo.get(ExifTags.Base.BodySerialNumber), exif.get(ExifTags.Base.CameraSerialNumber)
     return Metadata(
@@ -179,7 +178,7 @@ def _metadata(
         make=tag_text(exif.get(ExifTags.Base.Make)),
         model=tag_text(exif.get(ExifTags.Base.Model)),
         serial=next(filter(None, map(tag_text, serials)), ""),
-        dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(finite(d) for d in dpi) else None,
+        dpi=_resolution(info.get("dpi")),
         exposure=exposure_of(photo),
         radiometry=read_radiometry(xmp, info.get("black_level"), bit_depth),
         timestamp=time_taken(photo),
@@ -188,6 +187,12 @@ def _metadata(
         profile_lost=profile_lost,
         channels=channels,
     )
+
+
+def _resolution(dpi: object) -> tuple[float, float] | None:
+    """Pixels per inch, across and down; None where there are none, or none that a TIFF file can say."""
+    pair = [value for each in dpi if (value := finite(each)) and _DPI[0] < value < _DPI[1]] if _is_pair(dpi) else []
+    return (pair[0], pair[1]) if len(pair) == 2 else None
 
 
 def _colour_profile(profile: object) -> tuple[bytes, str]:
