@@ -33,7 +33,7 @@ class _Page(NamedTuple):
 def put_in_order(path: Path) -> list[Message]:
     """Rewrite a TIFF file: header, directories in their order, tiles of the last page, …, tiles of the first.
 
-    Needs room for a copy beside it. Where there is none the file, which is whole, stays as it is, and a message says so.
+    Needs room for a copy beside it; where there is none the file, which is whole, stays, and a message says so.
     """
     ordered = path.with_name(f"{path.name}.ordered")
     try:

@@ -25,6 +25,7 @@ from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip, as_eight_bit, check
 from rdstitch.io.tiff import ExtraTag, write_tiff
 from rdstitch.io.write_jpeg import jpeg_pieces
 from rdstitch.io.write_png import png_pieces
+from rdstitch.results.messages import Message
 from rdstitch.system.outputs import Fingerprint, Outputs, check_folder, fingerprint, is_zarr, naming, tiles_folder
 
 _TIFF = (".tif", ".tiff")
