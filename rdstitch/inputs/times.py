@@ -9,7 +9,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
-from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.frame import Frame, frame_numbers
 from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, csv_rows, is_number
@@ -41,7 +41,7 @@ def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
     named = _read_times(file)
     if not isinstance(named, list):
         return [replace(frame, timestamp=time) for frame, time in zip(frames, _times(frames, named, file), strict=True)]
-    numbers = np.array([position if frame.number is None else frame.number for position, frame in enumerate(frames)])
+    numbers = np.array(frame_numbers(frames))
     if len(np.unique(numbers)) < len(numbers):  # of several videos
         numbers = np.arange(len(frames))
     steps = np.unique(np.diff(np.sort(numbers)))
