@@ -15,7 +15,7 @@ from rdstitch.arrays import evenly_spaced
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.places_files import fiji_list, places_table
 from rdstitch.inputs.find import FoundImages, found_images
-from rdstitch.inputs.frame import Images
+from rdstitch.inputs.frame import Frame, Images
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.io.stored_tiles import StoredTile
@@ -152,7 +152,7 @@ def _registered(
     while True:
         if len(sources) < 2:
             raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
-        nominal = _grid(sources, stored, options)
+        nominal = _grid(sources, frames, stored, options)
         try:
             sources, tiled, messages = _placed(sources, nominal, options, run.progress)
             break
@@ -268,21 +268,24 @@ def _channels(count: int) -> str:
     return "1 channel" if count == 1 else f"{count} channels"
 
 
-def _grid(sources: Sequence[Source], stored: Mapping[Path, StoredTile], options: TileOptions) -> TileGrid:
-    """Where the tiles should be."""
+def _grid(
+    sources: Sequence[Source], listed: Sequence[Frame], stored: Mapping[Path, StoredTile], options: TileOptions
+) -> TileGrid:
+    """Where the tiles should be; those of all that were listed that are left, which moves none of them."""
     sizes = np.array([source.camera.image_size for source in sources], dtype=np.intp)
     width, height = sizes.max(axis=0).tolist()
     size, pixel_size = (width, height), options.pixel_size or sources[0].metadata.pixel_size
     names = [source.name for source in sources]
     if options.grid is not None:
         scan = Scan(options.columns, options.order, options.origin)
-        grid = grid_from_names(names, options.grid, options.overlap, size, scan)
+        listed_names = [frame.name for frame in listed]
+        grid = grid_from_names(names, options.grid, options.overlap, size, scan, listed_names)
         grid = replace(grid, pixel_size=pixel_size)
     elif isinstance(options.positions, str | os.PathLike):
         grid = grid_from_table(names, options.positions, size, pixel_size)
     elif options.positions is not None:
-        # Of tiles that are left out the lines are, too.
-        numbers = [source.number(k) for k, source in enumerate(sources)]
+        lines = {frame: k if frame.number is None else frame.number for k, frame in enumerate(listed)}
+        numbers = [lines[source.frame] for source in sources if source.frame is not None]
         grid = grid_from_arrays(options.positions, numbers, size, pixel_size)
     else:
         known = [stored.get(source.path) or StoredTile(source.path, {}) for source in sources]

@@ -130,6 +130,16 @@ def test_of_bands_of_which_one_fails_nothing_is_written(rig: Path, tmp_path: Pat
     assert set(tmp_path.iterdir()) == inputs
 
 
+def test_an_image_of_two_bands_and_a_band_without_any_that_can_be_read_are_refused(rig: Path, tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match=r"IMG_0003_NIR.png fits both A=\*_N\*.png and B=\*_NIR.png"):
+        mosaic_bands([rig / "red", rig / "nir"], tmp_path / "f.tif", {"A": "*_N*.png", "B": "*_NIR.png"})
+    for k in range(2):
+        (tmp_path / f"{k}_bad.png").write_bytes(b"x")
+    for bands in ({"B": "*_bad.png", "N": "*_NIR.png"}, {"N": "*_NIR.png", "B": "*_bad.png"}):
+        with pytest.raises(InputError, match=r"0_bad\.png: .*; no other image of B can be read"):
+            mosaic_bands([rig / "nir", tmp_path], tmp_path / "f.tif", bands)
+
+
 def test_a_lost_image_and_one_from_elsewhere_move_no_other(rig: Path, tmp_path: Path) -> None:
     files = sorted((rig / "nir").iterdir())
     stranger = tmp_path / "IMG_0099_NIR.png"
