@@ -19,6 +19,8 @@ from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.option import check_parameter
+from rdstitch.options.shared_options import Height
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.along_odometry import with_odometry_of_bag
@@ -266,6 +268,9 @@ def trajectory(
     Trajectory, Registration
         The path, and the registration that it comes from.
     """
+    for name, kind, value in (("layout", TrajectoryFormat, layout), ("height", Height, height)):
+        check_parameter(name, kind, value)
+    check_parameter("frame", TrajectoryFrame | None, frame)
     options = replace(options or StitchOptions(), pose_covariance=True)
     given = as_inputs(inputs, options.channel_order)
     options = with_odometry_of_bag(given, options)

@@ -76,6 +76,11 @@ def test_a_band_by_another_lens_is_registered(rig: Path, tmp_path: Path) -> None
     assert not [message for message in again.messages if message.code == "band-lens"]
     assert _same_pixels(tmp_path / "nir.tif", tmp_path / "again.tif")
     assert [source.camera for source in result.sources] == list(result.placed.cameras)
+    record = sidecar_of(tmp_path / "nir.tif")
+    of_another = [record[name] for name in ("lambda_std", "rms_px", "tilt_deg")]
+    of_another += [record["camera"][name] for name in ("lambda_std", "focal_std_px", "lens_covariance", "tilt_std_deg")]
+    assert of_another + [image[name] for image in record["images"] for name in ("features", "pose")] == [None] * 19
+    assert (record["lambda"], record["lambda_known"]) != (sidecar_of(rig / "red.tif")["lambda"], True)
 
 
 def test_seams_of_a_sidecar_are_those_of_its_image(rig: Path, tmp_path: Path) -> None:
