@@ -19,7 +19,6 @@ from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatch
 # Cells of a grid that finds what is far from the plane, and of the one that is used; nodes of all images together, by
 # which the finer one is coarser for more than some 70 images, and both for more than 800.
 _COARSE, _FINE = (12, 120_000), (24, 40_000)
-_MOST_NODES = 120_000  # of all images together, where the user says how many cells
 _SLOPES = (0.2, 0.06, 0.02)
 _SLOPE_OF_GROUND = 0.5  # one surface for all images: many matches determine it, and it may be freer
 _HELD_OUT = 5  # every fifth match
@@ -103,8 +102,8 @@ def align_locally(
     if choice == "auto" and (agreement := _agreement_of_neighbours(placed)) < _MIN_AGREEMENT:
         return no_local_alignment(f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only")
     coarse, fine = (max(2, min(cells, math.isqrt(nodes // len(cameras)))) for cells, nodes in (_COARSE, _FINE))
-    most = max(coarse, math.isqrt(_MOST_NODES // len(cameras)))
-    cells = max(coarse, fine) if choice == "auto" else min(choice, most)
+    finest = max(coarse, math.isqrt(_COARSE[1] // len(cameras)))
+    cells = max(coarse, fine) if choice == "auto" else min(choice, finest)
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
     fitted, tested = placed.take(~held_out), placed.take(held_out)
     worthwhile = (1.0 - _WORTHWHILE) * _seam_residual(tested.residual)

@@ -13,7 +13,7 @@ from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import has_times, path_as_svg
 from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.inputs.find import FoundImages, found_images
-from rdstitch.inputs.frame import Images, as_inputs
+from rdstitch.inputs.frame import Images, as_inputs, frame_numbers
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
@@ -280,8 +280,8 @@ def trajectory(
         Outputs(options.overwrite) as outputs,
     ):
         RunFiles.of_path(run, listed.files, output, plot, layout).check(outputs)
-        # Numbered as they were named: what is left out leaves a gap.
-        numbered = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
+        numbers = frame_numbers(listed.frames)
+        numbered = [replace(frame, number=k) for frame, k in zip(listed.frames, numbers, strict=True)]
         registration = _registered(replace(listed, frames=numbered), run)
         path, of_path = camera_path(registration, options.odometry, height)
         messages = [*scale_uncertainty(registration.alignment), *of_path]

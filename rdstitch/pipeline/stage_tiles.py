@@ -15,7 +15,7 @@ from rdstitch.arrays import evenly_spaced
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.places_files import fiji_list, places_table
 from rdstitch.inputs.find import FoundImages, found_images
-from rdstitch.inputs.frame import Frame, Images
+from rdstitch.inputs.frame import Frame, Images, frame_numbers
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.io.stored_tiles import StoredTile
@@ -33,7 +33,7 @@ from rdstitch.pipeline.tiles_as_registration import tiles_as_registration
 from rdstitch.results.messages import Message, left_out
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.stage.axes import with_axes_shown
+from rdstitch.stage.axes import with_measured_axes
 from rdstitch.stage.coarse_tile import coarse_tile
 from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
@@ -202,25 +202,25 @@ def _placed(
 ) -> tuple[list[Source], TileRegistration, list[Message]]:
     """The tiles with their illumination taken out, where they are, and what there is to say of that."""
     if len({source.camera.image_size for source in sources}) > 1:
-        messages = [Message("tiles of several sizes have no flat field in common", severity="note", code="flat-field")]
+        text = "tiles of several sizes have no flat field in common"
+        illumination = [Message(text, severity="note", code="flat-field")]
         if options.flat_field not in ("auto", "off") or isinstance(options.distortion, float):
             raise ArgumentError("tiles of several sizes have neither a flat field nor a lens in common")
     else:
-        sources, messages = with_flat_field(sources, options.flat_field)
+        sources, illumination = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
     plan = SearchPlan.of(nominal, options.search)
     factor = plan.factor
-    grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
-    if shown:
-        messages.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
+    grid, shown = with_measured_axes(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
+    messages = [Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown")] if shown else []
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
     tiled = register_tiles(replace(plan, grid=grid), read, distortion=options.distortion, progress=progress)
     for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
         read(index)
     if options.flat_field == "auto" and sources[0].flat_field is not None and not _overlaps_show(sources, tiled):
-        sources, messages = [replace(source, flat_field=None) for source in sources], [*messages[1:], NO_FLAT_FIELD]
-    return sources, tiled, messages
+        sources, illumination = [replace(source, flat_field=None) for source in sources], [NO_FLAT_FIELD]
+    return sources, tiled, [*illumination, *messages]
 
 
 def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
@@ -285,7 +285,7 @@ def _grid(
     elif isinstance(options.positions, str | os.PathLike):
         grid = grid_from_table(names, options.positions, size, pixel_size)
     elif options.positions is not None:
-        lines = {frame: k if frame.number is None else frame.number for k, frame in enumerate(listed)}
+        lines = dict(zip(listed, frame_numbers(listed), strict=True))
         numbers = [lines[source.frame] for source in sources if source.frame is not None]
         grid = grid_from_arrays(options.positions, numbers, size, pixel_size)
     else:

@@ -229,7 +229,7 @@ def test_a_number_of_cells_is_used_in_any_case() -> None:
 
 
 def test_a_number_of_cells_that_no_memory_holds_is_coarser_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estimate, "_MOST_NODES", 6 * 13**2, raising=False)
+    monkeypatch.setattr(estimate, "_COARSE", (12, 6 * 13**2))
     sequence = scene(None)
     local = align_locally(matches(sequence), CAMERAS, homographies(sequence), 40)
     assert [field.values.shape[1] for field in local.fields] == [14] * 6
