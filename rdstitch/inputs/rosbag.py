@@ -73,7 +73,7 @@ def opened_bag(path: Path) -> "Iterator[Any]":
     try:
         with AnyReader([bag], default_typestore=get_typestore(Stores.LATEST)) as reader:
             yield reader
-    except RdstitchError:
+    except (RdstitchError, MemoryError):
         raise
     except Exception as error:  # rosbags raises many kinds on damaged files
         reason = " ".join(str(error).split()) or type(error).__name__

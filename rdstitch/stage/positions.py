@@ -138,9 +138,12 @@ def _fiji_rows(text: str, file: str | Path) -> list[Row]:
 
 
 def grid_from_arrays(
-    positions: Any, numbers: Sequence[int], size: tuple[int, int], pixel_size: float | None
+    positions: Any, numbers: Sequence[int], size: tuple[int, int], pixel_size: float | None, listed: Sequence[int]
 ) -> TileGrid:
-    """Places of tiles by their numbers in an array (N, 2), pixels, or in the columns x and y, or x_um and y_um."""
+    """Places of tiles by their numbers in an array (N, 2), pixels, or in the columns x and y, or x_um and y_um.
+
+    There is one for each number in ``listed``, of tiles too that cannot be read; for frames of videos others between.
+    """
     unit = None
     places: FloatArray = np.empty(0)
     if isinstance(positions, Mapping) or hasattr(positions, "columns"):
@@ -151,8 +154,10 @@ def grid_from_arrays(
         positions = zip(*(positions[name] for name in pair), strict=True)
     with suppress(TypeError, ValueError):  # of what is no array of numbers
         places = np.asarray(list(positions), dtype=np.float64)
-    if places.ndim != 2 or places.shape[1] != 2 or len(places) <= max(numbers):
-        raise ArgumentError(f"positions must be numbers, x and y of each of {max(numbers) + 1} tiles")
+    count = max(listed) + 1
+    allowed = len(places) == count or len(places) > count > len(listed)
+    if places.ndim != 2 or places.shape[1] != 2 or not allowed:
+        raise ArgumentError(f"positions must be numbers, x and y of each of {count} tiles")
     return _grid(places[list(numbers)], unit, size, pixel_size, "positions")
 
 
