@@ -7,9 +7,39 @@ loaded when they are first used, so that importing the package costs nothing.
 from importlib import import_module
 from typing import Any
 
-# The names and where they live, as they are in the stub that type checkers read: from HOME import NAME as NAME
-_lines = __loader__.get_data(f"{__path__[0]}/__init__.pyi").decode().splitlines()
-_HOMES = {line.split()[3]: line.split()[1] for line in _lines if line.startswith("from ")}
+# Names by the module that they live in; type checkers read the same in the stub.
+_NAMES = {
+    "": "errors solvers synthetic",
+    "alignment": "Alignment",
+    "alignment.trajectory": "Trajectory",
+    "camera_files": "load_camera save_camera",
+    "errors": "RdstitchError",
+    "export.layers": "write_layers",
+    "geometry.camera": "Camera",
+    "geometry.radial_homography": "RadialHomography",
+    "options.apply_options": "ApplyOptions",
+    "options.composite_options": "CompositeOptions",
+    "options.feature_options": "FeatureOptions",
+    "options.files_beside": "FilesBeside",
+    "options.stitch_options": "StitchOptions",
+    "options.tile_options": "TileOptions",
+    "pipeline.apply_sidecar": "apply",
+    "pipeline.blocks": "mosaic_blocks",
+    "pipeline.composer": "Composer",
+    "pipeline.doctor": "Examination examine",
+    "pipeline.follow": "Tracker",
+    "pipeline.recipes": "calibrate mosaic pano trajectory",
+    "pipeline.stage_tiles": "place_tiles tiles",
+    "pipeline.undistort_images": "undistort",
+    "report": "write_report",
+    "results.messages": "Message",
+    "results.pose": "FollowedPoses Pose",
+    "results.registration": "Registration",
+    "results.stitch_result": "StitchResult",
+    "robust": "estimate_radial_homography",
+    "sidecar.recomposition": "Recomposition",
+}
+_HOMES = {name: f"{__name__}.{home}".rstrip(".") for home, names in _NAMES.items() for name in names.split()}
 
 __all__ = [*_HOMES]
 

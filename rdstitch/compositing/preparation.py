@@ -68,7 +68,8 @@ class _Task:
         reader = ImageReader(images)
         channels, dtype = reader.samples
         cameras = [image.camera for image in images]
-        plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize, masked=reader.masked(0))
+        masked = reader.masked(0) or any(image.transparent for image in images)
+        plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize, masked=masked)
         if canvas.period is not None:
             canvas = canvas.widened(_wrap_margin(canvas, plan.bands))
         return cls(images, canvas, options, reader, plan, _unwidened(canvas))

@@ -48,6 +48,7 @@ class PlacedImage:
     path: str = ""  # what messages call it; its number if empty
     radiometry: Radiometry | None = None  # of samples that are measurements
     coloured: bool = False  # whether its file says that it has colours, so that grey ones beside it get them
+    transparent: bool = False  # whether parts of it may be transparent, by what is known before it is read
 
 
 @dataclass(frozen=True, eq=False)

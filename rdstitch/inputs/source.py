@@ -62,6 +62,12 @@ class Source:
         return (self.frame or Frame(self.path)).name
 
     @property
+    def may_be_transparent(self) -> bool:
+        """Whether it has a mask, an image circle or alpha."""
+        alpha = self.metadata.channels in (2, 4) and not self.metadata.planes
+        return alpha or self.mask is not None or self.camera.image_circle is not None
+
+    @property
     def down(self) -> tuple[float, float, float] | None:
         """Unit vector straight down in the camera's axes (right, down, ahead), as measured or as its XMP says."""
         if self.attitude is None:

@@ -46,27 +46,32 @@ class CompositeOptions(UprightOptions):
         "none",
         "Crop to --rectangle, otherwise to the largest rectangle without holes, where that keeps a fair part.",
         flag="--crop/--no-crop",
+        pixels=True,
     )
-    projection: ProjectionName = option("auto", "Projection of images taken by turning on the spot.")
+    projection: ProjectionName = option("auto", "Projection of images taken by turning on the spot.", pixels=True)
     scale: float = option(
         1.0,
         "Scale of the output; 1 keeps the resolution of the reference image, one of the largest.",
         least=1e-6,
         most=1e6,
+        pixels=True,
     )
-    max_size: int | None = option(None, "Longest side of the output, pixels; --scale is reduced to fit.", least=1)
+    max_size: int | None = option(
+        None, "Longest side of the output, pixels; --scale is reduced to fit.", least=1, pixels=True
+    )
     quality: int = option(95, "Quality of JPEG and WebP, 1 to 100.", "Q", least=1, most=100)
     max_stretch: float = option(
-        3.0, "Leave out what an oblique image shows N times coarser than the reference image.", above=1.0
+        3.0, "Leave out what an oblique image shows N times coarser than the reference image.", above=1.0, pixels=True
     )
-    rotate: float = option(0.0, "Turn the output clockwise, degrees; north is then not turned up.", "DEG")
+    rotate: float = option(0.0, "Turn the output clockwise, degrees; north is then not turned up.", "DEG", pixels=True)
     north_up: bool = option(
         True,
         "Turn north up where three images or more have a GPS position that fits.",
         flag="--north-up/--no-north-up",
         default="north up",
+        pixels=True,
     )
-    gsd: float | None = option(None, "Ground sample distance, metres; instead of --scale.", "M", above=0.0)
+    gsd: float | None = option(None, "Ground sample distance, metres; instead of --scale.", "M", above=0.0, pixels=True)
     epsg: int | None = option(
         None,
         "Coordinate system of the map, and of x and y in --positions; otherwise UTM (UPS near the poles) on WGS "
@@ -75,19 +80,22 @@ class CompositeOptions(UprightOptions):
         "--crs",
         above=0,
         below=2**16,
+        pixels=True,
     )
     like: str | Path | None = option(
-        None, "Grid of the output: coordinate system, pixels and extent of this GeoTIFF file.", "FILE"
+        None, "Grid of the output: coordinate system, pixels and extent of this GeoTIFF file.", "FILE", pixels=True
     )
     extent: tuple[float, float, float, float] | None = option(
         None,
         "Extent of the output on the map, metres: on the pixels of --like, else from the north-west corner on.",
         "W,S,E,N",
+        pixels=True,
     )
     georeference: Literal["auto", "force", "off"] = option(
         "auto",
         "Place the output where positions or control points agree with the images, also where these contradict "
         "them (force), or never.",
+        pixels=True,
     )
     max_memory: int | None = option(
         None,

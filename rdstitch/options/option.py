@@ -41,6 +41,7 @@ class Option:
     entered: Any = None  # the type on the command line, where that of the field is another one
     writes: bool = False  # whether it names a file or folder that is written
     command_line: bool = True
+    pixels: bool = False  # whether it says which pixels the output has
 
     def allows(self, number: float) -> bool:
         """Check a number by the limits."""

@@ -16,7 +16,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.band_lens import BandLens, band_lens
 from rdstitch.options.apply_options import ApplyOptions
-from rdstitch.options.option import with_fields
+from rdstitch.options.option import declared, with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import CanvasPlan, compose_images
 from rdstitch.pipeline.deep_zoom_page import plainly_viewed, write_page
@@ -33,24 +33,6 @@ from rdstitch.stage.tile_inputs import with_position_folders
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, json_bytes
 from rdstitch.system.progress import Progress, StageTimer, silent
-
-_GEOMETRY = (
-    "scale",
-    "max_size",
-    "crop",
-    "projection",
-    "max_stretch",
-    "rotate",
-    "north_up",
-    "gsd",
-    "epsg",
-    "like",
-    "extent",
-    "georeference",
-)
-"""Options of compositing that say which pixels the output has."""
-
-_NOT_COMPARED = "whether the same lens took the given ones, from the same places, was not compared"
 
 
 @one_native_thread()
@@ -179,7 +161,11 @@ def _laid_out(
 
 def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions) -> SavedGrid | None:
     """The pixels of the saved output, where images of the same sizes are to have the same: bands, and dates."""
-    asked = any(getattr(options, name) != getattr(saved.composite, name) for name in _GEOMETRY)
+    asked = any(
+        getattr(options, name) != getattr(saved.composite, name)
+        for name, declaration in declared(CompositeOptions).items()
+        if declaration.option.pixels
+    )
     matrix, size = saved.plane_to_output, saved.record.output.size
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
     if (
@@ -204,8 +190,8 @@ def _lens_of_band(
     originals = {k: file for k in frames if (file := saved.original(saved.images[k])) is not None}
     if files and not originals:
         name = saved.images[next(iter(frames))].path
-        text = f"the registered images are not there any more ({name}, …): {_NOT_COMPARED}"
-        return None, [Message(f"{saved.path}: {text}", severity="note")]
+        text = f"the registered images are not there any more ({name}, …): whether the same lens took the given ones, "
+        return None, [Message(f"{saved.path}: {text}from the same places, was not compared", severity="note")]
     there = {k: file for k, file in originals.items() if file.resolve() != frames[k].path.resolve()}
     pairs: dict[int, tuple[Source, Source]] = {}
     for index, file in there.items():

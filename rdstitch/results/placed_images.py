@@ -140,6 +140,7 @@ class PlacedImages:
                 str(source.path),
                 source.metadata.radiometry or (Radiometry() if located or source.metadata.gps else None),
                 source.metadata.channels in (3, 4),
+                source.may_be_transparent or self.static is not None,
             )
             for reader, camera, matrix, source, displacement in zip(
                 read,

@@ -46,13 +46,13 @@ def applied_sidecar(
     then, to_plane = saved.record, dict(zip(sources, homographies, strict=True))
     # An image without any image in it is never written.
     source = sources.get(saved.reference) or next(iter(sources.values()))
-    camera = camera_record(source.camera.turned(inverse(source.metadata.orientation)))
     # How far the camera was determined then.
-    determined = ("lambda_std", "lens_covariance", "tilt_deg", "tilt_std_deg", "focal_std_px")
-    stds = dict.fromkeys(determined) if not same_lens else {name: getattr(then.camera, name) for name in determined}
-    if same_lens:
-        stds |= {"lambda_std": then.lambda_std, "focal_std_px": _resized_std(then.camera, source.camera.focal)}
-    camera = replace_fields(camera, **stds)
+    determined = {name: getattr(then.camera, name) for name in ("lens_covariance", "tilt_deg", "tilt_std_deg")}
+    determined |= {"lambda_std": then.lambda_std, "focal_std_px": _resized_std(then.camera, source.camera.focal)}
+    camera = replace_fields(
+        camera_record(source.camera.turned(inverse(source.metadata.orientation))),
+        **(determined if same_lens else dict.fromkeys(determined)),
+    )
     of_lens = {"lambda_std": None, "lambda_known": False, "tilt_deg": None, "rms_px": None}
     now = replace_fields(
         then,

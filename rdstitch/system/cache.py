@@ -162,7 +162,8 @@ class Cache:
     def file(self, path: str | Path | None) -> str:
         """Give what stands for the content of a file in the inputs of a stage; empty without a file or a cache.
 
-        A file that cannot be read is unlike any other, and itself the next time: nothing is kept of it.
+        A file that cannot be read, or of which the server does not say when it changes, is unlike any other, and itself
+        the next time: nothing is kept of it.
         """
         if self.folder is None or path is None:
             return ""
@@ -170,7 +171,7 @@ class Cache:
             return str(path)
         try:
             if is_url(path):
-                return remote_status(path)[2]
+                return remote_status(path)[2] or os.urandom(16).hex()
             with open_regular(path) as stream:
                 return hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError:

@@ -26,6 +26,7 @@ _BLOCK = 2**18  # bytes of a file that are fetched at a time where only its head
 _READ_AT_ONCE = 2**22  # bytes
 # Two letters or more: one is a drive.
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+_HTTP_STATES = ("ETag", "Content-MD5", "Digest", "Last-Modified")  # headers that change with the content
 _LOCAL = ("file", "local")  # schemes of what is on this machine
 _SEVERAL = "::"  # between the parts of a chain, as in simplecache::s3://bucket/name
 _Content = TypeVar("_Content")
@@ -105,11 +106,18 @@ def held_in_memory(path: Path) -> Iterator[None]:
 
 
 def remote_status(path: str | Path) -> tuple[bool, int | None, str]:
-    """Check whether it is a folder, its size in bytes where the server says that, and what changes with its content."""
+    """Check whether it is a folder, its size in bytes where the server says that, and what changes with its content.
+
+    The last is empty where the server says nothing of that.
+    """
     with _as_os_error():
         system, name = _filesystem(path)
         info = system.info(name)
-        return info["type"] == "directory", info.get("size"), system.ukey(name)
+        state = system.ukey(name)
+        if "http" in getattr(system, "fs", system).protocol:  # whose key is that of the address
+            known = [f"{key}: {info[key]}" for key in _HTTP_STATES if info.get(key)]
+            state = "\n".join([*known, f"{info.get('size')} bytes"]) if known else ""
+        return info["type"] == "directory", info.get("size"), state
 
 
 def remote_names(url: str) -> list[str]:
@@ -157,9 +165,15 @@ def file_state(path: str | Path) -> tuple[int, int] | None:
 
 
 def content_state(path: str | Path) -> ContentState | None:
-    """What changes with the content of a file or URL, and is the same on every machine; None where there is none."""
+    """What changes with the content of a file or URL, and is the same on every machine; None where there is none.
+
+    Of a server that says nothing else it is the size.
+    """
+    if not is_url(path):
+        return file_state(path)
     with suppress(OSError):
-        return remote_status(path)[2] if is_url(path) else file_state(path)
+        _, size, state = remote_status(path)
+        return state or f"{size} bytes"
     return None
 
 

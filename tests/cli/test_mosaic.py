@@ -122,10 +122,10 @@ def test_all_blocks_are_planned_first_and_published_together(rdstitch: Run, fold
 def test_a_block_that_cannot_be_laid_out_is_told_of(
     rdstitch: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stitched(found: FoundImages, *arguments: Any) -> StitchResult:
+    def stitched(found: FoundImages, *arguments: Any, **files: Any) -> StitchResult:
         if len(found.frames) < 4:
             raise LimitError("the canvas is too large")
-        return stitch_found(found, *arguments)
+        return stitch_found(found, *arguments, **files)
 
     monkeypatch.setattr(blocks, "stitch_found", stitched)
     how = ("mosaic", folder, "-o", tmp_path / "floor.png", "--all-blocks", "--lambda", DISTORTION)

@@ -1,5 +1,6 @@
 """The public API: the examples of its docstrings run, and every name is typed and described."""
 
+import ast
 import doctest
 import shutil
 import subprocess
@@ -63,3 +64,11 @@ def test_results_show_themselves_in_one_line() -> None:
     lines = [repr(each) for each in (*shown, result.composite)]
     assert all(len(line) < 120 and "\n" not in line and line[0] == "<" for line in lines), lines
     assert lines[5] == "<RadialHomography failed: too few matches>"
+
+
+def test_type_checkers_read_the_same_names_and_homes() -> None:
+    stub = ast.parse(Path(rdstitch.__file__).with_suffix(".pyi").read_text())
+    homes = [
+        (alias.asname, node.module) for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names
+    ]
+    assert homes == [*vars(rdstitch)["_HOMES"].items()]

@@ -1,6 +1,7 @@
 """What robots load: a map of nav2, odometry in a bag, all in one frame."""
 
 import math
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,8 @@ def test_of_several_bands_the_first_one_is_the_map(rdstitch: Run, frames: list[P
     wanted = ("mosaic", *frames, "-o", tmp_path / "f.png", "--map-server", tmp_path / "maps", "--focal", "380", *CACHED)
     rdstitch(*wanted, status=2, told="--map-server is in metres")
     wanted = (*wanted, "--height", "1")
-    rdstitch(*wanted, "--bands", "A=*.png,B=*.png")
+    second = [shutil.copy(frame, tmp_path / f"b_{frame.name}") for frame in frames]
+    rdstitch("mosaic", *second, *wanted[1:], "--bands", "A=frame_*.png,B=b_frame_*.png")
     assert {file.name for file in (tmp_path / "maps").iterdir()} == {"map.yaml", "map.png"}
     rdstitch(*wanted, status=None, told="map.yaml: exists already")
     assert not (tmp_path / "f.png").exists()

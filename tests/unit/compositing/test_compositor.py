@@ -1,5 +1,6 @@
 """Composites of rendered sets: exposure, seams, blending, crop, files."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,9 +24,11 @@ from examples.worlds.compositing_scenes import (
 )
 from rdstitch.compositing import CompositeOptions, compose, compose_to_file
 from rdstitch.compositing.cropping import largest_rectangle
-from rdstitch.compositing.preparation import decide, prepare_composite
+from rdstitch.compositing.preparation import decide, planned, prepare_composite
 from rdstitch.compositing.source_images import ImageLoader
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.source import Source
 from rdstitch.io import Metadata, read_image
 from rdstitch.synthetic.rendering import Photometry
 from tests.sampled import sampled
@@ -273,6 +276,22 @@ def test_sixteen_bits_grey_and_mixed_sizes() -> None:
     ok = inner(result.alpha)
     assert np.sqrt(np.mean((grey(result.pixels)[ok] - scene.truth()[ok]) ** 2)) < 0.06
     assert len(np.unique(result.pixels)) > 1000
+
+
+def test_a_mask_on_any_image_is_planned_for() -> None:
+    scene = render(2, 1)
+    plain, first, last = (
+        planned(
+            [replace(image, transparent=k == masked) for k, image in enumerate(scene.images)],
+            scene.canvas,
+            CompositeOptions(),
+        )
+        for masked in (None, 0, 1)
+    )
+    assert first.memory_bytes == last.memory_bytes > plain.memory_bytes
+    source = Source(Path("a.png"), Metadata((8, 6)), Camera((8, 6)))
+    assert not source.may_be_transparent
+    assert replace(source, metadata=Metadata((8, 6), channels=4)).may_be_transparent
 
 
 def test_images_that_do_not_fit_and_wrong_options() -> None:

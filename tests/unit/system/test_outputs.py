@@ -8,6 +8,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,8 @@ from rdstitch.inputs.times import time_of
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
-from rdstitch.system.file_access import is_url, url_of
+from rdstitch.system.cache import Cache
+from rdstitch.system.file_access import content_state, is_url, url_of
 from rdstitch.system.outputs import Outputs, check_output, replace_folder, write_bytes_atomic
 from rdstitch.system.temporary_folder import TemporaryFolder
 from tests.faults import OPERATIONS, Operation, failing_disk
@@ -398,6 +400,23 @@ def test_content_that_changes_during_the_run_is_noticed(flight: str) -> None:
     system.pipe("/flight/f9.jpg", system.cat("/flight/f9.jpg") + b"\0")
     with pytest.raises(InputError, match="has changed during the run"):
         source.read()
+
+
+@pytest.mark.parametrize("told", ["ETag", "Last-Modified", "size"])
+def test_what_changes_behind_one_web_address_is_not_what_was_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str
+) -> None:
+    """The file system of HTTP has one key for an address, whatever lies there."""
+    info = {"type": "file", "size": 5, told: 5}
+    server = SimpleNamespace(protocol=("http", "https"), info=lambda name: info, ukey=lambda name: "address")
+    monkeypatch.setattr("rdstitch.system.file_access._filesystem", lambda path: (server, path))
+    url, cache = "https://host.org/a.jpg", Cache.at(tmp_path)
+    kept, state = cache.file(url), content_state(url)
+    assert content_state(url) == state
+    assert (cache.file(url) == kept) == (told != "size")
+    info[told] = 6
+    assert cache.file(url) != kept
+    assert content_state(url) != state
 
 
 @pytest.mark.parametrize(
