@@ -17,10 +17,8 @@ from rdstitch.options.feature_options import CLOSER, FeatureOptions
 
 _MIN_KEYPOINT_FRACTION = 0.5  # of the keypoints wanted: where a reduced image shows fewer, a larger one is used
 _SPREAD_CELL = 0.05  # side of a cell over which keypoints are spread, diagonals of the image
-_LASTING = (
-    0.5  # fraction of the keypoints that must be seen at less contrast, too; of fewer, contrast is what is missing
-)
-
+# Fraction of the keypoints that must be seen at less contrast, too; of fewer, contrast is what is missing.
+_LASTING = 0.5
 
 Detection = SurfDetection | AlikedDetection | SiftTilesDetection | OpenCVDetection
 """Keypoints of one image, not yet described; always in the same order for the same image."""

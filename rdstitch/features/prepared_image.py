@@ -18,8 +18,7 @@ Mask = NDArray[Any]
 """A mask of bool or uint8."""
 
 _STRETCH_PERCENTILES = (0.1, 99.9)
-CLIP_LIMIT = 4.0
-_CLIP_TILES = 8
+CLIP_LIMIT, _CLIP_TILES = 4.0, 8
 """Contrast-limited adaptive histogram equalization (Zuiderveld 1994): largest slope, and tiles along a side."""
 
 Stretch = tuple[float, float]

@@ -24,9 +24,8 @@ class StoredFeatures:
     # width and height of the image in whose pixels they are wanted; None: as they are stored
     image_size: Size | None = None
     chosen: NDArray[np.intp] | None = None  # (N,), intp: those that are wanted, in their order; None: all
-    detected_count: int = (
-        0  # keypoints that the image shows at its working size, see :class:`rdstitch.features.Features`
-    )
+    # keypoints that the image shows at its working size, see :class:`rdstitch.features.Features`
+    detected_count: int = 0
     low_contrast: bool = False
 
     @classmethod

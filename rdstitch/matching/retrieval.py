@@ -26,9 +26,8 @@ _TRAINING_PER_BRANCH = 50
 _ROUNDS = 3  # of Lloyd's algorithm
 _SHORTLIST = 40  # most similar images of each that are considered further
 _SHARED_NEIGHBOURS = 10  # most similar images of each that two images may have in common
-_SEQUENCE_RANK = (
-    0.75  # fraction of the other images that are less alike than the next one where the order means something
-)
+# Fraction of the other images that are less alike than the next one where the order means something.
+_SEQUENCE_RANK = 0.75
 _MIN_SEQUENTIAL_FRACTION = 0.5  # fraction of the images of which that is true of the next one; a quarter by chance
 _BLOCK = 8192  # descriptors assigned at a time
 _ROWS = 256  # images compared with all others at a time

@@ -75,9 +75,7 @@ class MatchingTask(NamedTuple):
 
     features1: StoredFeatures
     features2: StoredFeatures
-    known: (
-        StoredMatches | None
-    )  # some matches: they show where the images overlap, and only there others are looked for
+    known: StoredMatches | None  # some matches: others are looked for only where these show that the images overlap
 
 
 def match_pairs(

@@ -31,7 +31,7 @@ def occupied_cells(points1: FloatArray, points2: FloatArray, size1: tuple[int, i
 
 
 def binomial_tail(successes: int, trials: int, probability: float) -> float:
-    """Probability that ``least`` or more of independent events happen, each with a probability in (0, 1)."""
+    """Probability that ``successes`` or more of ``trials`` independent events happen, each with one in (0, 1)."""
     if successes <= 0:
         return 1.0
     if successes < trials * probability:  # from the other side, where terms only become smaller

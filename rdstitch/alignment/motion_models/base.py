@@ -21,13 +21,13 @@ class ModelMatrices:
 class MotionModel(ABC):
     """A motion model, as the adjustment uses it."""
 
-    name: str  # One word for it
-    pose_size: int  # Free parameters per image, D
-    shared_names: tuple[str, ...] = ()  # Parameters that all images share, S of them, without those of the lens
-    on_sphere: bool = False  # Whether images lie around one centre, not over a plane
-    # Whether all images are of one camera with one focal length, the last of the shared parameters
+    name: str  # one word for it
+    pose_size: int  # free parameters per image, D
+    shared_names: tuple[str, ...] = ()  # parameters that all images share, S of them, without those of the lens
+    on_sphere: bool = False  # whether images lie around one centre, not over a plane
+    # whether all images are of one camera with one focal length, the last of the shared parameters
     one_camera: bool = True
-    # Whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one
+    # whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one
     free_tilts: bool = False
     any_tilt: bool = False
     # Which columns of poses in a metric plane move, see :mod:`rdstitch.alignment.motion_models.planar`; none where

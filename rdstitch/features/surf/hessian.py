@@ -29,7 +29,7 @@ def vertex(values: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.bool_]]
     """Locate the maximum of the quadric through each neighbourhood (N, 3, 3, 3) (Brown and Lowe, BMVC 2002).
 
     Neighbourhoods have the axes scale, row, column; offsets (N, 3) from the middle are in steps along column, row,
-    scale, and zero where the quadric has no maximum, which is told too (N,).
+    scale, and zero where the quadric has no maximum, which is returned too, (N,).
     """
     n = values.astype(np.float64)
     middle = n[:, 1, 1, 1]
