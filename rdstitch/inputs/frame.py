@@ -1,7 +1,7 @@
 """One image before anything is known of it: a file, a video frame or an array in memory."""
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -37,6 +37,11 @@ class Frame:
     def name(self) -> str:
         """What it is called in messages, tables and files, the same in every locale."""
         return self.label or canonical_name(self.path.name)
+
+
+def frame_numbers(listed: Sequence[Frame]) -> list[int]:
+    """The number of each in its video, bag or list of arrays, else its place among all that are listed."""
+    return [place if frame.number is None else frame.number for place, frame in enumerate(listed)]
 
 
 Image = str | os.PathLike[str] | NDArray[Any] | PIL.Image.Image

@@ -9,7 +9,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
-from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.frame import Frame, frame_numbers
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, by_image, csv_rows, is_number
 from rdstitch.system.file_access import cached_by_file_state, canonical_name, read_text
@@ -40,7 +40,7 @@ def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
     named = _read_times(file)
     if not isinstance(named, list):
         return [replace(frame, timestamp=_time_of(frame, named, file)) for frame in frames]
-    numbers = np.array([position if frame.number is None else frame.number for position, frame in enumerate(frames)])
+    numbers = np.array(frame_numbers(frames))
     if len(np.unique(numbers)) < len(numbers):  # of several videos
         numbers = np.arange(len(frames))
     steps = np.unique(np.diff(np.sort(numbers)))

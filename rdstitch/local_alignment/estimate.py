@@ -81,7 +81,9 @@ def align_locally(
 
     By ``choice`` "auto" only where matches that are held out of the fit come nearer by more than fields bend what is
     straight, and by 15 % of their distance or more; a number: always, with so many cells along the longer side of an
-    image. ``homographies`` (N, 3, 3) are of undistorted coordinates, in half diagonals, to the plane, or to directions;
+    image, or fewer where all have too many nodes together.
+
+    ``homographies`` (N, 3, 3) are of undistorted coordinates, in half diagonals, to the plane, or to directions;
     ``pairs``: how many ``matches`` there are, where these come one by one; ``edges`` gives the ends (K, 2, 2) of
     straight edges in each of some images, measured pixels. ``centers`` (N, 3) are where cameras are known to be: below
     each on the plane, and how high above it, in its unit. What heights of the ground explain is not left to fields of
@@ -100,7 +102,8 @@ def align_locally(
     if choice == "auto" and (agreement := _agreement_of_neighbours(placed)) < _MIN_AGREEMENT:
         return no_local_alignment(f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only")
     coarse, fine = (max(2, min(cells, math.isqrt(nodes // len(cameras)))) for cells, nodes in (_COARSE, _FINE))
-    cells = max(coarse, fine) if choice == "auto" else choice
+    finest = max(coarse, math.isqrt(_COARSE[1] // len(cameras)))
+    cells = max(coarse, fine) if choice == "auto" else min(choice, finest)
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
     fitted, tested = placed.take(~held_out), placed.take(held_out)
     worthwhile = (1.0 - _WORTHWHILE) * _seam_residual(tested.residual)
@@ -125,6 +128,8 @@ def align_locally(
         return LocalAlignment((), f"not worth while; {text}", before=before, after=after)
     if base is not None:
         text += ", mostly by the height of the ground"
+    if choice not in ("auto", cells):
+        text += f"; a grid of {cells} instead of {choice} cells, the finest that so many images may have"
     final = fit_fields(placed, images, best.fit.stiffness, best.fit, base)
     return LocalAlignment(final.delivered, text, cells, base is not None, before, after)
 

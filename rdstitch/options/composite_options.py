@@ -1,16 +1,30 @@
 """How images are put together."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
 from rdstitch.choices import ProjectionName
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import documented, option
-from rdstitch.options.upright_options import UprightOptions
+from rdstitch.options.option import Contradiction, documented, option
+from rdstitch.options.upright_options import TURN_CONTRADICTIONS, UprightOptions
 
 ExposureMethod = Literal["auto", "none", "exif", "gain", "blocks", "balanced"]
 Interpolation = Literal["linear", "cubic", "lanczos"]
+
+_CONTRADICTIONS = (
+    Contradiction(("gsd",), ("scale",), "scale and gsd both say how large the output is; leave one of them out"),
+    Contradiction(
+        ("like",),
+        ("gsd", "epsg", "scale", "rotate"),
+        "like says the size of pixels and the map; leave out gsd, crs, scale and rotate",
+    ),
+    Contradiction(
+        ("like", "extent"),
+        ("crop", "max_size"),
+        "like and extent say how large the output is; leave out crop and max_size",
+    ),
+)
 
 
 @documented
@@ -79,7 +93,7 @@ class CompositeOptions(UprightOptions):
         None,
         "Memory for compositing, as 800M; otherwise a quarter of what is available, at least 400M.",
         "SIZE",
-        above=0,
+        least=2**20,
         unit="bytes",
     )
     interpolation: Interpolation = option("cubic", "Interpolation kernel.")
@@ -107,21 +121,24 @@ class CompositeOptions(UprightOptions):
 
     def overridden(self, **given: Any) -> Self:
         """The same with other options; what is given takes the place of all that says the same in another way."""
-        for several in ({"scale": 1.0, "gsd": None}, {"rectangle": None, "straighten": "off", "level": False}):
-            if given.keys() & several.keys():
-                given = several | given
-        return replace(self, **given)
+        defaults = {each.name: each.default for each in fields(self)}
+        # What turns nothing, crops nothing, or is left open contradicts nothing; scale=1 and straighten="off" do.
+        stated = [name for name, value in given.items() if value not in (None, "none", 0.0)]
+        contradictions = (*_CONTRADICTIONS, *TURN_CONTRADICTIONS)
+        replaced = {other for name in stated for each in contradictions for other in each.against(name)}
+        if {"scale", "gsd"} & given.keys():
+            replaced.add("max_size")  # it would reduce them
+        new: dict[str, Any] = {name: defaults[name] for name in replaced} | given
+        if any(new.get(name, now) != now for name, now in (("like", self.like), ("epsg", self.epsg))):
+            new = {"extent": None} | new  # it is in metres of that map
+        return replace(self, **new)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.like is not None:
             object.__setattr__(self, "like", str(self.like))  # as the sidecar has it
-        if self.gsd is not None and self.scale != 1.0:
-            raise ArgumentError("scale and gsd both say how large the output is; leave one of them out")
-        if self.like is not None and (self.gsd, self.epsg, self.scale, self.rotate) != (None, None, 1.0, 0.0):
-            raise ArgumentError("like says the size of pixels and the map; leave out gsd, crs, scale and rotate")
-        if (self.like or self.extent) and (self.crop != "none" or self.max_size is not None):
-            raise ArgumentError("like and extent say how large the output is; leave out crop and max_size")
+        for contradiction in _CONTRADICTIONS:
+            contradiction.refuse(self)
         if self.extent is not None and not (self.extent[0] < self.extent[2] and self.extent[1] < self.extent[3]):
             raise ArgumentError(f"extent must be west, south, east and north, not {self.extent}")
         if self.tile_size is not None and self.tile_size % 256:

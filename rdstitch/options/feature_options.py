@@ -41,13 +41,17 @@ class FeatureOptions:
         least=0.0,
         default="0.6; of fewer than 8 images 4.8 together, at most 2.4 each",
     )
-    # keep the strongest of each cell of a grid in turn, rather than the strongest of the image
-    spread: bool = True
-    # grey levels that become 0 and 255; None: those of the set where its images have more than 8 bits, see
-    # :mod:`rdstitch.pipeline.detect_features`, else none
-    stretch: tuple[float, float] | None = None
-    # equalize local contrast before detection; None: of a set whose images show too little otherwise
-    equalize: bool | None = None
+    spread: bool = option(True, "Keep the strongest of each cell of a grid in turn.", command_line=False)
+    stretch: tuple[float, float] | None = option(
+        None,
+        "Grey levels that become 0 and 255; None: those of the set where its images have more than 8 bits, else none.",
+        command_line=False,
+    )
+    equalize: bool | None = option(
+        None,
+        "Equalize local contrast before detection; None: of a set whose images show too little otherwise.",
+        command_line=False,
+    )
     aliked_model: str | Path | None = option(None, "ONNX file of the network of --features aliked.", "FILE")
     aliked_size: int = option(
         640, "Side of the square image that the network takes, pixels.", least=1, command_line=False

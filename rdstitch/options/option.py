@@ -7,17 +7,21 @@ large is imported here or by the modules of the options, so that ``--help`` is q
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from inspect import isclass
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
 
 from rdstitch.errors import ArgumentError
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 Class = TypeVar("Class", bound=type)
+Options = TypeVar("Options", bound="DataclassInstance")
 
 
 @dataclass(frozen=True)
@@ -98,22 +102,71 @@ def declared(kind: Any) -> dict[str, Declared]:
     return {name: found for name, kind in types.items() if (found := declaration(name, kind)) is not None}
 
 
+@dataclass(frozen=True)
+class Contradiction:
+    """Options none of which may be given together with one of others, and why not."""
+
+    names: tuple[str, ...]
+    others: tuple[str, ...]
+    reason: str
+
+    def refuse(self, options: Any) -> None:
+        """Refuse options of both sides that are not their defaults."""
+        defaults = {each.name: each.default for each in fields(options)}
+        if all(any(getattr(options, n) != defaults[n] for n in side) for side in (self.names, self.others)):
+            raise ArgumentError(self.reason)
+
+    def against(self, name: str) -> tuple[str, ...]:
+        """Those that may not be given together with one."""
+        return self.others if name in self.names else self.names if name in self.others else ()
+
+
+def with_fields(options: Options, given: dict[str, Any]) -> Options:
+    """The same options with other values; a name that is none of theirs is refused."""
+    known = [each.name for each in fields(options)]
+    for name in given.keys() - set(known):
+        from difflib import get_close_matches
+
+        close = "".join(f"; do you mean {each!r}?" for each in get_close_matches(name, known, n=1))
+        raise ArgumentError(f"{type(options).__name__} has no option {name!r}{close}")
+    return replace(options, **given)
+
+
 def check_options(options: Any) -> None:
-    """Refuse a value that its field may not have; text that names a file becomes a path, lists become tuples."""
+    """Refuse a value that its field may not have; text that names a file becomes a path, lists and arrays tuples."""
     for name, option in declared(options).items():
         value = getattr(options, name)
         if isinstance(value, str) and option.types == (Path,):
             value = Path(value)
-        elif isinstance(value, list):
-            value = tuple(tuple(item) if isinstance(item, list) else item for item in value)
-        if not option.fits(value):
-            raise ArgumentError(f"{name} must be {option.expected}, not {value!r}")
-        object.__setattr__(options, name, value)
+        object.__setattr__(options, name, checked(option, value))
     for each in fields(options):
         # Options within options.
         kind: Any = each.default_factory
         if isclass(kind) and is_dataclass(kind) and not isinstance(getattr(options, each.name), kind):
             raise ArgumentError(f"{each.name} must be {kind.__name__}, not {getattr(options, each.name)!r}")
+
+
+def checked(option: Declared, value: Any) -> Any:
+    """The value, of Python's own numbers and tuples, of an option that may have it."""
+    plain = _plain(value) if any(kind in (bool, int, float) or get_origin(kind) for kind in option.types) else value
+    if not option.fits(plain):
+        raise ArgumentError(f"{option.name} must be {option.expected}, not {value!r}")
+    return plain
+
+
+def check_parameter(name: str, annotation: Any, value: Any) -> None:
+    """Refuse a parameter's value that its annotation does not allow."""
+    entry = declaration(name, Annotated[annotation, Option("")])
+    assert entry is not None
+    checked(entry, value)
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's numbers and arrays, which are no truth values, as Python's; lists as tuples."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    is_list = isinstance(value, Sequence) and not isinstance(value, str | bytes)
+    return tuple(map(_plain, value)) if is_list else value
 
 
 def documented(kind: Class) -> Class:
@@ -130,7 +183,7 @@ def _members(kind: Any) -> Sequence[Any]:
 def _fits(value: Any, kind: Any, option: Option) -> bool:
     if get_origin(kind) is tuple:
         parts = get_args(kind)
-        if isinstance(value, str) or not hasattr(value, "__len__"):
+        if not isinstance(value, tuple):
             return False
         if parts[-1] is Ellipsis:
             return all(_fits(item, parts[0], option) for item in value)

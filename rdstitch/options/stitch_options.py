@@ -10,7 +10,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.estimation_options import EstimationOptions, RansacOptions
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.options.option import documented, option
+from rdstitch.options.option import Contradiction, documented, option
 from rdstitch.options.shared_options import (
     ArrayChannels,
     Distortion,
@@ -28,6 +28,14 @@ if TYPE_CHECKING:
     from rdstitch.geometry.camera import Camera
     from rdstitch.inputs.odometry import Odometry
 
+_CONTRADICTIONS = (
+    Contradiction(("lens",), ("distortion", "camera"), "the lens is known: leave out lens, or the known lens"),
+    Contradiction(
+        ("camera",),
+        ("distortion",),
+        "camera and distortion (--camera and --lambda) both say what the lens is; leave one of them out",
+    ),
+)
 _SELECT_MODEL_BELOW = 50
 """Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
 
@@ -151,12 +159,11 @@ class StitchOptions(RansacOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        lens_known = self.distortion is not None or self.camera is not None
-        if self.lens != "auto" and lens_known:
-            raise ArgumentError("the lens is known: leave out lens, or the known lens")
+        for contradiction in _CONTRADICTIONS:
+            contradiction.refuse(self)
         if self.solver == "two_point" and self.tilt is None and (self.attitude is None or self.attitude_std > 0.0):
             raise ArgumentError("the two_point solver needs the tilt, or exact attitudes")
-        if lens_known:
+        if self.distortion is not None or self.camera is not None:
             self.refuse_solver()
         if self.scheduler not in (None, "local") and self.cache is None:
             raise ArgumentError("a cluster needs a folder for features that all its machines see: give --cache too")
@@ -175,7 +182,7 @@ class StitchOptions(RansacOptions):
 
     @property
     def known_distortion(self) -> float | None:
-        """λ where the user gave it, alone or with the camera; of a richer lens, the nearest one-parameter λ."""
+        """λ where the user gave it, or of the camera given; of a richer lens, the nearest one-parameter λ."""
         if self.distortion is not None or self.known_camera is None:
             return self.distortion
         return self.known_camera.nearest_distortion

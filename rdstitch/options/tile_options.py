@@ -88,3 +88,5 @@ class TileOptions:
         check_options(self)
         if self.positions is not None and self.grid is not None:
             raise ArgumentError("positions and grid both say where the tiles are; leave one of them out")
+        if (self.columns, self.order) != (None, "rows") and "{number}" not in (self.grid or ""):
+            raise ArgumentError("columns and order say how running numbers are laid out: they go with {number} in grid")

@@ -4,10 +4,16 @@ from dataclasses import dataclass, fields
 from typing import Literal
 
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import check_options, option
+from rdstitch.options.option import Contradiction, check_options, option
 
 Segment = tuple[float, float, float, float]
 Corners = tuple[float, float, float, float, float, float, float, float]
+
+_TURN = "rectangle, straighten and level each turn the output; give one of them"
+TURN_CONTRADICTIONS = (
+    Contradiction(("rectangle",), ("straighten", "level"), _TURN),
+    Contradiction(("straighten",), ("level",), _TURN),
+)
 
 
 @dataclass(frozen=True)
@@ -33,8 +39,8 @@ class UprightOptions:
 
     def __post_init__(self) -> None:
         check_options(self)
-        if (self.rectangle is not None) + (self.straighten != "off") + self.level > 1:
-            raise ArgumentError("rectangle, straighten and level each turn the output; give one of them")
+        for contradiction in TURN_CONTRADICTIONS:
+            contradiction.refuse(self)
         if not isinstance(self.straighten, str) and any(line[:2] == line[2:] for line in self.straighten):
             raise ArgumentError("straighten: a line needs two different ends")
 

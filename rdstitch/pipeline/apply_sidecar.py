@@ -11,21 +11,21 @@ import numpy as np
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import InputError
 from rdstitch.inputs.find import FoundImages, found_images
-from rdstitch.inputs.frame import Frame, Images, as_inputs
+from rdstitch.inputs.frame import Frame, Images, as_inputs, files_of
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.band_lens import BandLens, band_lens
 from rdstitch.options.apply_options import ApplyOptions
+from rdstitch.options.option import with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import CanvasPlan, compose_images
 from rdstitch.pipeline.deep_zoom_page import plainly_viewed, write_page
-from rdstitch.pipeline.replacements import Replacements, read_replacements
+from rdstitch.pipeline.replacements import read_replacements
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.run_files import RunFiles, check_world_files
 from rdstitch.pipeline.straighten import reoriented
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages, SavedGrid
-from rdstitch.sidecar.counterparts import registered_files
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
 from rdstitch.sidecar.recomposition import Recomposition
 from rdstitch.sidecar.write_applied import applied_sidecar
@@ -49,6 +49,8 @@ _GEOMETRY = (
     "georeference",
 )
 """Options of compositing that say which pixels the output has."""
+
+_NOT_COMPARED = "whether the same lens took the given ones, from the same places, was not compared"
 
 
 @one_native_thread()
@@ -92,7 +94,7 @@ def apply(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    options = replace(options or ApplyOptions(), **fields)
+    options = with_fields(options or ApplyOptions(), fields)
     saved = sidecar if isinstance(sidecar, SavedRegistration) else read_sidecar(sidecar)
     mismatch = mismatch_with_image(saved)
     if options.strict and mismatch:
@@ -137,7 +139,8 @@ def apply_found(
     given = read_replacements(saved, listed.frames, options, run.guard, run.options.composite.max_memory)
     if output is not None:
         check_world_files([output], list(given.sources.values()), options.overwrite)
-    plan, run, of_plan = _laid_out(saved, given, run)
+    lens, of_lens = _lens_of_band(saved, given.frames, given.sources, run.progress)
+    plan, run, of_turn = _laid_out(saved, given.sources, lens, run)
     composed, of_output = compose_images(plan, run, outputs)
     sources = dict(zip(given.sources, plan.placed.sources, strict=True))
     result = Recomposition(
@@ -145,31 +148,33 @@ def apply_found(
         sources=tuple(map(sources.get, range(len(saved.images)))),
         matched=given.matched,
         left_out=given.left_out,
-        messages=(*given.messages, *of_plan, *listed.messages, *run.guard.messages, *of_output),
+        messages=(*given.messages, *of_lens, *of_turn, *listed.messages, *run.guard.messages, *of_output),
         **composed.fields,
     )
     if options.dry_run or output is None:
         return result
     page = partial(plainly_viewed, result.canvas, [source.name for source in sources.values()])
     result = replace(result, messages=(*result.messages, *write_page(result, outputs, page)))
-    record = applied_sidecar(saved, result, sources, list(plan.placed.homographies), given.left_out, given.matched)
+    homographies = list(plan.placed.homographies)
+    record = applied_sidecar(
+        saved, result, sources, homographies, given.left_out, given.matched, same_lens=lens is None
+    )
     outputs.write(f"{output}.json", json_bytes(record))
     return result
 
 
-def _laid_out(saved: SavedRegistration, given: Replacements, run: Run) -> tuple[CanvasPlan, Run, list[Message]]:
+def _laid_out(
+    saved: SavedRegistration, sources: Mapping[int, Source], lens: BandLens | None, run: Run
+) -> tuple[CanvasPlan, Run, list[Message]]:
     """Where the images lie, by the sidecar and the lens of their band, and how they are composed there."""
-    sources, composite = given.sources, run.options.composite
-    # Channels of a microscope have their places in common, not their content.
-    tiles = saved.record.stage is not None
-    lens, messages = (None, []) if tiles else _lens_of_band(saved, given.frames, sources, run.progress)
+    composite = run.options.composite
     if lens is not None:
         sources = {index: replace(source, camera=lens.camera(source.camera)) for index, source in sources.items()}
     placed, of_turn = reoriented(_placed(saved, sources, lens), composite, saved.composite)
     if (grid := _same_grid(saved, sources, composite)) is not None:
         placed, composite = replace(placed, grid=grid), replace(composite, crop="none")
     run = replace(run, options=replace(run.options, composite=composite))
-    return CanvasPlan.of(placed, composite), run, [*messages, *of_turn]
+    return CanvasPlan.of(placed, composite), run, of_turn
 
 
 def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions) -> SavedGrid | None:
@@ -193,7 +198,15 @@ def _lens_of_band(
     saved: SavedRegistration, frames: Mapping[int, Frame], used: Mapping[int, Source], progress: Progress
 ) -> tuple[BandLens | None, list[Message]]:
     """The lens that took the given images, where that is another one than took those that were registered."""
-    there = registered_files(saved, frames)
+    if saved.record.stage is not None:
+        return None, []  # channels of a microscope have their places in common, not their content
+    files = files_of(frame for frame in frames.values() if frame.number is None)
+    originals = {k: file for k in frames if (file := saved.original(saved.images[k])) is not None}
+    if files and not originals:
+        name = saved.images[next(iter(frames))].path
+        text = f"the registered images are not there any more ({name}, …): {_NOT_COMPARED}"
+        return None, [Message(f"{saved.path}: {text}", severity="note")]
+    there = {k: file for k, file in originals.items() if file.resolve() != frames[k].path.resolve()}
     pairs: dict[int, tuple[Source, Source]] = {}
     for index, file in there.items():
         camera, size = saved.images[index].camera, used[index].camera.image_size

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rdstitch.errors import ArgumentError
+from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.selection import selected
@@ -73,7 +73,7 @@ def mosaic_bands(
         Outputs(options.overwrite) as outputs,  # all are published together
     ):
         frames = selected(listed.frames, options.exclude, options.include_only)
-        chosen = [_of_band(frames, pattern) for pattern in bands.values()]
+        chosen = _by_band(frames, bands)
         _check_alike(dict(zip(bands, chosen, strict=True)), in_one_file=bool(stack))
         whole = replace(run.options, exclude=(), include_only=())
         run = replace(run, options=whole, read=[*run.read, *listed.files])
@@ -105,7 +105,10 @@ def _check_alike(bands: Mapping[str, list[Frame]], *, in_one_file: bool) -> None
     """Refuse before long work bands whose images have other sizes than the first's, or which one file cannot hold."""
     kinds = {}
     for name, frames in bands.items():
-        read = [source.metadata for source in read_sources(frames, skip_bad=True)[0]]
+        sources, unread = read_sources(frames, skip_bad=True)
+        if not sources:
+            raise InputError(f"{unread[0].images[0]}: {unread[0].text}; no other image of {name} can be read either")
+        read = [source.metadata for source in sources]
         bits = {next(depth for depth in (8, 16, 64) if one.bit_depth <= depth) for one in read}
         kinds[name] = {"{} x {} pixels".format(*one.size) for one in read}, {f"{depth} bits" for depth in bits}
     first = next(iter(bands))
@@ -147,8 +150,17 @@ def _stage_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, out
     outputs.write(f"{file}.json", json_bytes(record))
 
 
-def _of_band(frames: Sequence[Frame], pattern: str) -> list[Frame]:
-    chosen = [frame for frame in frames if fnmatchcase(frame.path.name.lower(), pattern.lower())]
-    if not chosen:
-        raise ArgumentError(f"bands: no image has a name like {pattern}")
-    return chosen
+def _by_band(frames: Sequence[Frame], bands: Mapping[str, str]) -> list[list[Frame]]:
+    """The images of each band; none may be of two."""
+    chosen: dict[str, list[Frame]] = {name: [] for name in bands}
+    for frame in frames:
+        fitting = [name for name in bands if fnmatchcase(frame.path.name.lower(), bands[name].lower())]
+        if len(fitting) > 1:
+            one, other = (f"{name}={bands[name]}" for name in fitting[:2])
+            raise ArgumentError(f"bands: {frame.name} fits both {one} and {other}; change one of these patterns")
+        for name in fitting:
+            chosen[name].append(frame)
+    for name, of_band in chosen.items():
+        if not of_band:
+            raise ArgumentError(f"bands: no image has a name like {bands[name]}")
+    return list(chosen.values())

@@ -13,12 +13,14 @@ from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import has_times, path_as_svg
 from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.inputs.find import FoundImages, found_images
-from rdstitch.inputs.frame import Images, as_inputs
+from rdstitch.inputs.frame import Images, as_inputs, frame_numbers
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.option import check_parameter
+from rdstitch.options.shared_options import Height
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.along_odometry import with_odometry_of_bag
@@ -266,6 +268,9 @@ def trajectory(
     Trajectory, Registration
         The path, and the registration that it comes from.
     """
+    for name, kind, value in (("layout", TrajectoryFormat, layout), ("height", Height, height)):
+        check_parameter(name, kind, value)
+    check_parameter("frame", TrajectoryFrame | None, frame)
     options = replace(options or StitchOptions(), pose_covariance=True)
     given = as_inputs(inputs, options.channel_order)
     options = with_odometry_of_bag(given, options)
@@ -275,8 +280,8 @@ def trajectory(
         Outputs(options.overwrite) as outputs,
     ):
         RunFiles.of_path(run, listed.files, output, plot, layout).check(outputs)
-        # Numbered as they were named: what is left out leaves a gap.
-        numbered = [replace(f, number=k if f.number is None else f.number) for k, f in enumerate(listed.frames)]
+        numbers = frame_numbers(listed.frames)
+        numbered = [replace(frame, number=k) for frame, k in zip(listed.frames, numbers, strict=True)]
         registration = _registered(replace(listed, frames=numbered), run)
         path, of_path = camera_path(registration, options.odometry, height)
         messages = [*scale_uncertainty(registration.alignment), *of_path]

@@ -70,7 +70,7 @@ def _read(
         if image.camera is None or image.to_plane is None:
             continue
         if frame is None:
-            yield index, left_out(image.path, "is not among the given images")
+            yield index, left_out(saved.original(image) or image.path, "is not among the given images")
             continue
         read, unread = read_sources([frame], skip_bad=True, guard=guard, max_memory=max_memory)
         yield index, unread[0] if unread else replace(read[0], camera=_resized(image.camera, read[0]))

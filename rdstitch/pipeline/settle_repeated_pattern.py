@@ -15,12 +15,8 @@ from rdstitch.matching.repeated_pattern import rematch_elsewhere, shows_repeated
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.verification.overlap_check import ComparedImages
-from rdstitch.verification.photometric_agreement import COMPARED_SIDE
 from rdstitch.verification.self_similarity import find_ambiguity
-from rdstitch.verification.unique_places import unique_shifts
-
-_MAX_IMAGES = 2**27 // (2 * COMPARED_SIDE**2 * np.dtype(np.float32).itemsize)
-"""Images whose drawings and departures fit into 128 MB at once; of more, a repeated pattern is refused as before."""
+from rdstitch.verification.unique_places import IMAGES_AT_ONCE, unique_shifts
 
 _PAIRS_OF_AN_IMAGE = 6  # pairs that are compared, by image on average: those taken one soon after the other first
 _MIN_PLACED = 0.5  # of the images, that must find their place; of fewer nobody is helped
@@ -44,7 +40,7 @@ def settle_repeated_pattern(
     the pairs: why images have no place any more, by their index.
     """
     alignment = aligned.alignment
-    if alignment.poses is None or len(sources) > _MAX_IMAGES or not shows_repeated_pattern(estimator):
+    if alignment.poses is None or len(sources) > IMAGES_AT_ONCE or not shows_repeated_pattern(estimator):
         return aligned, {}
     used = [pair for pair in aligned.pairs if pair.relation and alignment.used[[pair.image1, pair.image2]].all()]
     compared = sorted(used, key=lambda pair: pair.image2 - pair.image1)[: _PAIRS_OF_AN_IMAGE * len(sources)]

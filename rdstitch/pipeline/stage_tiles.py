@@ -15,12 +15,13 @@ from rdstitch.arrays import evenly_spaced
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.places_files import fiji_list, places_table
 from rdstitch.inputs.find import FoundImages, found_images
-from rdstitch.inputs.frame import Images
+from rdstitch.inputs.frame import Frame, Images, frame_numbers
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.option import with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
 from rdstitch.pipeline.lay_out import lay_out
@@ -32,7 +33,7 @@ from rdstitch.pipeline.tiles_as_registration import tiles_as_registration
 from rdstitch.results.messages import Message, left_out
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.stage.axes import with_axes_shown
+from rdstitch.stage.axes import with_measured_axes
 from rdstitch.stage.coarse_tile import coarse_tile
 from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
@@ -80,7 +81,7 @@ def tiles(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    options = replace(options or TileOptions(), **fields)
+    options = with_fields(options or TileOptions(), fields)
     run = _tile_run(options, output, beside, progress)
     with (
         found_images(as_tiles(inputs), outputs=[run.output], topic=options.topic) as listed,
@@ -125,7 +126,7 @@ def place_tiles(
     inputs, options, progress, **fields
         As for :func:`tiles`.
     """
-    options = replace(options or TileOptions(), **fields)
+    options = with_fields(options or TileOptions(), fields)
     run = _tile_run(options, None, NOTHING_BESIDE, progress)
     with (
         found_images(as_tiles(inputs), topic=options.topic) as listed,
@@ -152,7 +153,7 @@ def _registered(
     while True:
         if len(sources) < 2:
             raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
-        nominal = _grid(sources, stored, options)
+        nominal = _grid(sources, frames, stored, options)
         try:
             sources, tiled, messages = _placed(sources, nominal, options, run.progress)
             break
@@ -201,25 +202,25 @@ def _placed(
 ) -> tuple[list[Source], TileRegistration, list[Message]]:
     """The tiles with their illumination taken out, where they are, and what there is to say of that."""
     if len({source.camera.image_size for source in sources}) > 1:
-        messages = [Message("tiles of several sizes have no flat field in common", severity="note", code="flat-field")]
+        text = "tiles of several sizes have no flat field in common"
+        illumination = [Message(text, severity="note", code="flat-field")]
         if options.flat_field not in ("auto", "off") or isinstance(options.distortion, float):
             raise ArgumentError("tiles of several sizes have neither a flat field nor a lens in common")
     else:
-        sources, messages = with_flat_field(sources, options.flat_field)
+        sources, illumination = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
     plan = SearchPlan.of(nominal, options.search)
     factor = plan.factor
-    grid, shown = with_axes_shown(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
-    if shown:
-        messages.append(Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown"))
+    grid, shown = with_measured_axes(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
+    messages = [Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown")] if shown else []
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
     tiled = register_tiles(replace(plan, grid=grid), read, distortion=options.distortion, progress=progress)
     for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
         read(index)
     if options.flat_field == "auto" and sources[0].flat_field is not None and not _overlaps_show(sources, tiled):
-        sources, messages = [replace(source, flat_field=None) for source in sources], [*messages[1:], NO_FLAT_FIELD]
-    return sources, tiled, messages
+        sources, illumination = [replace(source, flat_field=None) for source in sources], [NO_FLAT_FIELD]
+    return sources, tiled, [*illumination, *messages]
 
 
 def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
@@ -268,21 +269,24 @@ def _channels(count: int) -> str:
     return "1 channel" if count == 1 else f"{count} channels"
 
 
-def _grid(sources: Sequence[Source], stored: Mapping[Path, StoredTile], options: TileOptions) -> TileGrid:
-    """Where the tiles should be."""
+def _grid(
+    sources: Sequence[Source], listed: Sequence[Frame], stored: Mapping[Path, StoredTile], options: TileOptions
+) -> TileGrid:
+    """Where the tiles should be; those of all that were listed that are left, which moves none of them."""
     sizes = np.array([source.camera.image_size for source in sources], dtype=np.intp)
     width, height = sizes.max(axis=0).tolist()
     size, pixel_size = (width, height), options.pixel_size or sources[0].metadata.pixel_size
     names = [source.name for source in sources]
     if options.grid is not None:
         scan = Scan(options.columns, options.order, options.origin)
-        grid = grid_from_names(names, options.grid, options.overlap, size, scan)
+        listed_names = [frame.name for frame in listed]
+        grid = grid_from_names(names, options.grid, options.overlap, size, scan, listed_names)
         grid = replace(grid, pixel_size=pixel_size)
     elif isinstance(options.positions, str | os.PathLike):
         grid = grid_from_table(names, options.positions, size, pixel_size)
     elif options.positions is not None:
-        # Of tiles that are left out the lines are, too.
-        numbers = [source.number(k) for k, source in enumerate(sources)]
+        lines = dict(zip(listed, frame_numbers(listed), strict=True))
+        numbers = [lines[source.frame] for source in sources if source.frame is not None]
         grid = grid_from_arrays(options.positions, numbers, size, pixel_size)
     else:
         known = [stored.get(source.path) or StoredTile(source.path, {}) for source in sources]

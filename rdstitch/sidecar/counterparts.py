@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from operator import attrgetter
 from pathlib import Path
 
@@ -35,19 +35,21 @@ def counterparts(
     # Arrays have no names of their own.
     if match == "order" or all(frame.image is not None for frame in frames):
         return list(_by_order(saved, frames)), "order", []
-    chosen: Chosen = []
-    for part in ("name", "stem"):
-        chosen = _by_name(saved, frames, attrgetter(part))
-        if any(frame is not None for frame in chosen):
-            return chosen, "name", []
     ways: tuple[tuple[MatchedBy, Callable[[], Chosen | None]], ...] = (
+        ("name", lambda: _by_name(saved, frames, attrgetter("name"))),
+        ("name", lambda: _by_name(saved, frames, attrgetter("stem"))),
         ("name", lambda: _by_varying_part(saved, frames)),
         ("time", lambda: _by_measurement(saved, frames, _seconds)),
         ("position", lambda: _by_measurement(saved, frames, _metres)),
     )
-    for matched, find in ways[:1] if match == "name" else ways:
-        if (found := find()) is not None:
-            return found, matched, _without_counterpart(found, frames)
+    for matched, find in ways[:3] if match == "name" else ways:
+        found = find() or [None] * len(saved.images)
+        pairs = zip(saved.images, found, strict=True)
+        chosen = [None if image.to_plane is None else frame for image, frame in pairs]
+        if any(frame is not None for frame in chosen):
+            if matched == "name" and match == "auto":
+                _refuse_other_flights(saved, chosen)
+            return chosen, matched, _without_counterpart(found, frames)
     for path in files_of(frames):
         check_readable(path)
     wanted = next(image.name for image in saved.images if image.to_plane is not None)
@@ -68,19 +70,33 @@ def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[P
     given: dict[str, list[Frame]] = {}
     for frame in frames:
         given.setdefault(canonical_name(key(frame.path)), []).append(frame)
-    chosen: Chosen = []
+    chosen, taken = list[Frame | None](), set[int]()
     for image in saved.images:
         *folders, name = Path(canonical_text(image.name)).parts or ("",)
-        alike = [] if image.to_plane is None else given.get(key(Path(name)), [])
+        alike = given.get(key(Path(name)), [])
         if folders:
             alike = [frame for frame in alike if _folders(frame)[-len(folders) :] == folders]
-        if len(alike) > 1 or (alike and alike[0] in chosen):
+        if image.to_plane is not None and (len(alike) > 1 or taken.intersection(map(id, alike))):
             raise InputError(
                 f"{saved.path}: several images are called {name}; give as many images as were registered, in the same "
                 "order, with --match order"
             )
+        if image.to_plane is not None:
+            taken.update(map(id, alike))
         chosen.append(alike[0] if alike else None)
     return chosen
+
+
+def _refuse_other_flights(saved: SavedRegistration, chosen: Chosen) -> None:
+    """Refuse equal names of another flight, as cameras begin again at 1: times, or else places, tell them apart."""
+    frames = [frame for frame in chosen if frame is not None]
+    near = _by_measurement(saved, frames, _seconds) or _by_measurement(saved, frames, _metres) or chosen
+    for image, by_name, by_place in zip(saved.images, chosen, near, strict=True):
+        if by_name is not None and by_place is not None and by_name is not by_place:
+            raise InputError(
+                f"{by_name.path}: has the name or number of {image.name}, but {by_place.path.name} was taken at the "
+                "time or place of that; say which holds: --match name, or --match order"
+            )
 
 
 def _folders(frame: Frame) -> list[str]:
@@ -94,18 +110,7 @@ def _by_varying_part(saved: SavedRegistration, frames: Sequence[Frame]) -> Chose
     if ours is None or theirs is None or not set(ours) & set(theirs):
         return None
     files = dict(zip(theirs, frames, strict=True))
-    used = zip(saved.images, ours, strict=True)
-    chosen = [None if image.to_plane is None else files.get(part) for image, part in used]
-    # Equal numbers of another flight are no counterparts.
-    for measure in (_seconds, _metres):
-        near = _by_measurement(saved, frames, measure)
-        for image, by_name, by_place in zip(saved.images, chosen, near or chosen, strict=True):
-            if by_name is not None and by_place is not None and by_name is not by_place:
-                raise InputError(
-                    f"{by_name.path}: has the number of {image.name}, but {by_place.path.name} was taken at the "
-                    "time or place of that; --match order takes images in order"
-                )
-    return chosen
+    return [files.get(part) for part in ours]
 
 
 def _varying_parts(names: Sequence[str]) -> list[tuple[str, ...]] | None:
@@ -181,9 +186,3 @@ def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Fra
             "the same names, or equally many"
         )
     return frames
-
-
-def registered_files(saved: SavedRegistration, chosen: Mapping[int, Frame]) -> dict[int, Path]:
-    """Files of the registered images that are still there, where they are not the given ones themselves."""
-    files = {k: Path(saved.images[k].path) for k in chosen}
-    return {k: file for k, file in files.items() if file.is_file() and file.resolve() != chosen[k].path.resolve()}

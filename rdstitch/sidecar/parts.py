@@ -1,7 +1,9 @@
 """Records that the sidecars of a new image, and of one that was composed again, have in common."""
 
+import os
 import platform
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -23,6 +25,14 @@ from rdstitch.sidecar.records import (
     ResidualRecord,
     SeamsRecord,
 )
+
+
+def recorded_path(path: Path, output: Path | None) -> str:
+    """A file as the sidecar of an output has it, from its folder on; an absolute name, or what is no file, as it is."""
+    if output is None or path.is_absolute() or not path.exists():
+        return str(path)
+    named, folder = path.parent.resolve() / path.name, output.parent.resolve()
+    return str(named) if named.drive != folder.drive else Path(os.path.relpath(named, folder)).as_posix()
 
 
 def taken_fields(source: Source) -> dict[str, Any]:

@@ -42,6 +42,11 @@ class SavedRegistration:
         """All images, also those that are not in the output."""
         return self.record.images
 
+    def original(self, image: ImageRecord) -> Path | None:
+        """Its file, if it is still there: from the sidecar's folder on or, as earlier ones had it, the current one."""
+        path = Path(image.path)
+        return next((file for file in (self.path.parent / path, path) if file.is_file()), None)
+
     @cached_property
     def reference(self) -> int:
         """The image whose resolution the output has."""

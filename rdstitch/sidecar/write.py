@@ -15,6 +15,7 @@ from rdstitch.sidecar.parts import (
     displacement_record,
     in_degrees,
     output_record,
+    recorded_path,
     seams_record,
     taken_fields,
     to_lists,
@@ -101,7 +102,7 @@ def _images(result: StitchResult) -> list[ImageRecord]:
         records.append(
             ImageRecord(
                 source.name,
-                str(source.path),
+                recorded_path(source.path, result.output),
                 source.camera.image_size,
                 used,
                 reasons.pop(source.path, ""),
@@ -114,7 +115,10 @@ def _images(result: StitchResult) -> list[ImageRecord]:
                 **lens_fields(alignment.cameras[index]),
             )
         )
-    return records + [ImageRecord(path.name, str(path), None, False, reason) for path, reason in reasons.items()]
+    return records + [
+        ImageRecord(path.name, recorded_path(path, result.output), None, False, reason)
+        for path, reason in reasons.items()
+    ]
 
 
 def _pose(registration: Registration, index: int) -> PoseRecord | None:

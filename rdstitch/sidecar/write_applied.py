@@ -1,6 +1,7 @@
 """The sidecar of an image that was composed again: what was estimated then, of the images that are in it now."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from msgspec import UNSET
@@ -12,7 +13,15 @@ from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.inputs.source import Source
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import OutputImage
-from rdstitch.sidecar.parts import displacement_record, output_record, seams_record, taken_fields, to_output, versions
+from rdstitch.sidecar.parts import (
+    displacement_record,
+    output_record,
+    recorded_path,
+    seams_record,
+    taken_fields,
+    to_output,
+    versions,
+)
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import VERSION, Applied, ImageRecord, MatchedBy
 from rdstitch.system.records import to_jsonable
@@ -25,25 +34,29 @@ def applied_sidecar(
     homographies: Sequence[FloatArray],
     left_out: Mapping[int, Message],
     matched: MatchedBy,
+    *,
+    same_lens: bool,
 ) -> dict[str, Any]:
     """The content of the sidecar, which can be applied like any other.
 
     ``sources`` are the images of the output, by the numbers of those whose places they take, and ``homographies``
-    theirs. Pairs are those of the sidecar that was applied, and stay there.
+    theirs. Pairs are those of the sidecar that was applied, and stay there; so does how far a lens was determined that
+    took none of these images.
     """
     then, to_plane = saved.record, dict(zip(sources, homographies, strict=True))
     # An image without any image in it is never written.
     source = sources.get(saved.reference) or next(iter(sources.values()))
+    camera = camera_record(source.camera.turned(inverse(source.metadata.orientation)))
     # How far the camera was determined then.
-    determined = ("lens_covariance", "tilt_deg", "tilt_std_deg")
-    camera = replace_fields(
-        camera_record(source.camera.turned(inverse(source.metadata.orientation))),
-        lambda_std=then.lambda_std,
-        **{name: getattr(then.camera, name) for name in determined},
-        focal_std_px=_resized_std(then.camera, source.camera.focal),
-    )
+    determined = ("lambda_std", "lens_covariance", "tilt_deg", "tilt_std_deg", "focal_std_px")
+    stds = dict.fromkeys(determined) if not same_lens else {name: getattr(then.camera, name) for name in determined}
+    if same_lens:
+        stds |= {"lambda_std": then.lambda_std, "focal_std_px": _resized_std(then.camera, source.camera.focal)}
+    camera = replace_fields(camera, **stds)
+    of_lens = {"lambda_std": None, "lambda_known": False, "tilt_deg": None, "rms_px": None}
     now = replace_fields(
         then,
+        **({} if same_lens else of_lens | {"lens_reason": "that of another band, from what images of both show"}),
         version=VERSION,
         lambda_=source.camera.distortion,
         lambda_px=camera.lambda_px,
@@ -54,28 +67,39 @@ def applied_sidecar(
         output=output_record(output, turned=saved.turned),
         seams=seams_record(output.seams, [source.name for source in sources.values()]),
         images=[
-            _used_image(image, sources[index], to_plane[index], output)
+            _used_image(saved, image, sources[index], to_plane[index], output, same_lens=same_lens)
             if index in sources
-            else _unused_image(image, left_out.get(index))
+            else _unused_image(saved, image, left_out.get(index), output)
             for index, image in enumerate(saved.images)
         ],
         pairs=[],
         options={**then.options, "composite": output.options.composite},
         versions=versions(),
-        applied=Applied(str(saved.path), matched),
+        applied=Applied(recorded_path(saved.path, output.output), matched),
     )
     content: dict[str, Any] = to_jsonable(now)
     return content
 
 
-def _used_image(image: ImageRecord, source: Source, to_plane: FloatArray, output: OutputImage) -> ImageRecord:
+def _used_image(
+    saved: SavedRegistration,
+    image: ImageRecord,
+    source: Source,
+    to_plane: FloatArray,
+    output: OutputImage,
+    *,
+    same_lens: bool,
+) -> ImageRecord:
     """The record of an image, with what took its place."""
-    field, size = image.displacement_field(), source.camera.image_size
+    field, size, original = image.displacement_field(), source.camera.image_size, saved.original(image)
+    is_original = original is not None and original.resolve() == source.path.resolve()
     return replace_fields(
         image,
         name=source.name,
-        path=str(source.path),
+        path=recorded_path(source.path, output.output),
         size=size,
+        features=image.features if is_original else None,
+        pose=image.pose if same_lens else None,
         to_plane=to_plane.tolist(),
         to_output=to_output(output.canvas, to_plane),
         displacement=displacement_record(None if field is None else field.resized(size)),
@@ -85,11 +109,14 @@ def _used_image(image: ImageRecord, source: Source, to_plane: FloatArray, output
     )
 
 
-def _unused_image(image: ImageRecord, left_out: Message | None) -> ImageRecord:
+def _unused_image(
+    saved: SavedRegistration, image: ImageRecord, left_out: Message | None, output: OutputImage
+) -> ImageRecord:
     """The record of an image that is not in the output."""
     lens = {} if image.camera is None else lens_fields(image.camera)
     reason = image.reason if left_out is None else left_out.text
     gone = {"used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
+    gone["path"] = recorded_path(saved.original(image) or Path(image.path), output.output)
     return replace_fields(image, **lens, **gone, lambda2=UNSET)
 
 

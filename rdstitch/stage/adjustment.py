@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.stage.equations import LinkedPoints, StageEquations, Variances
+from rdstitch.stage.equations import LinkedPoints, StageEquations, StageState, Variances
 from rdstitch.stage.grid import TileGrid
 
 _ROUNDS = 12
@@ -90,21 +90,21 @@ def adjust(
         weights, pair_weights, noise = _reweighted(equations, state, weights, width)
     _, draws = equations.solve(state, weights, noise, variances, _RESULT_SAMPLES)
     return Adjustment(
-        places=state[equations.place_slice].reshape(-1, 2) + equations.middle,
-        distortion=float(state[-1]),
-        distortion_std=float(draws[:, -1].std()) if free_lens else math.inf,
+        places=state.places + equations.middle,
+        distortion=float(state.lens[0]),
+        distortion_std=float(draws.lens.std()) if free_lens else math.inf,
         weights=pair_weights,
         residuals=equations.errors(state)[0],
         squared=equations.squared(state),
         noise=noise,
         stage=_stage_model(equations, state, variances),
         off_stage=equations.off_stage(state),
-        deviations=draws[:, equations.place_slice].reshape(len(draws), -1, 2),
+        deviations=draws.places,
     )
 
 
 def _reweighted(
-    equations: StageEquations, state: FloatArray, weights: FloatArray, width: float
+    equations: StageEquations, state: StageState, weights: FloatArray, width: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """Weights of blocks and of pairs by a loss of a width, and the noise of the blocks that agreed by the weights."""
     squared, of_blocks = equations.squared(state), equations.squared(state, of_blocks=True)
@@ -119,27 +119,22 @@ def _reweighted(
 
 
 def _variances(
-    equations: StageEquations, state: FloatArray, draws: FloatArray, weights: FloatArray, usual: Variances
+    equations: StageEquations, state: StageState, draws: StageState, weights: FloatArray, usual: Variances
 ) -> Variances:
     """Of tiles, rows, columns and pairs, from those that links hold: the fewer they are, the more counts the usual."""
     agreeing = weights > HOLDING_WEIGHT
 
-    def squared(values: FloatArray, spread: FloatArray, shown: IntArray) -> FloatArray:
-        """Expected squares of vectors (K, 2), of which ``spread`` (S, K, 2) are draws of the errors."""
-        return np.asarray(((values**2).sum(axis=1) + (spread**2).mean(axis=0).sum(axis=1))[shown])
+    def squared(values: FloatArray, errors: FloatArray, chosen: IntArray) -> FloatArray:
+        """Expected squares of some of the vectors (K, 2), of which ``errors`` (S, K, 2) are draws."""
+        return np.asarray(((values**2).sum(axis=1) + (errors**2).mean(axis=0).sum(axis=1))[np.unique(chosen)])
 
     held = np.union1d(equations.first[agreeing], equations.second[agreeing])
-    of_tiles = squared(equations.off_stage(state), equations.off_stage(draws), held)
-    parts = (
-        (equations.row_slice, equations.rows[held]),
-        (equations.column_slice, equations.columns[held]),
-        (equations.shared_slice, equations.links.pair[agreeing]),
+    return Variances(
+        tile=_students_variance(squared(equations.off_stage(state), equations.off_stage(draws), held), usual.tile),
+        row=_students_variance(squared(state.rows, draws.rows, equations.rows[held]), usual.row),
+        column=_students_variance(squared(state.columns, draws.columns, equations.columns[held]), usual.column),
+        pair=_students_variance(squared(state.shared, draws.shared, equations.links.pair[agreeing]), usual.pair),
     )
-    of_parts = [
-        squared(state[part].reshape(-1, 2), draws[:, part].reshape(len(draws), -1, 2), np.unique(shown))
-        for part, shown in parts
-    ]
-    return Variances(*map(_students_variance, (of_tiles, *of_parts), usual))
 
 
 def _students_variance(squares: FloatArray, usual: float) -> float:
@@ -152,17 +147,10 @@ def _students_variance(squares: FloatArray, usual: float) -> float:
     return variance
 
 
-def _stage_model(equations: StageEquations, state: FloatArray, variances: Variances) -> StageModel:
+def _stage_model(equations: StageEquations, state: StageState, variances: Variances) -> StageModel:
     linked = np.unique(equations.links.tiles)
     row_std, column_std = (
         math.sqrt(variance) if np.unique(lines[linked]).size >= _MIN_LINES else None
         for lines, variance in ((equations.rows, variances.row), (equations.columns, variances.column))
     )
-    return StageModel(
-        state[equations.matrix_slice].reshape(2, 2),
-        state[equations.row_slice].reshape(-1, 2),
-        state[equations.column_slice].reshape(-1, 2),
-        row_std,
-        column_std,
-        math.sqrt(variances.tile),
-    )
+    return StageModel(state.matrix, state.rows, state.columns, row_std, column_std, math.sqrt(variances.tile))

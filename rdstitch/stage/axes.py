@@ -11,9 +11,10 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.stage.coarse_tile import CoarseTile
 from rdstitch.stage.evidence import HUNDRED_TO_ONE, MIN_AXES_EVIDENCE, wide_peaks
 from rdstitch.stage.grid import TileGrid
+from rdstitch.stage.pair_candidates import Candidates
 
 _TRIED, _ENOUGH = 48, 8  # pairs of an axis that are compared at most, and those with evidence that are enough
-_MIN_RATIO = 1.2  # of evidence for other axes to that as told: where one is right its pairs agree in both
+_MIN_RATIO = 1.2  # of evidence for other axes to that for the nominal ones: where one is right its pairs agree in both
 _ACROSS = 2.0  # times as far as along a step neighbours may be off across it
 _MAX_SKEW = 0.1  # radians that the two axes may be off it
 _SIMILAR = 0.2  # share by which the steps of pairs may differ to be compared with each other
@@ -24,7 +25,7 @@ class _Axis:
     """What pairs of neighbours along one of the stage's axes show."""
 
     step: FloatArray  # (2,): nominal, pixels
-    shown: FloatArray  # (P, 2): where the second tile of a pair is in the first
+    measured: FloatArray  # (P, 2): where the second tile of a pair is in the first
     nats: FloatArray  # (P,): that it is there and not anywhere else
 
     def evidence(self, step: FloatArray, tolerance: float) -> float:
@@ -34,14 +35,14 @@ class _Axis:
     def _near(self, step: FloatArray, tolerance: float) -> BoolArray:
         """Pairs that show a step; across it rows that are taken to and fro have their backlash twice."""
         across = 1.0 + _ACROSS * (np.arange(2) != np.abs(step).argmax())
-        return np.asarray((np.abs(self.shown - step) <= tolerance * across).all(axis=1))
+        return np.asarray((np.abs(self.measured - step) <= tolerance * across).all(axis=1))
 
     def steps(self, tolerance: float, count: int = 4) -> list[FloatArray]:
         """The steps with the most evidence, unlike each other, along an axis of the image; the most first."""
         chosen: list[FloatArray] = []
-        for step in sorted(self.shown, key=lambda step: -self.evidence(step, tolerance)):
+        for step in sorted(self.measured, key=lambda step: -self.evidence(step, tolerance)):
             if len(chosen) < count and all(np.abs(step - other).max() > tolerance for other in chosen):
-                middle = np.median(self.shown[self._near(step, tolerance)], axis=0)
+                middle = np.median(self.measured[self._near(step, tolerance)], axis=0)
                 chosen.append(np.where(np.arange(2) == np.abs(middle).argmax(), middle, 0.0))
         return chosen
 
@@ -50,35 +51,35 @@ class _Axis:
 class _Step:
     """From one column or row of the grid to the next, pixels (2,)."""
 
-    told: FloatArray
-    shown: FloatArray  # by the tiles
+    nominal: FloatArray
+    measured: FloatArray  # by the tiles
 
 
-def with_axes_shown(
+def with_measured_axes(
     grid: TileGrid, read: Callable[[int], CoarseTile], factor: int, search: float
 ) -> tuple[TileGrid, str]:
-    """The grid as its tiles show it, and in words what it is not as told; unchanged, and "", unless clearly otherwise.
+    """The grid as its tiles show it, and in words what is not as given; unchanged, and "", unless clearly otherwise.
 
-    ``read`` gives tiles whose pixels are ``factor`` of the grid's; within ``search`` pixels the grid is as told.
+    ``read`` gives tiles whose pixels are ``factor`` of the grid's; within ``search`` pixels it is as given.
     """
     axes = {k: axis for k in (0, 1) if (axis := _axis(grid, k, read, factor)) is not None}
 
     def evidence(steps: Sequence[FloatArray]) -> float:
         return sum(axis.evidence(step, search) for axis, step in zip(axes.values(), steps, strict=True))
 
-    told, *others = product(*([axis.step, *axis.steps(search)] for axis in axes.values()))
-    best = max([told, *(steps for steps in others if len(steps) < 2 or _perpendicular(*steps))], key=evidence)
+    nominal, *alternatives = product(*([axis.step, *axis.steps(search)] for axis in axes.values()))
+    best = max([nominal, *(steps for steps in alternatives if len(steps) < 2 or _perpendicular(*steps))], key=evidence)
     if (
-        evidence(best) < max(MIN_AXES_EVIDENCE, _MIN_RATIO * evidence(told))
-        or best is told
-        or all(np.abs(shown - step).max() <= search for shown, step in zip(best, told, strict=True))
+        evidence(best) < max(MIN_AXES_EVIDENCE, _MIN_RATIO * evidence(nominal))
+        or best is nominal
+        or all(np.abs(measured - step).max() <= search for measured, step in zip(best, nominal, strict=True))
     ):
         return grid, ""
-    steps = {k: _Step(axis.step, shown) for (k, axis), shown in zip(axes.items(), best, strict=True)}
+    steps = {k: _Step(axis.step, measured) for (k, axis), measured in zip(axes.items(), best, strict=True)}
     steps = _completed(steps, axes, search)
     before, after = np.eye(2), np.eye(2)
     for k, step in steps.items():
-        before[k], after[k] = step.told, step.shown
+        before[k], after[k] = step.nominal, step.measured
     places = grid.places @ np.linalg.solve(before, after)
     turned = replace(grid, places=places - places.min(axis=0))
     return turned, _in_words(steps, grid.size)
@@ -87,8 +88,8 @@ def with_axes_shown(
 def _axis(grid: TileGrid, axis: int, read: Callable[[int], CoarseTile], factor: int) -> _Axis | None:
     """Neighbours along an axis of the grid; None where it has none."""
     cells = {cell: k for k, cell in enumerate(zip(grid.columns.tolist(), grid.rows.tolist(), strict=True))}
-    beside = ((k, cells.get((c + 1, r) if axis == 0 else (c, r + 1))) for (c, r), k in cells.items())
-    pairs: IntArray = np.array([pair for pair in beside if pair[1] is not None], dtype=np.intp).reshape(-1, 2)
+    adjacent = ((k, cells.get((c + 1, r) if axis == 0 else (c, r + 1))) for (c, r), k in cells.items())
+    pairs: IntArray = np.array([pair for pair in adjacent if pair[1] is not None], dtype=np.intp).reshape(-1, 2)
     if not len(pairs):
         return None
     off = grid.places[pairs[:, 1]] - grid.places[pairs[:, 0]]
@@ -96,18 +97,18 @@ def _axis(grid: TileGrid, axis: int, read: Callable[[int], CoarseTile], factor: 
     pairs = pairs[np.abs(off - step).max(axis=1) <= _SIMILAR * np.linalg.norm(step)]
     # Spread over the grid, whatever the number that will be compared: multiples of the golden section.
     order = np.argsort((np.arange(len(pairs)) * (math.sqrt(5.0) - 1.0) / 2.0) % 1.0, kind="stable")
-    shown, margins = [], []
+    measured, margins = [], []
     for first, second in pairs[order[:_TRIED]].tolist():
         tiles = read(first), read(second)
         places, nats = wide_peaks(tiles)
         if len(nats):
             best = int(nats.argmax())
-            others = nats[np.abs(places - places[best]).max(axis=1) > min(tile.grain for tile in tiles)]
-            shown.append(places[best] * factor)
-            margins.append(max(0.0, float(nats[best] - others.max(initial=0.0))))
+            found = Candidates(places, nats, min(tile.grain for tile in tiles))
+            measured.append(places[best] * factor)
+            margins.append(max(0.0, float(nats[best]) - found.best_elsewhere(best)))
             if sum(margin > HUNDRED_TO_ONE for margin in margins) == _ENOUGH:
                 break
-    return _Axis(np.asarray(step), np.array(shown).reshape(-1, 2), np.array(margins))
+    return _Axis(np.asarray(step), np.array(measured).reshape(-1, 2), np.array(margins))
 
 
 def _perpendicular(x: FloatArray, y: FloatArray) -> bool:
@@ -118,23 +119,23 @@ def _completed(steps: Mapping[int, _Step], axes: Mapping[int, _Axis], search: fl
     """The steps; one that no pair shows follows the other in direction and length."""
     completed = dict(steps)
     for k, step in steps.items():
-        if 1 - k in steps and axes[k].evidence(step.shown, search) == 0.0:
+        if 1 - k in steps and axes[k].evidence(step.measured, search) == 0.0:
             other = steps[1 - k]
-            # Perpendicular, on the side where it was told to be if that is one.
-            longer = float(np.linalg.norm(step.told) / np.linalg.norm(other.told))
-            across = np.array([-other.shown[1], other.shown[0]]) * longer
-            completed[k] = _Step(step.told, across if float(across @ step.told) >= 0.0 else -across)
+            # Perpendicular, on the side of the nominal one if there is such a side.
+            longer = float(np.linalg.norm(step.nominal) / np.linalg.norm(other.nominal))
+            across = np.array([-other.measured[1], other.measured[0]]) * longer
+            completed[k] = _Step(step.nominal, across if float(across @ step.nominal) >= 0.0 else -across)
     return completed
 
 
 def _in_words(steps: Mapping[int, _Step], size: tuple[int, int]) -> str:
-    """What is not as told: directions, and overlaps."""
+    """What is not as it was given: directions, and overlaps."""
     said, overlaps = [], []
     for k, step in steps.items():
-        along = int(np.abs(step.shown).argmax())
+        along = int(np.abs(step.measured).argmax())
         if along != k:
             said.append(f"{('columns', 'rows')[k]} lie {'below' if along else 'beside'} each other")
-        if step.shown[along] * step.told[k] < 0.0:
+        if step.measured[along] * step.nominal[k] < 0.0:
             said.append(f"the next {('column', 'row')[k]} is {('left', 'above')[along]}")
-        overlaps.append(f"{100.0 * (1.0 - abs(step.shown[along]) / size[along]):.1f}")
+        overlaps.append(f"{100.0 * (1.0 - abs(step.measured[along]) / size[along]):.1f}")
     return f"{', '.join([*said, ''])}neighbours overlap by {' and '.join(overlaps)} %"

@@ -56,8 +56,8 @@ def _most_likely(
     score = candidates.nats + np.logaddexp(log_prior, ANYWHERE + anywhere)
     best = int(score.argmax())
     # Nothing of what was found may be right, either.
-    others = np.append(score[candidates.apart(best)], anywhere)
-    return best, float(score[best] - np.logaddexp.reduce(others))
+    elsewhere = np.append(score[candidates.distinct_from(best)], anywhere)
+    return best, float(score[best] - np.logaddexp.reduce(elsewhere))
 
 
 class _Move(NamedTuple):
@@ -86,10 +86,10 @@ def _moved_tiles(
         place, agreeing = _largest_group(np.concatenate(moved), moves, search)
         if np.abs(place).max() <= search:
             continue
-        margins = {move: move.nats - candidates[move.pair].best_besides(move.candidate) for move in agreeing}
-        shown = {move: margin for move, margin in margins.items() if margin > 0.0}
-        if len(shown) > 1 and sum(shown.values()) > HUNDRED_TO_ONE - ANYWHERE:
-            found |= {move.pair: candidates[move.pair].offsets[move.candidate] for move in shown}
+        margins = {move: move.nats - candidates[move.pair].best_elsewhere(move.candidate) for move in agreeing}
+        supporting = {move: margin for move, margin in margins.items() if margin > 0.0}
+        if len(supporting) > 1 and sum(supporting.values()) > HUNDRED_TO_ONE - ANYWHERE:
+            found |= {move.pair: candidates[move.pair].offsets[move.candidate] for move in supporting}
     return found
 
 

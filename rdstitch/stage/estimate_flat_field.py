@@ -85,8 +85,8 @@ def _noise_of_ground(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
     """
     rows = tile[: tile.shape[0] // 2 * 2].astype(np.float32)
     rows, between = rows[::2], rows[1::2]
-    beside = _cells(between[:, :-2] + between[:, 1:-1] + between[:, 2:])
-    away = np.abs(beside - np.median(beside, axis=-1, keepdims=True))
+    smoothed = _cells(between[:, :-2] + between[:, 1:-1] + between[:, 2:])
+    away = np.abs(smoothed - np.median(smoothed, axis=-1, keepdims=True))
     half = max(1, away.shape[-1] // 2)
     ground = np.argpartition(away, half - 1, axis=-1)[..., :half]
     second = _cells(np.abs(rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]))
@@ -109,11 +109,11 @@ class _Channel:
     spread: float  # of the illumination itself
 
     @classmethod
-    def of(cls, shown: _Statistics, channel: int) -> "_Channel":
-        ground = shown.ground[..., channel]
-        dark, dark_error = _sure_dark_level(shown.light[..., channel], shown.variance[..., channel])
+    def of(cls, statistics: _Statistics, channel: int) -> "_Channel":
+        ground = statistics.ground[..., channel]
+        dark, dark_error = _sure_dark_level(statistics.light[..., channel], statistics.variance[..., channel])
         # Where it is not shown, all are as likely up to the largest that cameras have: its root mean square.
-        largest = min(_MAX_DARK * shown.largest, float(np.quantile(ground, 0.01)))
+        largest = min(_MAX_DARK * statistics.largest, float(np.quantile(ground, 0.01)))
         other = dark + dark_error if dark_error else largest / math.sqrt(3.0)
         parts = ground - dark, ground[::2] - dark, ground[1::2] - dark, ground - other
         down, across = (_middles(cells) for cells in ground.shape[1:])
@@ -140,11 +140,11 @@ def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Il
     # Second differences in every other row take two rows of three samples.
     if count < MIN_TILES or first.shape[0] < 2 or first.shape[1] < 3:
         return Illumination(None, math.inf, 0.0, np.zeros(1), np.zeros(1))
-    shown = _Statistics(read(index) for index in range(count))
-    channels = [_Channel.of(shown, channel) for channel in range(shown.ground.shape[3])]
+    cells = _Statistics(read(index) for index in range(count))
+    channels = [_Channel.of(cells, channel) for channel in range(cells.ground.shape[3])]
     # Centres of the pixels in the frame of the cells, from -1 to 1.
     x, y = (
-        2.0 * (np.arange(first.shape[axis]) + 0.5) * shown.size[axis] / first.shape[axis] / shown.used[axis] - 1.0
+        2.0 * (np.arange(first.shape[axis]) + 0.5) * cells.size[axis] / first.shape[axis] / cells.used[axis] - 1.0
         for axis in (1, 0)
     )
     gain = np.stack([np.exp(_surface(channel.surface, x, y)) for channel in channels], axis=-1).astype(np.float32)
@@ -179,9 +179,9 @@ def agrees_with_overlaps(field: FlatField, overlaps: Iterable[tuple[NDArray[Any]
                 cell = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
                 a, b = (part[cell].mean(axis=(0, 1)) for part in parts)
                 f, g = (field.gain[part][cell].mean(axis=(0, 1)) for part in (here, there))
-                shown = (a > 0.0) & (b > 0.0)
-                measured += np.log(a[shown] / b[shown]).tolist()
-                expected += np.log(f[shown] / g[shown]).tolist()
+                positive = (a > 0.0) & (b > 0.0)
+                measured += np.log(a[positive] / b[positive]).tolist()
+                expected += np.log(f[positive] / g[positive]).tolist()
     r, f = np.array(measured), np.array(expected)
     if not len(r) or not (f**2).sum() > 0.0:
         return False
@@ -239,8 +239,8 @@ def _dark_level(ground: FloatArray, variance: FloatArray) -> float:
     # Of each bin the lower part: texture, too, is taken for noise.
     y = np.array([np.quantile(noise[part], 0.25) for part in bins])
     first, second = np.triu_indices(len(x), 1)
-    apart = x[second] - x[first] > 0.0
-    slopes = (y[second] - y[first])[apart] / (x[second] - x[first])[apart]
+    distinct = x[second] - x[first] > 0.0
+    slopes = (y[second] - y[first])[distinct] / (x[second] - x[first])[distinct]
     low, slope = np.quantile(slopes, [0.16, 0.5]) if len(slopes) else (0.0, 0.0)
     if not low > 0.0:
         return 0.0

@@ -19,7 +19,7 @@ from rdstitch.system.late_imports import fft
 
 HUNDRED_TO_ONE = math.log(100.0)  # by which a place of a pair stands out against another, or against nothing
 WRONG_PEAK = 6.0  # below which a pair is looked for elsewhere: a peak of about 0.6 may be one of a pattern
-MIN_AXES_EVIDENCE = 10.0  # below which tiles show no other axes than told: one overlap that correlates by 0.9
+MIN_AXES_EVIDENCE = 10.0  # below which the nominal axes hold: one overlap that correlates by 0.9
 ANYWHERE = math.log(1e-3)  # prior that a tile is anywhere but where its stage was sent, within its errors
 
 _UNLIKE = 0.2  # share of the variance that two images of the same may differ by: interpolation, bleaching, focus
@@ -36,9 +36,9 @@ def log_evidence(
 ) -> float:
     """How much more likely two tiles are with the second at a place (2,) in the first than anywhere else, in nats.
 
-    By their normalized cross-correlation in the blocks of the overlap, each displaced by its shift (K, 2) besides, but
-    for their noise. However many pixels an overlap has, they count as few: neighbours are alike, and what interpolation
-    and bleaching change is not independent.
+    By their normalized cross-correlation in the blocks of the overlap, each displaced by its shift (K, 2) in addition,
+    but for their noise. However many pixels an overlap has, they count as few: neighbours are alike, and what
+    interpolation and bleaching change is not independent.
     """
     first, second = (tile.content for tile in tiles)
     noise = np.array([tile.noise for tile in tiles])
@@ -88,8 +88,8 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
     found: dict[tuple[int, int], None] = {}
     # A pattern that repeats itself is as high in many places of the plain correlation, and in chance ones of the other.
     for values, threshold in ((surface, peak_threshold(deviation, surface.size)), (plain, 0.0)):
-        shown = np.where(possible, values, 0.0).astype(np.float32)
-        found |= dict.fromkeys((int(x[column]), int(y[row])) for column, row in peaks(shown, threshold, _WIDE_PEAKS))
+        masked = np.where(possible, values, 0.0).astype(np.float32)
+        found |= dict.fromkeys((int(x[column]), int(y[row])) for column, row in peaks(masked, threshold, _WIDE_PEAKS))
     places = np.array(list(found), dtype=np.float64).reshape(-1, 2)
     boxes = [Overlap.expected(0, 1, place, sizes[:, ::-1], 1) for place in places]
     return places, np.array([log_evidence(tiles, box, at) for at, box in zip(places, boxes, strict=True)])

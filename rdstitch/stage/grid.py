@@ -54,12 +54,12 @@ class TileGrid:
         pairs = []
         for position, first in enumerate(order.tolist()):
             stop = int(np.searchsorted(y, y[position] + sizes[first, 1] + reach))
-            others = order[position + 1 : stop]
-            low = np.maximum(self.places[others], self.places[first])
-            high = np.minimum(self.places[others] + sizes[others], self.places[first] + sizes[first])
-            common, least = high - low, np.minimum(sizes[others], sizes[first]).min(axis=1)
+            candidates = order[position + 1 : stop]
+            low = np.maximum(self.places[candidates], self.places[first])
+            high = np.minimum(self.places[candidates] + sizes[candidates], self.places[first] + sizes[first])
+            common, least = high - low, np.minimum(sizes[candidates], sizes[first]).min(axis=1)
             near = (common > -reach / 2).all(axis=1) & (common.max(axis=1) > _MIN_OVERLAP * least)
-            pairs += [(min(first, k), max(first, k)) for k in others[near].tolist()]
+            pairs += [(min(first, k), max(first, k)) for k in candidates[near].tolist()]
         rank = np.empty(len(self), dtype=np.intp)
         rank[np.lexsort([self.places[:, 0], self.columns, self.rows])] = np.arange(len(self))
         return np.array(sorted(pairs, key=lambda pair: sorted(rank[[*pair]])), dtype=np.intp).reshape(-1, 2)

@@ -28,7 +28,7 @@ _Tile = TypeVar("_Tile")
 _COARSE_SIDE = 512  # pixels that are enough to find a displacement to a pixel of theirs
 _SEARCH = 0.05  # of a side: displacement from the nominal place where the user does not say
 _MIN_OVERLAP = 0.02  # of a side: overlap that is compared at least
-_NARROW = 2  # coarse pixels about where others say that a pair is: peaks are kept above the noise of so few
+_NARROW = 2  # coarse pixels: the radius of the window above whose noise peaks are kept
 _CANDIDATES = 8  # highest peaks of a pair that are compared by normalized cross-correlation
 _LENSES = np.linspace(-0.04, 0.04, 21)  # values of λ that are tried before it is estimated
 _LENS_REACH = 0.02  # of a side: largest displacement of an overlap's blocks against each other by the lens
@@ -63,13 +63,13 @@ class Candidates:
     nats: FloatArray  # (K,): evidence for each, see :func:`log_evidence`
     grain: float  # pixels within which two of them are one
 
-    def apart(self, index: int) -> BoolArray:
-        """Which others (K,) are another place than one of them."""
+    def distinct_from(self, index: int) -> BoolArray:
+        """Which of them (K,) are another place than one of them."""
         return np.asarray(np.abs(self.offsets - self.offsets[index]).max(axis=1) > self.grain)
 
-    def best_besides(self, index: int) -> float:
+    def best_elsewhere(self, index: int) -> float:
         """The most evidence, nats, for any other place than one of them; 0 for none."""
-        return float(self.nats[self.apart(index)].max(initial=0.0))
+        return float(self.nats[self.distinct_from(index)].max(initial=0.0))
 
 
 class PairFinder:
@@ -130,10 +130,10 @@ class PairFinder:
     ) -> Candidates:
         """Peaks of the correlation by their evidence; of any place in the tiles where none of them has much."""
         overlap, grain = self.overlap(number), min(tile.grain for tile in tiles)
-        likely, others = self._peaks(surfaces, _shifts(overlap, lens), grain)
+        likely, further = self._peaks(surfaces, _shifts(overlap, lens), grain)
         offsets: list[FloatArray] = []
         nats: list[float] = []
-        for at in (*likely, *others):
+        for at in (*likely, *further):
             offset = overlap.offset + at - self.radius
             there = self.overlap(number, offset * self.factor)
             value = log_evidence(tiles, there, offset, _shifts(there, lens))
@@ -151,8 +151,8 @@ class PairFinder:
         plain = surfaces.plain[inner, inner].astype(np.float64)
         likely = [_vertex(total, *at) for at in peaks(total, _threshold(total, _NARROW), _CANDIDATES)]
         # Of a repeated pattern all places are alike, whichever of them a whitened correlation makes higher.
-        others = [_vertex(plain, *at) for at in peaks(plain, 0.0, _CANDIDATES)]
-        return likely, [at for at in others if all(np.abs(at - other).max() > grain for other in likely)]
+        further = [_vertex(plain, *at) for at in peaks(plain, 0.0, _CANDIDATES)]
+        return likely, [at for at in further if all(np.abs(at - other).max() > grain for other in likely)]
 
 
 def _vertex(surface: FloatArray, x: int, y: int) -> FloatArray:

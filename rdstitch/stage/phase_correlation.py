@@ -32,7 +32,7 @@ class Surfaces:
         return int(self.values.shape[1] // 2)
 
     def total(self, shifts: FloatArray, radius: int) -> FloatArray:
-        """Sum over the blocks, each displaced by its shift (K, 2) besides, (2 R + 1, 2 R + 1)."""
+        """Sum over the blocks, each displaced by its shift (K, 2) in addition, (2 R + 1, 2 R + 1)."""
         total = np.zeros((2 * radius + 1, 2 * radius + 1), dtype=np.float32)
         for surface, (x, y) in zip(self.values, np.rint(shifts).astype(int).tolist(), strict=True):
             top, left = self.reach - radius + y, self.reach - radius + x

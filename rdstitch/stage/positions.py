@@ -50,9 +50,17 @@ class Scan:
 
 
 def grid_from_names(
-    names: Sequence[str], pattern: str, overlap: float, size: tuple[int, int], scan: Scan | None = None
+    names: Sequence[str],
+    pattern: str,
+    overlap: float,
+    size: tuple[int, int],
+    scan: Scan | None = None,
+    listed: Sequence[str] = (),
 ) -> TileGrid:
-    """Places by rows and columns, or running numbers, in file names."""
+    """Places by rows and columns, or running numbers, in file names.
+
+    Numbers run from the first to the last of ``listed``, which names tiles too that cannot be read.
+    """
     if not 0.0 <= overlap < 100.0:
         raise ArgumentError(f"tiles overlap by 0 to less than 100 %, not {overlap:g} %")
     scan, wanted, found = scan or Scan(), _compiled(pattern), []
@@ -61,7 +69,8 @@ def grid_from_names(
         if fitting is None:
             raise ArgumentError(f"{name}: does not fit the grid '{pattern}'")
         found.append(fitting.groupdict())
-    cells = _cells(found, scan)
+    fitting_names = filter(None, map(wanted.search, [*names, *listed]))
+    cells = _cells(found, scan, [fitting.groupdict() for fitting in fitting_names])
     if len(set(cells)) < len(cells):
         twice = next(cell for cell in cells if cells.count(cell) > 1)
         raise ArgumentError(f"several tiles are row {twice[1]}, column {twice[0]}; name those of one channel only")
@@ -86,13 +95,15 @@ def _compiled(pattern: str) -> re.Pattern[str]:
     return re.compile(rf"(?<!\d){expression}" if pattern.startswith("{") else expression)
 
 
-def _cells(found: Sequence[Mapping[str, str]], scan: Scan) -> list[tuple[int, int]]:
-    """Column and row of each tile by what its name says: a running number, or either."""
+def _cells(
+    found: Sequence[Mapping[str, str]], scan: Scan, listed: Sequence[Mapping[str, str]]
+) -> list[tuple[int, int]]:
+    """Column and row of each tile by what its name says: a running number, among all that were listed, or either."""
     if "number" not in found[0]:
         return [(int(item["col"]), int(item["row"]) if "row" in item else _number(item["letter"])) for item in found]
-    numbers = [int(item["number"]) for item in found]
+    numbers = [int(item["number"]) for item in listed]
     first, count = min(numbers), max(numbers) - min(numbers) + 1
-    return [scan.cell(number - first, count) for number in numbers]
+    return [scan.cell(int(item["number"]) - first, count) for item in found]
 
 
 def _number(letters: str) -> int:

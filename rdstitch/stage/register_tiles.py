@@ -115,16 +115,16 @@ def _with_lens(
 def _lens_is_there(grid: TileGrid, links: LinkedPoints, std: float, lens: float) -> bool:
     """Check whether pairs along rows and pairs along columns show the same λ: what else bends tiles does not."""
     off = np.abs(grid.places[links.tiles[:, 1]] - grid.places[links.tiles[:, 0]])
-    shown = []
+    estimates = []
     for along in (off[:, 0] > off[:, 1], off[:, 0] <= off[:, 1]):
         part = links.of_pairs(along)
         if not len(part.pair):
             return False
         fitted = adjust(grid, part, std, lens, free_lens=True)
-        shown.append((fitted.distortion, fitted.distortion_std))
-    (a, a_std), (b, b_std) = shown
-    apart = abs(a - b) <= max(_LENS_AGREES * abs(a + b) / 2.0, 3.0 * math.hypot(a_std, b_std))
-    return apart and a * b > 0.0 and all(abs(value) > _LENS_SHOWN * deviation for value, deviation in shown)
+        estimates.append((fitted.distortion, fitted.distortion_std))
+    (a, a_std), (b, b_std) = estimates
+    agree = abs(a - b) <= max(_LENS_AGREES * abs(a + b) / 2.0, 3.0 * math.hypot(a_std, b_std))
+    return agree and a * b > 0.0 and all(abs(value) > _LENS_SHOWN * deviation for value, deviation in estimates)
 
 
 def _transfer(overlap: Overlap, offset: FloatArray, camera: Camera) -> PointMap:

@@ -91,11 +91,13 @@ def tile_frames(
     files = [frame.path for frame in frames if frame.image is None and frame.load is None]
     stored = {tile.name: tile for tile in stored_tiles(files)}
     known = {frame.path: frame for frame in frames}
-    tiles = [frame for frame in frames if frame.path not in set(files)]
-    tiles += [
-        known[tile.name] if tile.is_plain else _frame(tile, "max" if z is None else z, time or 0)
-        for tile in stored.values()
-    ]
+    tiles = list(frames)
+    if not all(tile.is_plain for tile in stored.values()):
+        tiles = [frame for frame in frames if frame.path not in set(files)]
+        tiles += [
+            known[tile.name] if tile.is_plain else _frame(tile, "max" if z is None else z, time or 0)
+            for tile in stored.values()
+        ]
     depth, times = (max((tile.counts[k] for tile in stored.values()), default=1) for k in (1, 2))
     notes = []
     if depth > 1 and z is None:

@@ -11,7 +11,6 @@ from importlib import import_module
 import numpy as np
 
 from rdstitch.alignment import Alignment, align
-from rdstitch.errors import RdstitchError
 from rdstitch.results.messages import Message
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.placement import Placement, PlaneSimilarity
@@ -111,7 +110,7 @@ class MapRefinement:
             alignment = window.future.result(patience)
         except NotYet:
             return None
-        except (RdstitchError, np.linalg.LinAlgError) as error:
+        except Exception as error:  # noqa: BLE001 - whatever it is, the frames that follow are worth more
             self.drop()
             self._report(Message(f"an alignment of the last keyframes failed ({error}); the next one is tried"))
             return None

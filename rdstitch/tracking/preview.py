@@ -21,6 +21,7 @@ from rdstitch.tracking.tracked_frame import TrackingResult
 _FRAME_SIDE = 240  # longer side of a frame in the preview at first, pixels
 _OUTLINE = 8  # points a side of a frame's outline
 _MEGAPIXELS = 0.08  # 10⁶ pixels that a keyframe is read with
+_FARTHEST = 4  # times the longest side: what would make the preview longer, before it is halved, is wrongly placed
 
 
 class Preview:
@@ -36,14 +37,16 @@ class Preview:
         self._scale = 0.0  # pixels per unit of the plane
 
     def paint(self, image: NDArray[Any], placement: Placement) -> None:
-        """Paint a frame (H, W) or (H, W, C) of any size; one beyond the horizon, or far too large, is left out."""
+        """Paint a frame (H, W) or (H, W, C) of any size; one beyond the horizon, too large or far away is left out."""
         outline = placement.to_plane(placement.camera.outline(_OUTLINE))
         if not np.isfinite(outline).all():
             return
         extent = float(np.ptp(outline, axis=0).max())
         if self._scale == 0.0:
             self._scale = _FRAME_SIDE / max(extent, 1e-12)
-        if extent * self._scale > self._side:
+        painted = (self._origin + np.array([[0, 0], self.pixels.shape[1::-1]])) / self._scale
+        reach = float(np.ptp(np.vstack([outline, painted]), axis=0).max()) if self.pixels.size else extent
+        if extent * self._scale > self._side or reach * self._scale > _FARTHEST * self._side:
             return
         low, high = self._make_room(outline)
         x, y = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))

@@ -1,6 +1,6 @@
 """A second opinion on a registration: do the images look alike where it puts them together?"""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -25,7 +25,7 @@ from rdstitch.verification.photometric_agreement import (
     overlap_agreement,
 )
 from rdstitch.verification.self_similarity import SLACK, Ambiguity, drawing_scale, find_ambiguity
-from rdstitch.verification.unique_places import unique_shifts
+from rdstitch.verification.unique_places import IMAGES_AT_ONCE, unique_shifts
 
 _MAX_LINKS = 40  # up to which all are looked at; of more, so many of the least confirmed, and some of all at random
 # Links that are taken at random, and their share of all at the most. If none of 300 is wrong, with a confidence of 95 %
@@ -107,8 +107,7 @@ def check_overlaps(registration: Registration, images: ComparedImages, cache: Ca
         if alignment.poses is None or alignment.on_sphere:
             # On a plane that is not metric a period of a pattern is another shift at every place.
             return checked
-        doubtful = chain.from_iterable(link.pair for link in checked if link.ambiguity.ambiguous)
-        return _by_what_is_unique(images.aligned(alignment, doubtful), checked)
+        return _by_what_is_unique(images, alignment, checked)
 
     inputs = (described, chosen, registration.stretch, alignment.on_sphere, alignment.poses is None)
     return cache.recall("overlaps", inputs, compute)
@@ -131,16 +130,29 @@ def wrong_at_most(checked: Sequence[CheckedLink]) -> float:
     return float((middle + z * np.sqrt(wrong * (count - wrong) / count + z**2 / 4.0)) / (count + z**2))
 
 
-def _by_what_is_unique(placed: Mapping[int, ComparedImage], checked: Sequence[CheckedLink]) -> list[CheckedLink]:
+def _by_what_is_unique(
+    images: ComparedImages, alignment: Alignment, checked: Sequence[CheckedLink]
+) -> list[CheckedLink]:
     """The same links; those that are ambiguous but for something unique are known to be."""
-    shifts = unique_shifts(placed, [link.pair for link in checked if link.ambiguity.ambiguous])
+    known: set[tuple[int, int]] = set()
+    for pairs in _few_images([link.pair for link in checked if link.ambiguity.ambiguous]):
+        placed = images.aligned(alignment, chain.from_iterable(pairs))
+        for (first, second), unique in unique_shifts(placed, pairs, images.threads).items():
+            image = placed[second]
+            if np.hypot(*unique.shift) * drawing_scale(image.camera, image.homography) <= SLACK:
+                known.add((first, second))
+    return [replace(link, unique=link.pair in known) for link in checked]
 
-    def lies_here(link: CheckedLink) -> bool:
-        second = placed[link.fit.image2]
-        off = np.hypot(*shifts[link.pair].shift) * drawing_scale(second.camera, second.homography)
-        return bool(off <= SLACK)
 
-    return [replace(link, unique=link.pair in shifts and lies_here(link)) for link in checked]
+def _few_images(pairs: Iterable[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
+    """The pairs in groups of no more images than may be compared by what is unique at once."""
+    group: list[tuple[int, int]] = []
+    for pair in pairs:
+        if len({*pair, *chain.from_iterable(group)}) > IMAGES_AT_ONCE:
+            yield group
+            group = []
+        group.append(pair)
+    yield group
 
 
 def _between(first: ComparedImage, second: ComparedImage) -> tuple[ComparedImage, ComparedImage]:

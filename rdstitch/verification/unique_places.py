@@ -25,6 +25,8 @@ _MAX_PERIODS = 16  # shifts that an image is compared with itself at
 _MIN_COPIES = 3  # other copies of a place, of which the median is clean though one of them has dirt
 _MARGIN = 6  # pixels at the border of an image, where brightness cannot be removed well
 _MOST = 25.0  # spreads of the copies: a larger departure counts as this
+# Images whose drawings and departures fit into 128 MB at once.
+IMAGES_AT_ONCE = 2**27 // (2 * COMPARED_SIDE**2 * np.dtype(np.float32).itemsize)
 
 
 @dataclass(frozen=True, eq=False)

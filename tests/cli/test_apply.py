@@ -11,10 +11,15 @@ from typing import Literal
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 
+from rdstitch import apply, mosaic
+from rdstitch.errors import InputError
 from rdstitch.io import read_image
-from tests.cli.running import CACHED, Outcome, Run, sidecar_of
+from rdstitch.io.metadata import read_metadata
+from rdstitch.sidecar.read import read_sidecar
+from tests.cli.running import CACHED, OPTIONS, Outcome, Run, sidecar_of
 
 
 def _sidecar(image: Path) -> Path:
@@ -130,6 +135,51 @@ def test_another_band_in_order(rdstitch: Run, frames: list[Path], stitched: Path
     assert grey.shape == green.shape
     assert np.abs(grey.astype(float) - green).mean() < 3.0
     _apply(rdstitch, _sidecar(stitched), band, tmp_path / "n.tif", "--match", "name", status=3, told=frames[0].name)
+
+
+def test_originals_are_found_from_the_folder_of_the_sidecar(
+    frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that another band's lens is compared wherever one stands; sidecars from before have the current folder's."""
+    flight, elsewhere = tmp_path / "flight", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    _written(frames, flight, [frame.name for frame in frames])
+    monkeypatch.chdir(flight)
+    mosaic([frame.name for frame in frames], "../elsewhere/o.tif", OPTIONS)
+    sidecar = elsewhere / "o.tif.json"
+    assert [image["path"] for image in sidecar_of(elsewhere / "o.tif")["images"]] == [
+        f"../flight/{frame.name}" for frame in frames
+    ]
+    shifted = _written(frames, tmp_path / "shifted", [frame.name for frame in frames])
+    for k, file in enumerate(sorted(shifted.iterdir())):
+        assert cv2.imwrite(str(file), np.roll(cv2.imread(str(file)), (12 * k, -9 * k), axis=(0, 1)))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="was not taken from the same place"):
+        apply(sidecar, [shifted])
+    sidecar.write_text(sidecar.read_text("utf-8").replace("../flight/", ""), "utf-8")
+    assert any("was not compared" in message.text for message in apply(sidecar, [shifted]).messages)
+    monkeypatch.chdir(flight)
+    with pytest.raises(InputError, match="was not taken from the same place"):
+        apply(sidecar, [shifted])
+
+
+def test_equal_names_of_another_flight_are_refused_and_other_images_named(
+    frames: list[Path], stitched: Path, tmp_path: Path
+) -> None:
+    taken = _written(frames, tmp_path / "taken", [frame.stem + ".jpg" for frame in frames])
+    saved, times = read_sidecar(_sidecar(stitched)), []
+    for k, file in enumerate(sorted(taken.iterdir())):
+        exif = PIL.Image.Exif()
+        exif[0x8769] = {0x9003: f"2024:05:06 07:08:{10 * k:02}"}
+        PIL.Image.open(file).save(file, exif=exif)
+        times.append(read_metadata(file).timestamp)
+    for image, time in zip(saved.images, times[1:] + times[:1], strict=True):
+        image.timestamp = time
+    with pytest.raises(InputError, match="was taken at the time or place"):
+        apply(saved, [taken])
+    (tmp_path / "more.png").write_bytes(frames[0].read_bytes())
+    result = apply(saved, [*frames, tmp_path / "more.png"])
+    assert [message.images for message in result.messages] == [(str(tmp_path / "more.png"),)]
 
 
 def test_a_missing_image_is_named(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from rdstitch.geometry.radial_homography import RadialHomography, from_direction
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
 from rdstitch.io import DecodedImage, Metadata
-from rdstitch.local_alignment import DisplacementField, LocalAlignment, Match, align_locally, fit
+from rdstitch.local_alignment import DisplacementField, LocalAlignment, Match, align_locally, estimate, fit
 from rdstitch.local_alignment.field import grid_shape, node_points
 from rdstitch.local_alignment.fit import Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches, place_matches
@@ -226,6 +226,14 @@ def test_a_number_of_cells_is_used_in_any_case() -> None:
     local = align_locally(found, CAMERAS, homographies(sequence), 7)
     assert [field.values.shape for field in local.fields] == [(6, 8, 2)] * 6
     assert max(field.largest for field in local.fields) < 0.5
+
+
+def test_a_number_of_cells_that_no_memory_holds_is_coarser_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimate, "_COARSE", (12, 6 * 13**2))
+    sequence = scene(None)
+    local = align_locally(matches(sequence), CAMERAS, homographies(sequence), 40)
+    assert [field.values.shape[1] for field in local.fields] == [14] * 6
+    assert (local.cells, "13 instead of 40 cells" in local.reason) == (13, True)
 
 
 def test_the_whole_does_not_move_and_fields_fade_where_nothing_supports_them() -> None:

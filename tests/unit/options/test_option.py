@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pytest
 
-from rdstitch import CompositeOptions, StitchOptions, TileOptions
+import rdstitch
+from rdstitch import Camera, CompositeOptions, StitchOptions, TileOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.options.option import Option, check_options, documented
 
@@ -93,6 +94,49 @@ def test_a_tilt_is_in_radians(tilt: tuple[float, float]) -> None:
 def test_an_extent_has_four_sides_in_their_order(extent: Any) -> None:
     with pytest.raises(ArgumentError, match=r"extent must be (4 numbers|west, south, east and north)"):
         CompositeOptions(extent=extent)
+
+
+def test_arrays_become_tuples_of_numbers() -> None:
+    options: Any = {"tilt": np.radians([3, 0]), "max_iterations": np.int64(5)}
+    assert StitchOptions(**options) == StitchOptions(tilt=(math.radians(3), 0.0), max_iterations=5)
+    extent: Any = np.array([0, 0, 2, 3])
+    assert hash(CompositeOptions(extent=extent)) == hash(CompositeOptions(extent=(0, 0, 2, 3)))
+    for sides in (np.zeros(3), {1.0, 2.0}, {1.0: 0, 2.0: 0}):
+        with pytest.raises(ArgumentError, match="tilt must be 2 numbers"):
+            StitchOptions(tilt=sides)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("saved", "given", "changed"),
+    [
+        ({"max_size": 1200, "crop": "auto"}, {"extent": (0, 0, 1, 1)}, {"max_size": None, "crop": "none"}),
+        ({"max_size": 1200}, {"scale": 1.0}, {"max_size": None}),
+        ({"max_size": 1200, "scale": 0.5}, {"scale": 2.0, "max_size": 9}, {}),
+        ({"scale": 0.5, "rotate": 9.0}, {"like": "a.tif"}, {"scale": 1.0, "rotate": 0.0}),
+        ({"like": "a.tif", "extent": (0, 0, 1, 1)}, {"gsd": 0.1}, {"like": None, "extent": None}),
+        ({"like": "a.tif"}, {"rotate": 0.0, "crop": "none"}, {}),
+        ({"gsd": 0.1}, {"scale": 1.0}, {"gsd": None}),
+        ({"rectangle": (0, 0, 9, 0, 9, 9, 0, 9)}, {"straighten": "off"}, {"rectangle": None}),
+        ({"level": True}, {"straighten": "auto"}, {"level": False}),
+    ],
+)
+def test_what_is_given_takes_the_place_of_what_contradicts_it(saved: Any, given: Any, changed: Any) -> None:
+    assert CompositeOptions(**saved).overridden(**given) == CompositeOptions(**saved | given | changed)
+
+
+def test_what_contradicts_or_is_unknown_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="camera and distortion"):
+        StitchOptions(camera=Camera((40, 30)), distortion=-0.1)
+    with pytest.raises(ArgumentError, match=r"\{number\} in grid"):
+        TileOptions(grid="r{row}c{col}", columns=4)
+    with pytest.raises(ArgumentError, match="max_memory must be"):
+        CompositeOptions(max_memory=800)
+    for recipe, inputs in ((rdstitch.apply, ("none.json", "none")), (rdstitch.tiles, ("none",))):
+        with pytest.raises(ArgumentError, match="no option 'overwite'; do you mean 'overwrite'"):
+            recipe(*inputs, overwite=True)
+    for wrong in ({"layout": "kiti"}, {"height": 0}, {"frame": "map"}):
+        with pytest.raises(ArgumentError, match=f"{next(iter(wrong))} must be"):
+            rdstitch.trajectory("none", **wrong)
 
 
 def test_a_grid_to_keep_is_an_input_that_no_output_may_replace(tmp_path: Path) -> None:

@@ -76,6 +76,11 @@ def test_a_band_by_another_lens_is_registered(rig: Path, tmp_path: Path) -> None
     assert not [message for message in again.messages if message.code == "band-lens"]
     assert _same_pixels(tmp_path / "nir.tif", tmp_path / "again.tif")
     assert [source.camera for source in result.sources] == list(result.placed.cameras)
+    record = sidecar_of(tmp_path / "nir.tif")
+    of_another = [record[name] for name in ("lambda_std", "rms_px", "tilt_deg")]
+    of_another += [record["camera"][name] for name in ("lambda_std", "focal_std_px", "lens_covariance", "tilt_std_deg")]
+    assert of_another + [image[name] for image in record["images"] for name in ("features", "pose")] == [None] * 19
+    assert (record["lambda"], record["lambda_known"]) != (sidecar_of(rig / "red.tif")["lambda"], True)
 
 
 def test_seams_of_a_sidecar_are_those_of_its_image(rig: Path, tmp_path: Path) -> None:
@@ -128,6 +133,16 @@ def test_of_bands_of_which_one_fails_nothing_is_written(rig: Path, tmp_path: Pat
     with pytest.raises(InputError, match="was not taken from the same place"):
         mosaic_bands([rig / "red", tmp_path], tmp_path / "f.tif", {"R": "*_red.png", "N": "*_nir.png"})
     assert set(tmp_path.iterdir()) == inputs
+
+
+def test_an_image_of_two_bands_and_a_band_without_any_that_can_be_read_are_refused(rig: Path, tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match=r"IMG_0003_NIR.png fits both A=\*_N\*.png and B=\*_NIR.png"):
+        mosaic_bands([rig / "red", rig / "nir"], tmp_path / "f.tif", {"A": "*_N*.png", "B": "*_NIR.png"})
+    for k in range(2):
+        (tmp_path / f"{k}_bad.png").write_bytes(b"x")
+    for bands in ({"B": "*_bad.png", "N": "*_NIR.png"}, {"N": "*_NIR.png", "B": "*_bad.png"}):
+        with pytest.raises(InputError, match=r"0_bad\.png: .*; no other image of B can be read"):
+            mosaic_bands([rig / "nir", tmp_path], tmp_path / "f.tif", bands)
 
 
 def test_a_lost_image_and_one_from_elsewhere_move_no_other(rig: Path, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from rdstitch.io.flat_field import FlatField, read_flat_field
 from rdstitch.io.stored_tiles import stored_tiles
 from rdstitch.pipeline.read_inputs import with_flat_field
 from rdstitch.stage import SearchPlan, TileRegistration, register_tiles
-from rdstitch.stage.axes import with_axes_shown
+from rdstitch.stage.axes import with_measured_axes
 from rdstitch.stage.coarse_tile import coarse_tile
 from rdstitch.stage.estimate_flat_field import estimate_illumination
 from rdstitch.stage.grid import TileGrid
@@ -168,11 +168,11 @@ def test_axes_and_overlap_are_those_that_the_tiles_show(
     told = stage.nominal @ np.array(matrix, float) * 0.9
     grid = TileGrid(told - told.min(axis=0), (256, 256))
     read = lambda index: coarse_tile(stage.render(index), 1)  # noqa: E731
-    shown, words = with_axes_shown(grid, read, 1, 12.8)
+    shown, words = with_measured_axes(grid, read, 1, 12.8)
     assert np.abs(shown.places - stage.nominal).max() < 12.0
     assert "neighbours overlap by 1" in words
     right = TileGrid(stage.nominal, (256, 256))
-    assert with_axes_shown(right, read, 1, 12.8) == (right, "")
+    assert with_measured_axes(right, read, 1, 12.8) == (right, "")
 
 
 def _array(rng: np.random.Generator) -> tuple[list[NDArray[np.float32]], FloatArray]:
@@ -190,7 +190,7 @@ def test_tiles_of_a_pattern_without_anything_unique_stay_where_the_stage_was_sen
     tiles, places = _array(np.random.default_rng(4))
     nominal = np.array([(270.0 * c, 220.0 * r) for r in range(2) for c in range(3)])
     grid = TileGrid(nominal, (320, 256))
-    assert with_axes_shown(grid, lambda index: coarse_tile(tiles[index], 1), 1, 16.0)[1] == ""
+    assert with_measured_axes(grid, lambda index: coarse_tile(tiles[index], 1), 1, 16.0)[1] == ""
     found = register_tiles(SearchPlan.of(grid), tiles.__getitem__)
     off = found.adjustment.places - places
     assert np.abs(off - np.median(off, axis=0)).max() < 5.0

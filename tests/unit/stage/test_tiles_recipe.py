@@ -1,6 +1,7 @@
 """``rdstitch.tiles`` on arrays and on files that are not all alike."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,6 +76,24 @@ def test_a_truncated_tile_and_a_coloured_one_are_left_out_by_name(tmp_path: Path
     assert _errors(result, STAGE.places[[0, 1, 3, 4]]).max() < 0.5
     with pytest.raises(InputError, match="r0"):
         rdstitch.tiles(tmp_path, grid="r{row}c{col}", overlap=20.0, strict=True)
+
+
+@pytest.mark.parametrize("by", ["array", "table", "names", "numbers"])
+@pytest.mark.parametrize("lost", [0, 2, 5])
+def test_a_tile_that_cannot_be_read_moves_no_other(tmp_path: Path, by: str, lost: int) -> None:
+    files = STAGE.write(tmp_path)
+    named: dict[str, Any] = {"positions": STAGE.nominal} if by == "array" else {"positions": tmp_path / "positions.csv"}
+    if by in ("names", "numbers"):
+        named = {"overlap": 20.0, "grid": "r{row}c{col}"}
+    if by == "numbers":
+        files = [file.rename(tmp_path / f"img_{k}.tif") for k, file in enumerate(files)]
+        named |= {"grid": "img_{number}", "columns": 3}
+    kept = [k for k in range(6) if k != lost]
+    files[lost].write_bytes(b"II*\0")
+    (_, registration) = found = rdstitch.place_tiles(files, **named)
+    assert [Path(message.images[0]) for message in registration.left_out] == [files[lost]]
+    off = found[0].grid.places - STAGE.nominal[kept]
+    np.testing.assert_allclose(off, np.broadcast_to(off[0], off.shape), atol=2.0)
 
 
 def test_tiles_of_several_sizes_lie_where_they_are(tmp_path: Path) -> None:

@@ -21,9 +21,18 @@ from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.inputs.odometry import BodyPose
+from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, sequence_over
-from rdstitch.tracking import FrameTracker, Placement, PlaneSimilarity, Preview, TrackingOptions, TrackingResult
+from rdstitch.tracking import (
+    FrameTracker,
+    Placement,
+    PlaneSimilarity,
+    Preview,
+    TrackingOptions,
+    TrackingResult,
+    map_refinement,
+)
 from rdstitch.tracking.camera_check import check_camera
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.keyframe_map import KeyframeMap
@@ -349,6 +358,21 @@ def test_an_alignment_that_is_dropped_keeps_no_worker_busy() -> None:
     assert future.cancelled()
 
 
+def test_an_alignment_that_fails_does_not_end_the_track(monkeypatch: pytest.MonkeyPatch) -> None:
+    def singular(*_: object) -> None:
+        raise RuntimeError("Factor is exactly singular")
+
+    monkeypatch.setattr(map_refinement, "align", singular)
+    said: list[Message] = []
+    keyframe_map = KeyframeMap(_given_camera(), TrackState(has_plane=True), [_keyframe(0), _keyframe(1)])
+    with ThreadPoolExecutor(1) as executor:
+        refinement = MapRefinement(executor, patient=True, report=said.append)
+        refinement.begin(keyframe_map)
+        assert refinement.take_over(keyframe_map, None) == []
+        refinement.begin(keyframe_map)
+    assert "exactly singular" in said[0].text
+
+
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0, 1.0), (1.5, -2.0, 2.5, 0.8), (-3.0, 0.2, -3.0, 1.4)])
 def test_the_pose_of_a_homography_is_the_one_it_was_made_of(pose: tuple[float, float, float, float]) -> None:
     placed = _placed(*pose)
@@ -417,6 +441,16 @@ def test_it_grows_in_all_directions_and_stays_within_its_bound() -> None:
     assert max(preview.pixels.shape[:2]) <= 300
     assert max(preview.pixels.shape[:2]) > 150
     assert preview.pixels.any(axis=2).mean() > 0.3
+
+
+def test_one_frame_that_is_placed_far_off_does_not_shrink_the_others() -> None:
+    preview = Preview()
+    preview.paint(_image(200), _at(0.0, 0.0))
+    before = preview.pixels.copy()
+    preview.paint(_image(50), _at(1e5, 0.0))
+    assert np.array_equal(preview.pixels, before)
+    preview.paint(_image(50), _at(1.6, 0.0))
+    assert preview.pixels.any(axis=2).sum() > 1.9 * before.any(axis=2).sum()
 
 
 def test_what_is_beyond_the_horizon_or_far_too_large_is_left_out() -> None:

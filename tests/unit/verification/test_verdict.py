@@ -1,7 +1,10 @@
 """The verdict on registered images, and what parallax tells it."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +25,7 @@ from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic import Photometry
-from rdstitch.verification import evidence, verdict
+from rdstitch.verification import evidence, overlap_check, verdict
 from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind, messages_of
 from rdstitch.verification.overlap_check import CheckedLink
@@ -60,6 +63,21 @@ def _moved(good: Registration, image: int, shift: float) -> Registration:
     move[:2, 2] = shift * 0.6, shift * 0.8
     homographies[image] = homographies[image] @ move
     return replace(good, alignment=replace(good.alignment, homographies=homographies))
+
+
+def test_few_images_of_a_pattern_are_held_at_once(good: Registration, monkeypatch: pytest.MonkeyPatch) -> None:
+    held: list[int] = []
+
+    def shifts(placed: Mapping[int, object], pairs: Sequence[tuple[int, int]], workers: int = 1) -> dict[Any, Any]:
+        held.append(len(placed))
+        return dict.fromkeys(pairs, SimpleNamespace(shift=(0.0, 0.0)))
+
+    monkeypatch.setattr(overlap_check, "IMAGES_AT_ONCE", 2, raising=False)
+    monkeypatch.setattr(overlap_check, "find_ambiguity", lambda *_: SimpleNamespace(ambiguous=True))
+    monkeypatch.setattr(overlap_check, "unique_shifts", shifts)
+    images = overlap_check.ComparedImages(good.sources, good.stretch)
+    checked = overlap_check.check_overlaps(good, images)
+    assert (max(held), [link.unique for link in checked]) == (2, [True] * len(checked))
 
 
 @pytest.mark.parametrize("shift", [0.03, 0.05])
